@@ -1,0 +1,66 @@
+# One command for people and for CI. `make` alone lists the targets.
+#
+# PIP_ARGS goes to every `pip install`, so that you choose where wheels come from. On a machine without an NVIDIA GPU,
+# name PyTorch's CPU index (its install page shows the address) to spare 2 GB of CUDA libraries:
+#     make demo PIP_ARGS="--extra-index-url <PyTorch's CPU index>"
+
+PYTHON ?= python3
+PIP_ARGS ?=
+PYTEST_ARGS ?=
+DEMO_ARGS ?=
+BENCH_ARGS ?= --profile sensor --seeds 0,1 --out runs/bench/loop.json
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.setup-done
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check bench typing format clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## make .venv with everything in it (done by the other targets when needed)
+
+# torch comes first and alone: its version is pinned and its builds (CPU, CUDA) differ by gigabytes, so a wrong index
+# shows at once. The stamp is touched last: an interrupted set-up is taken up again by the next call.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "deal-hw needs Python 3.11 or newer; say which: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
+	  || { echo "this Python cannot make a venv; on Debian: apt-get install -y python3-venv" >&2; exit 1; }
+	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt torch
+	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[all,dev]'
+	@touch $@
+
+demo: $(STAMP) ## the whole loop on an emulated cart-pole, about ten minutes on two cores
+	$(BIN)/deal-hw demo $(DEMO_ARGS)
+
+test: $(STAMP) ## all tests that need no robot
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(STAMP) typing ## format, lint, types and import order
+	$(BIN)/ruff format --check --output-format concise .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/house/test_layers.py
+
+bench: $(STAMP) ## a small benchmark; BENCH_ARGS chooses another
+	$(BIN)/deal-hw bench loop $(BENCH_ARGS)
+
+format: $(STAMP) ## rewrite the sources in the one format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+# Type checkers cannot follow package-dir through an editable install, so they read this tree of links instead.
+typing:
+	@mkdir -p build/typing/deal_hw
+	@find build/typing/deal_hw -xtype l -delete
+	@for entry in deal_hw/*; do \
+	  case $$entry in */__pycache__) ;; *) ln -sfn ../../../$$entry build/typing/deal_hw/ ;; esac; done
+	@for leaf in calib drivers policies; do ln -sfn ../../../$$leaf build/typing/deal_hw/$$leaf; done
+
+clean: ## remove what was generated, but neither .venv nor runs/
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage htmlcov
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print | xargs rm -rf

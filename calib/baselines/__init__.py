@@ -1,0 +1,1 @@
+"""Calibration methods to compare with: simple, published or deliberately ignorant ones."""

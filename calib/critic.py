@@ -1,0 +1,201 @@
+"""Critics: networks that tell recorded transitions from simulated ones.
+
+Two kinds share one interface. `ClippedCritic` is the paper's WGAN with weight clipping (eq. 5); `PenaltyCritic` holds
+its gradient near one instead (WGAN-GP, Gulrajani et al. 2017), which leaves it smooth enough for its hidden features
+to be regressed on. Both run on the CPU, in float32, and draw from one torch generator: the same seed, the same critic.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.errors import MissingExtraError
+from deal_hw.types import FloatArray
+
+try:
+    import torch
+    from torch import Tensor, nn
+except ImportError as err:  # pragma: no cover - the extra is installed where the tests run
+    raise MissingExtraError("torch", "calib") from err
+
+Samples = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CriticSettings:
+    """How a critic is built and trained.
+
+    Attributes:
+        hidden: Units of the two hidden layers.
+        learning_rate: Step of the optimiser.
+        updates: Updates n a generation.
+        batch: Samples M of each side in one update.
+        clip: Weights are cut to [-clip, clip] after each update (`ClippedCritic`).
+        penalty: Weight of the squared distance of the gradient's norm from one (`PenaltyCritic`).
+    """
+
+    hidden: tuple[int, int] = (256, 256)
+    learning_rate: float = 3e-4
+    updates: int = 20
+    batch: int = 1024
+    clip: float = 0.1
+    penalty: float = 10.0
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Use so many threads inside one operation; on a busy machine more than one can be 30 times slower."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class Critic:
+    """A network with two hidden layers, ReLU, and one output (the paper's D).
+
+    Args:
+        inputs: Width of a sample.
+        settings: Size and training.
+        rng: Seeds the network's generator.
+    """
+
+    def __init__(self, inputs: int, settings: CriticSettings, rng: np.random.Generator) -> None:
+        self.settings = settings
+        self.generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        first, second = settings.hidden
+        self._layers = [nn.Linear(inputs, first), nn.Linear(first, second), nn.Linear(second, 1)]
+        self._parameters: list[nn.Parameter] = []
+        with torch.no_grad():
+            for layer in self._layers:
+                # torch's default initialisation, but from our generator instead of the global one.
+                bound = layer.in_features**-0.5
+                for parameter in (layer.weight, layer.bias):
+                    parameter.uniform_(-bound, bound, generator=self.generator)
+                    self._parameters.append(parameter)
+        self.optimiser = self._make_optimiser()
+
+    def _make_optimiser(self) -> torch.optim.Optimizer:
+        raise NotImplementedError
+
+    def _update(self, real: Tensor, fake: Tensor) -> float:
+        raise NotImplementedError
+
+    def hidden(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the activations of both hidden layers and the output, (B, h1), (B, h2), (B, 1)."""
+        first = self._layers[0](x).relu_()
+        second = self._layers[1](first).relu_()
+        return first, second, self._layers[2](second)
+
+    def train(self, real: Samples, fake: Samples) -> float:
+        """Make the settings' updates on minibatches drawn with replacement (Algorithm 1, lines 4-7).
+
+        Args:
+            real: Samples of the recording, (n, inputs).
+            fake: Samples of the simulators, (m, inputs).
+
+        Returns:
+            The estimate of the Wasserstein distance in the last update: mean output on real minus on fake samples.
+        """
+        return self.train_on_blocks(real, [fake])
+
+    def train_on_blocks(self, real: Samples, fake: Sequence[Samples]) -> float:
+        """Do the same with the simulators' samples in several blocks, which are never joined.
+
+        A replay of 50 generations of 200 x 200 transitions is 72 MB: rows are picked from the blocks by their index.
+        """
+        settings = self.settings
+        data = torch.from_numpy(real)
+        ends = np.cumsum([len(block) for block in fake])
+        draws = settings.updates * settings.batch
+        rows = torch.randint(len(data), (draws,), generator=self.generator)
+        other = torch.randint(int(ends[-1]), (draws,), generator=self.generator).numpy()
+        imitation = np.empty((draws, real.shape[1]), dtype=np.float32)
+        owner = np.searchsorted(ends, other, side="right")
+        for i, block in enumerate(fake):
+            mine = np.flatnonzero(owner == i)
+            imitation[mine] = block[other[mine] - (ends[i] - len(block))]
+        pairs = zip(
+            data[rows].split(settings.batch), torch.from_numpy(imitation).split(settings.batch), strict=True
+        )
+        gap = 0.0
+        for batch, copy in pairs:
+            gap = self._update(batch, copy)
+        return gap
+
+    @torch.no_grad()
+    def score(self, samples: Samples, chunk: int = 8192) -> Samples:
+        """Return the output on samples, (n,)."""
+        x = torch.from_numpy(samples)
+        parts = [self.hidden(x[i : i + chunk])[2][:, 0] for i in range(0, len(x), chunk)]
+        return np.asarray(torch.cat(parts).numpy())
+
+    @torch.no_grad()
+    def statistics(self, samples: Samples) -> FloatArray:
+        """Return the mean over samples of all hidden activations and the output.
+
+        Args:
+            samples: N groups of n samples, (N, n, inputs).
+
+        Returns:
+            (N, h1 + h2 + 1).
+        """
+        groups, count, width = samples.shape
+        per = max(16384 // count, 1)
+        out = []
+        for i in range(0, groups, per):
+            block = torch.from_numpy(samples[i : i + per])
+            parts = self.hidden(block.reshape(-1, width))
+            means = [part.reshape(len(block), count, -1).mean(dim=1) for part in parts]
+            out.append(torch.cat(means, dim=1))
+        return torch.cat(out).double().numpy()
+
+
+class ClippedCritic(Critic):
+    """The paper's critic: WGAN, weights clipped to a box (eq. 5)."""
+
+    def _make_optimiser(self) -> torch.optim.Optimizer:
+        # The paper names no optimiser; RMSprop is what WGAN's authors and EASI use.
+        return torch.optim.RMSprop(self._parameters, lr=self.settings.learning_rate, foreach=True)
+
+    def _update(self, real: Tensor, fake: Tensor) -> float:
+        self.optimiser.zero_grad(set_to_none=True)
+        # Both sides in one pass: half the calls for the same sums.
+        output = self.hidden(torch.cat([real, fake]))[2]
+        # Eq. 5 is a maximum, optimisers minimise.
+        gap = output[: len(real)].mean() - output[len(real) :].mean()
+        (-gap).backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        with torch.no_grad():
+            torch._foreach_clamp_min_(self._parameters, -self.settings.clip)
+            torch._foreach_clamp_max_(self._parameters, self.settings.clip)
+        return float(gap.detach())
+
+
+class PenaltyCritic(Critic):
+    """WGAN-GP: the gradient by the input is held at length one between real and simulated samples."""
+
+    def _make_optimiser(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(
+            self._parameters, lr=self.settings.learning_rate, betas=(0.5, 0.9), foreach=True
+        )
+
+    def _update(self, real: Tensor, fake: Tensor) -> float:
+        self.optimiser.zero_grad(set_to_none=True)
+        mix = torch.rand(len(real), 1, generator=self.generator)
+        between = (mix * real + (1 - mix) * fake).requires_grad_(True)
+        output = self.hidden(torch.cat([real, fake, between]))[2][:, 0]
+        on_real, on_fake, on_between = output.split([len(real), len(fake), len(between)])
+        (slope,) = torch.autograd.grad(on_between.sum(), between, create_graph=True)
+        penalty = ((slope.norm(dim=1) - 1) ** 2).mean()
+        gap = on_real.mean() - on_fake.mean()
+        (-gap + self.settings.penalty * penalty).backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        return float(gap.detach())

@@ -1,0 +1,43 @@
+"""Is there enough in a recording to calibrate from? Refuses before any long work and says what to record."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deal_hw.calib.problem import Problem
+from deal_hw.errors import InsufficientDataError
+
+SHORTEST_S = 1.0
+LEAST_NOISE_RATIO = 20.0
+
+
+def check_excitation(problem: Problem) -> None:
+    """Check that the recordings are long enough and move.
+
+    Raises:
+        InsufficientDataError: They do not; the message says what was found and what to record.
+    """
+    seconds = sum(
+        float(np.sum(e.usable)) * float(np.median(np.diff(e.sample))) * e.step_s for e in problem.episodes
+    )
+    advice = "record again with `deal-hw collect --profile rich` (4 s are enough)"
+    if seconds < SHORTEST_S:
+        raise InsufficientDataError(
+            f"{seconds:.2f} s of usable samples, at least {SHORTEST_S:g} s are needed; {advice}"
+        )
+    names = problem.robot.description.joint_names
+    spans = np.max([np.ptp(e.position[e.usable], axis=0) for e in problem.episodes], axis=0)
+    still = [
+        f"{name} moved {span:.2g} (noise {noise:.2g})"
+        for name, span, noise in zip(names, spans, problem.noise_std, strict=True)
+        if span < LEAST_NOISE_RATIO * noise
+    ]
+    if still:
+        raise InsufficientDataError(f"the recording hardly moves: {'; '.join(still)}; {advice}")
+    changes = sum(
+        int(np.count_nonzero(np.any(np.diff(e.target, axis=0) != 0, axis=1))) for e in problem.episodes
+    )
+    if changes < 5:
+        raise InsufficientDataError(
+            f"the position target changed {changes} times, at least 5 are needed; {advice}"
+        )

@@ -1,0 +1,87 @@
+"""The result folder of a calibration: result.json, distribution.json, calibrated.xml, trace.npz."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import DatasetError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.sim.model import RobotModel, write_calibrated_mjcf
+
+RESULT = "result.json"
+DISTRIBUTION = "distribution.json"
+MODEL = "calibrated.xml"
+TRACE = "trace.npz"
+
+
+def write_result(folder: Path, robot: RobotModel, result: CalibrationResult) -> dict[str, Path]:
+    """Write everything a calibration found; each file appears whole or not at all.
+
+    Args:
+        folder: Where to write; made if need be.
+        robot: The nominal model.
+        result: What was found.
+
+    Returns:
+        The files by name.
+
+    Raises:
+        DatasetError: The folder cannot be written.
+    """
+    files = {name: folder / name for name in (RESULT, DISTRIBUTION, MODEL, TRACE)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(files[RESULT], json.dumps(result.to_json(), indent=1))
+        _write(files[DISTRIBUTION], json.dumps(result.distribution().to_json(), indent=1))
+        write_calibrated_mjcf(robot, result.space, result.estimate, files[MODEL], result.latency_s)
+        keys = sorted({key for row in result.trace for key in row})
+        columns: dict[str, Any] = {
+            key: np.array([row.get(key, np.nan) for row in result.trace]) for key in keys
+        }
+        if result.population is not None:
+            columns["population"] = result.population
+        np.savez(files[TRACE], **columns)
+    except OSError as err:
+        raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
+    return files
+
+
+def _write(path: Path, text: str) -> None:
+    part = path.with_suffix(path.suffix + ".part")
+    part.write_text(text + "\n", encoding="utf-8")
+    os.replace(part, path)
+
+
+def read_result(path: Path) -> CalibrationResult:
+    """Read a result from its file or its folder.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    file = path / RESULT if path.is_dir() else path
+    try:
+        return CalibrationResult.from_json(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError) as err:
+        raise DatasetError(
+            f"{file} is not a calibration result ({err}); `deal-hw calibrate` writes one"
+        ) from err
+
+
+def read_distribution(path: Path) -> ParameterDistribution:
+    """Read a parameter distribution.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    try:
+        return ParameterDistribution.from_json(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError) as err:
+        raise DatasetError(
+            f"{path} is not a parameter distribution ({err}); `deal-hw calibrate` writes one"
+        ) from err

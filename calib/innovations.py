@@ -1,0 +1,112 @@
+"""Window innovations: what the recording shows beyond a simulator's prediction, whitened for noise and start states.
+
+A window restarts the simulation at a smoothed state. The error of that state enters the prediction, so each window's
+innovation has the covariance Sigma = sensor variance + J P0 J', with J the derivative of the prediction by the
+start state and P0 the uncertainty of that state. Multiplying by the inverse Cholesky factor of Sigma leaves unit
+variance where the model is right, and takes out what a wrong start state explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.coordinates import Members
+from deal_hw.calib.problem import NOISE_FREE_STD, Problem, WindowData
+from deal_hw.sim.windows import predict_windows, setpoints
+from deal_hw.types import FloatArray
+
+ADVANCE_S = 0.008
+"""Set-points are computed late by this much and moved back, so that latencies down to minus this are possible."""
+
+
+def is_noisy(problem: Problem) -> bool:
+    """Return whether the recording's positions carry sensor noise."""
+    return bool(np.any(problem.noise_std >= NOISE_FREE_STD))
+
+
+def samples_per_tick(problem: Problem) -> int:
+    """Return how many state samples one control period has."""
+    description = problem.robot.description
+    return max(round(description.state_rate_hz / description.control_rate_hz), 1)
+
+
+def predict(
+    problem: Problem,
+    members: Members,
+    data: WindowData,
+    position: FloatArray | None = None,
+    velocity: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative.
+
+    Returns:
+        Positions and velocities, (N, W, H, J) each.
+    """
+    episode = problem.episodes[data.episode]
+    batch = problem.batch(len(members.theta))
+    batch.set_parameters(members.theta)
+    ahead = round(ADVANCE_S / episode.step_s)
+    path = setpoints(batch, episode, members.latency_s + ahead * episode.step_s)
+    path = np.concatenate([path[:, ahead:], np.repeat(path[:, -1:], ahead, axis=1)], axis=1)
+    return predict_windows(
+        batch,
+        episode,
+        data.windows,
+        data.start_position if position is None else position,
+        data.start_velocity if velocity is None else velocity,
+        path,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Whitening:
+    """What whitens the windows of one episode.
+
+    Attributes:
+        reference: Prediction of the simulator around which was linearised, (W, H, J).
+        factor: Inverse Cholesky factors of Sigma, (W, H J, H J).
+    """
+
+    reference: FloatArray
+    factor: FloatArray
+
+    def apply(self, difference: FloatArray) -> FloatArray:
+        """Whiten differences of positions, (N, W, H, J); returns (N, W, H J)."""
+        flat = difference.reshape(*difference.shape[:2], -1)
+        return np.asarray(np.einsum("wij,nwj->nwi", self.factor, flat, optimize=True))
+
+
+def linearise(problem: Problem, centre: Members, data: WindowData) -> Whitening:
+    """Linearise the prediction by the start states around one simulator.
+
+    Args:
+        problem: Data and simulator.
+        centre: One member, the mean of the population.
+        data: The windows.
+    """
+    starts = problem.starts[data.episode]
+    W, J = data.start_position.shape
+    std = np.concatenate([starts.position_std, starts.velocity_std])
+    # Central differences at half the uncertainty: friction makes predictions kinked, and a secant of the size of the
+    # error itself says more about them than a derivative.
+    count = 1 + 4 * J
+    position = np.repeat(data.start_position[None], count, axis=0)
+    velocity = np.repeat(data.start_velocity[None], count, axis=0)
+    width = 0.5 * std
+    for s in range(2 * J):
+        state, j = (position, s) if s < J else (velocity, s - J)
+        state[1 + 2 * s, :, j] += width[s]
+        state[2 + 2 * s, :, j] -= width[s]
+    members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
+    predicted, _ = predict(problem, members, data, position, velocity)
+    predicted = np.where(np.isfinite(predicted), predicted, predicted[:1])
+    flat = predicted.reshape(count, W, -1)
+    # (W, H J, 2 J), already multiplied by the standard deviations: J sqrt(P0).
+    root = np.moveaxis((flat[1::2] - flat[2::2]), 0, -1) * (std / (2 * width))
+    sigma = root @ np.swapaxes(root, 1, 2)
+    noise = np.tile(problem.noise_std, data.measured.shape[1]) ** 2
+    sigma[:, np.arange(noise.size), np.arange(noise.size)] += noise
+    factor = np.linalg.inv(np.linalg.cholesky(sigma))
+    return Whitening(predicted[0], factor)

@@ -1,0 +1,102 @@
+"""What the searches hand back: estimate, spread of the last population, trace and provenance."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.problem import Problem
+from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.types import FloatArray
+
+Z90 = 1.6448536269514722
+"""A standard normal lies within +- this with 90 % probability."""
+
+
+class Run:
+    """Book-keeping of one search.
+
+    Args:
+        method: Name of the method.
+        problem: What is searched.
+        budget: What may be used.
+        progress: Called after each generation.
+    """
+
+    def __init__(
+        self, method: str, problem: Problem, budget: Budget, progress: ProgressCallback | None
+    ) -> None:
+        self.method = method
+        self.problem = problem
+        self.budget = budget
+        self.trace: list[dict[str, float]] = []
+        self._progress = progress
+        self._steps = problem.steps
+        self._start = time.perf_counter()
+
+    def note(self, message: str, population: FloatArray, values: Mapping[str, float]) -> None:
+        """Write one generation into the trace and call the callback, which may raise to stop the run."""
+        self.trace.append({"generation": float(len(self.trace)), **values})
+        if self._progress is not None:
+            total = max(self.budget.generations, len(self.trace))
+            self._progress(Progress("search", len(self.trace), total, message, population))
+
+    def result(
+        self,
+        coordinates: Coordinates,
+        centre: Members,
+        population: Members,
+        *,
+        settings: Any,
+        chi2: float = float("nan"),
+        alarms: Sequence[str] = (),
+        extra: Mapping[str, Any] | None = None,
+    ) -> CalibrationResult:
+        """Return the result.
+
+        The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT calibrated:
+        a searcher's population shrinks as its step rule says, too far where the ensemble is small, and to nothing
+        for diffusion evolution. The polish computes intervals from the data.
+
+        Args:
+            coordinates: The search's coordinates.
+            centre: The estimate, one member.
+            population: The last population.
+            settings: The method's settings, a dataclass.
+            chi2: Mean squared whitened residual at the estimate.
+            alarms: Reasons to distrust the result.
+            extra: Further provenance.
+        """
+        space = self.problem.space
+        scaled = space.to_scale(population.theta)
+        covariance = np.atleast_2d(np.cov(scaled, rowvar=False)) if len(scaled) > 1 else None
+        std = np.zeros(len(space)) if covariance is None else np.sqrt(np.diag(covariance))
+        middle = space.to_scale(centre.theta[0])
+        interval = np.stack(
+            [space.from_scale(middle - Z90 * std), space.from_scale(middle + Z90 * std)], axis=1
+        )
+        latency = coordinates.clip_latency(float(centre.latency_s[0]))
+        spread = float(population.latency_s.std(ddof=1)) if len(scaled) > 1 else 0.0
+        return CalibrationResult(
+            method=self.method,
+            space=space,
+            estimate=np.array(centre.theta[0]),
+            interval=np.clip(interval, space.low[:, None], space.high[:, None]),
+            covariance=covariance,
+            population=population.theta,
+            latency_s=latency,
+            latency_interval_s=(
+                coordinates.clip_latency(latency - Z90 * spread), coordinates.clip_latency(latency + Z90 * spread)
+            ),
+            chi2=chi2,
+            alarms=tuple(alarms),
+            trace=tuple(self.trace),
+            steps=self.problem.steps - self._steps,
+            seconds=time.perf_counter() - self._start,
+            provenance={"settings": asdict(settings), "budget": asdict(self.budget), **(extra or {})},
+        )  # fmt: skip

@@ -1,0 +1,158 @@
+"""The polish: Levenberg-Marquardt on multiple shooting, in windows that grow, with the latency as one more unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.residuals import Normal, Point, Shooting
+from deal_hw.errors import InsufficientDataError
+from deal_hw.types import FloatArray
+
+STAGES_S = (0.2, 0.4, 0.8)
+"""Window lengths, short first: short windows have a wide basin, long ones the information."""
+
+WORSE = 1.2
+"""A longer window whose chi2 grows by more than this factor is not kept: its start states are in another basin, or the
+model is wrong in a way that adds up."""
+
+STEP_LIMIT = 0.7
+"""Largest step of a parameter in its own scale (about a factor two)."""
+
+LATENCY_STEP_LIMIT_S = 0.005
+DAMPINGS = 10.0 ** np.arange(-5.0, 4.0)
+CONVERGED = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Polished:
+    """Where the polish ended.
+
+    Attributes:
+        theta: Physical parameters, (K,).
+        latency_s: Total latency [s].
+        chi2: Cost over degrees of freedom; 1 where noise explains everything.
+        normal: Normal equations there.
+        point: The solver's point.
+        shooting: The cut into windows that was used last.
+        iterations: Iterations over all stages.
+    """
+
+    theta: FloatArray
+    latency_s: float
+    chi2: float
+    normal: Normal
+    point: Point
+    shooting: Shooting
+    iterations: int
+
+
+def samples_in(problem: Problem, seconds: float) -> int:
+    """Return how many samples a time holds, at least 4 and at most the longest usable episode."""
+    episode = problem.episodes[0]
+    period = float(np.median(np.diff(episode.sample))) * episode.step_s
+    return max(round(seconds / period), 4)
+
+
+def polish(
+    problem: Problem,
+    theta: FloatArray,
+    latency_s: float,
+    stages_s: Sequence[float] = STAGES_S,
+    iterations: int = 12,
+    fixed_latency: bool = False,
+    notify: Callable[[int, float], None] | None = None,
+) -> Polished:
+    """Polish parameters from a start.
+
+    Args:
+        problem: The problem.
+        theta: Start, (K,).
+        latency_s: Start latency [s].
+        stages_s: Window lengths, in order [s].
+        iterations: Most iterations a stage.
+        fixed_latency: Keep the latency.
+        notify: Called with iterations done and chi2.
+
+    Raises:
+        InsufficientDataError: Not even the shortest window fits.
+    """
+    space = problem.space
+    theta = np.clip(theta, space.low, space.high)
+    result: Polished | None = None
+    states = None
+    done = 0
+    for seconds in stages_s:
+        try:
+            shooting = Shooting(problem, samples_in(problem, seconds))
+        except InsufficientDataError:
+            if result is None:
+                raise
+            break
+        start = shooting.start(theta, latency_s, states)
+        point, normal, used = _solve(shooting, start, iterations, fixed_latency)
+        done += used
+        free = len(space) + (0 if fixed_latency else 1)
+        chi2 = normal.cost / max(normal.count - free, 1)
+        if result is not None and chi2 > WORSE * max(result.chi2, 1.0):
+            break
+        theta, latency_s = shooting.theta(point), float(point.value[-1])
+        states = shooting.states(point)
+        result = Polished(theta, latency_s, chi2, normal, point, shooting, done)
+        if notify is not None:
+            notify(done, chi2)
+    if result is None:
+        raise InsufficientDataError("no window length was given")
+    return result
+
+
+def _bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    space = problem.space
+    low, high = problem.latency_range_s
+    return np.append(space.to_scale(space.low), low), np.append(space.to_scale(space.high), high)
+
+
+def _solve(
+    shooting: Shooting, point: Point, iterations: int, fixed_latency: bool
+) -> tuple[Point, Normal, int]:
+    low, high = _bounds(shooting.problem)
+    normal = shooting.normal(point)
+    used = 0
+    for _ in range(iterations):
+        used += 1
+        steps = [_step(point, normal, damping, low, high, fixed_latency) for damping in DAMPINGS]
+        candidates = [shooting.moved(point, normal, step) for step in steps]
+        costs = shooting.costs(candidates)
+        best = int(np.argmin(costs))
+        if not costs[best] < normal.cost:
+            break
+        gain = normal.cost - costs[best]
+        point = candidates[best]
+        normal = shooting.normal(point)
+        if gain < CONVERGED * normal.cost and gain < 0.1:
+            break
+    return point, normal, used
+
+
+def _step(
+    point: Point, normal: Normal, damping: float, low: FloatArray, high: FloatArray, fixed_latency: bool
+) -> FloatArray:
+    free = np.ones(len(point.value), dtype=bool)
+    free[-1] = not fixed_latency
+    # A parameter at its bound that wants to leave the range stays; the others are solved without it.
+    free &= ~((point.value <= low) & (normal.gradient > 0)) & ~((point.value >= high) & (normal.gradient < 0))
+    step = np.zeros(len(point.value))
+    scale = np.append(np.ones(len(step) - 1), 100.0)  # 10 ms of latency count like a factor e.
+    limit = np.append(np.full(len(step) - 1, STEP_LIMIT), LATENCY_STEP_LIMIT_S)
+    H = normal.hessian[np.ix_(free, free)]
+    # Levenberg's damping in units of the parameters' scale beside Marquardt's relative one: a parameter
+    # that the data cannot see (a limit never reached) must not run away.
+    weight = np.diag(H) + np.max(np.diag(H) / scale[free] ** 2) * 1e-9 * scale[free] ** 2 + scale[free] ** 2
+    step[free] = -np.linalg.solve(H + damping * np.diag(weight), normal.gradient[free])
+    shrink = np.max(np.abs(step) / limit)
+    if shrink > 1:
+        step = step / shrink
+    return np.asarray(np.clip(point.value + step, low, high) - point.value)

@@ -1,0 +1,60 @@
+"""Held-out error: open-loop prediction of a recording that the search has not seen, beside null predictors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.refine import samples_in
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode import Episode
+from deal_hw.sim.model import RobotModel
+from deal_hw.types import FloatArray
+
+HELDOUT_WINDOW_S = 0.2
+
+
+def heldout_nrmse(
+    robot: RobotModel,
+    space: ParameterSpace,
+    episodes: Sequence[Episode],
+    candidates: Mapping[str, tuple[FloatArray, float]],
+    truth: Sequence[FloatArray] | None = None,
+    window_s: float = HELDOUT_WINDOW_S,
+    threads: int | None = None,
+) -> dict[str, float]:
+    """Return the error of each candidate over the signal's range, mean over joints.
+
+    Args:
+        robot: The robot's model.
+        space: The parameters.
+        episodes: Held-out recordings.
+        candidates: Name to physical parameters, (K,), and latency [s].
+        truth: Noise-free positions at the episodes' samples, (T, J) each, where there are any; else the reported ones.
+        window_s: Prediction restarts from the smoothed reported state this often [s].
+        threads: Simulation threads.
+
+    Returns:
+        Error by name; beside the candidates "null", which predicts that each window keeps its start position.
+    """
+    problem = Problem(robot, space, episodes, threads=threads)
+    names = list(candidates)
+    theta = np.stack([candidates[name][0] for name in names])
+    latency = np.array([candidates[name][1] for name in names])
+    squares = np.zeros((len(names) + 1, problem.joints))
+    count, spans = 0, []
+    for data in problem.windows(samples_in(problem, window_s)):
+        reference = problem.episodes[data.episode].position if truth is None else truth[data.episode]
+        wanted = reference[data.windows.samples()]
+        predicted, _ = problem.predict(theta, latency, data)
+        null = np.broadcast_to(data.start_position[:, None], wanted.shape)
+        both = np.concatenate([predicted, null[None]])
+        # A diverged member is as wrong as the whole range.
+        error = np.where(np.isfinite(both), both - wanted, np.ptp(reference, axis=0))
+        squares += np.sum(error**2, axis=(1, 2))
+        count += wanted.shape[0] * wanted.shape[1]
+        spans.append(np.ptp(reference, axis=0))
+    nrmse = np.mean(np.sqrt(squares / count) / np.max(spans, axis=0), axis=1)
+    return dict(zip([*names, "null"], map(float, nrmse), strict=True))

@@ -1,0 +1,184 @@
+"""Contract of calibration: methods, budgets and results."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, Literal, TypeVar
+
+import numpy as np
+
+from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.types import FloatArray
+
+Verdict = Literal["identifiable", "weak", "not identifiable"]
+ProblemT = TypeVar("ProblemT", contravariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a long run stands; given to the callback after each generation or iteration.
+
+    Attributes:
+        stage: What is being done, such as ``"search"``, ``"polish"`` or ``"latency"``.
+        done: Units done.
+        total: Units expected; may grow.
+        message: One short line.
+        population: The current population, (N, K) physical values, or None.
+    """
+
+    stage: str
+    done: int
+    total: int
+    message: str = ""
+    population: FloatArray | None = None
+
+
+ProgressCallback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Budget:
+    """How much a method may use.
+
+    Attributes:
+        population: Members N.
+        generations: Search steps T; restarts count.
+        polish: Whether the search is followed by multiple shooting.
+    """
+
+    population: int = 100
+    generations: int = 50
+    polish: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationResult:
+    """What a calibration found.
+
+    Attributes:
+        method: Name of the method.
+        space: The parameters.
+        estimate: Physical values, (K,).
+        interval: 90 % interval of each parameter, (K, 2).
+        covariance: In each parameter's own scale, (K, K); None where the method gives none.
+        population: The last population, (N, K), or None.
+        verdicts: What the data can tell of each parameter.
+        null_directions: Combinations that the data cannot see, in words.
+        latency_s: Total latency found, or given [s].
+        latency_interval_s: 90 % interval of the latency [s].
+        chi2: Mean squared residual over its expected variance; 1 is a perfect model.
+        alarms: Reasons to distrust the model (mismatch), in words; empty is good.
+        heldout_nrmse: Held-out error by predictor: "nominal", "calibrated", "null" (the state stays as it is).
+        trace: One mapping a generation or iteration.
+        steps: Simulated physics steps.
+        seconds: Wall clock [s].
+        provenance: Versions, digests, settings, seed: plain JSON values.
+    """
+
+    method: str
+    space: ParameterSpace
+    estimate: FloatArray
+    interval: FloatArray
+    covariance: FloatArray | None = None
+    population: FloatArray | None = None
+    verdicts: tuple[Verdict, ...] = ()
+    null_directions: tuple[str, ...] = ()
+    latency_s: float = 0.0
+    latency_interval_s: tuple[float, float] = (0.0, 0.0)
+    chi2: float = float("nan")
+    alarms: tuple[str, ...] = ()
+    heldout_nrmse: Mapping[str, float] = field(default_factory=dict)
+    trace: Sequence[Mapping[str, float]] = ()
+    steps: int = 0
+    seconds: float = 0.0
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def distribution(self) -> ParameterDistribution:
+        """Return what is now known about the parameters."""
+        covariance = self.covariance
+        if covariance is None:
+            spread = np.diff(self.space.to_scale(self.interval.T), axis=0)[0] / (2 * 1.6448536269514722)
+            covariance = np.diag(np.square(spread))
+        return ParameterDistribution(
+            space=self.space, mean=self.estimate, covariance=covariance, latency_s=self.latency_interval_s
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values (without population and trace, which go into ``trace.npz``)."""
+        parameters = {}
+        for k, p in enumerate(self.space):
+            parameters[p.name] = {
+                "unit": p.unit,
+                "nominal": p.nominal,
+                "estimate": float(self.estimate[k]),
+                "low": float(self.interval[k, 0]),
+                "high": float(self.interval[k, 1]),
+                "range": [p.low, p.high],
+                "verdict": self.verdicts[k] if self.verdicts else None,
+            }
+        return {
+            "format": "deal_hw.calibration_result/1",
+            "method": self.method,
+            "space": self.space.to_json(),
+            "parameters": parameters,
+            "known": self.space.known,
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "null_directions": list(self.null_directions),
+            "latency_s": self.latency_s,
+            "latency_interval_s": list(self.latency_interval_s),
+            "chi2": self.chi2,
+            "alarms": list(self.alarms),
+            "heldout_nrmse": dict(self.heldout_nrmse),
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "provenance": dict(self.provenance),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> CalibrationResult:
+        """Return the result that :meth:`to_json` wrote."""
+        space = ParameterSpace.from_json(values["space"])
+        rows = [values["parameters"][name] for name in space.names]
+        covariance = values["covariance"]
+        return cls(
+            method=values["method"],
+            space=space,
+            estimate=np.array([row["estimate"] for row in rows]),
+            interval=np.array([[row["low"], row["high"]] for row in rows]),
+            covariance=None if covariance is None else np.array(covariance),
+            verdicts=tuple(row["verdict"] for row in rows) if rows and rows[0]["verdict"] else (),
+            null_directions=tuple(values["null_directions"]),
+            latency_s=values["latency_s"],
+            latency_interval_s=(values["latency_interval_s"][0], values["latency_interval_s"][1]),
+            chi2=values["chi2"],
+            alarms=tuple(values["alarms"]),
+            heldout_nrmse=values["heldout_nrmse"],
+            steps=values["steps"],
+            seconds=values["seconds"],
+            provenance=values["provenance"],
+        )
+
+
+class CalibrationMethod(abc.ABC, Generic[ProblemT]):
+    """A way to calibrate. Methods know a problem (data and simulator); the optimisers inside them know neither."""
+
+    name: str
+
+    @abc.abstractmethod
+    def run(
+        self,
+        problem: ProblemT,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
+    ) -> CalibrationResult:
+        """Calibrate.
+
+        Args:
+            problem: Data and simulator.
+            budget: How much may be used.
+            rng: The only source of randomness: the same generator state gives the same result.
+            progress: Called after each generation; may raise to stop the run.
+        """

@@ -1,0 +1,95 @@
+"""The control process: the one place where robot, behaviour, safety and loop come together in real time.
+
+Started by the supervisor as ``python -m deal_hw.cli.control_process`` with its orders as JSON on standard input and
+with the open port, the recorder's socket and the status socket as inherited descriptors. It writes neither to disk nor
+to the terminal, and imports neither torch, mujoco nor scipy.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+from types import FrameType
+from typing import Any
+
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.handover import RecordSender, StatusSender
+from deal_hw.control.realtime import Granted, become_realtime, die_with_parent, kill_self_after
+
+_START_SILENCE_S = 30.0
+_ORPHAN_S = 2.0
+
+
+class _Stopper:
+    """Turns signals into a stop of whatever runs: an exit before there is a loop, its passive route afterwards."""
+
+    def __init__(self, parent_pid: int) -> None:
+        self._parent_pid = parent_pid
+        self.loop: Any = None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        reason = "stopped by the operator"
+        if os.getppid() != self._parent_pid:
+            # Nobody is left to kill this process if its passive route hangs.
+            kill_self_after(_ORPHAN_S)
+            reason = "the supervisor died"
+        if self.loop is None:
+            raise KeyboardInterrupt
+        self.loop.request_stop(reason)
+
+
+def main() -> int:
+    """Run the orders from standard input; return the exit code (0: the report says how it went)."""
+    orders: dict[str, Any] = json.load(sys.stdin)
+    status = StatusSender(socket.socket(fileno=orders["status_fd"]))
+    clock = MonotonicClock()
+    stopper = _Stopper(orders["parent_pid"])
+    try:
+        die_with_parent(orders["parent_pid"])
+        status.beat(clock.now_ns(), "loading", _START_SILENCE_S)
+        status.result(_run(orders, status, clock, stopper))
+    except KeyboardInterrupt:
+        status.result({"outcome": "stopped", "reason": "stopped by the operator", "error": "", "passive_confirmed": True})
+    except Exception as err:
+        # Nothing was armed yet: the loop itself reports its errors instead of raising them.
+        status.result(
+            {"outcome": "failed", "reason": str(err), "error": type(err).__name__, "passive_confirmed": True}
+        )
+    return 0
+
+
+def _run(orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper) -> dict[str, Any]:
+    # Imported here, so that a stop during these imports is answered, too.
+    from deal_hw.cli.run_plan import RunPlan, make_behaviour
+    from deal_hw.control.loop import ControlLoop, LoopConfig
+    from deal_hw.control.safety import Safety
+    from deal_hw.drivers import adopt_robot
+
+    plan = RunPlan.from_json(orders)
+    robot = adopt_robot(plan.robot, plan.transport, orders["port_fd"], clock)
+    behaviour = make_behaviour(plan, robot.description)
+    sink = RecordSender(socket.socket(fileno=orders["record_fd"])) if "record_fd" in orders else _discard
+    granted = become_realtime() if plan.realtime else Granted("default", ())
+    loop = ControlLoop(
+        robot, behaviour, Safety(robot.description), clock, sink,
+        LoopConfig(duration_s=plan.seconds, dry_run=plan.dry_run, home=plan.home),
+        progress=lambda phase, silence_s: status.beat(clock.now_ns(), phase, silence_s),
+        scheduling=granted.scheduling,
+    )  # fmt: skip
+    for warning in granted.warnings:
+        loop.note("warning", warning)
+    stopper.loop = loop
+    return {**loop.run().to_json(), "warnings": list(granted.warnings)}
+
+
+def _discard(record: object) -> bool:
+    return True
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""``deal-hw deploy``: run a policy on the robot behind the safety filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from deal_hw.cli.run_plan import RunPlan, shipped_policy
+from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deploy:
+    """Run a policy on the robot behind the safety filter, and record it."""
+
+    robot: tyro.conf.Positional[str]
+    """The robot, such as cartpole."""
+
+    port: str
+    """Where the robot is, such as /dev/ttyUSB0."""
+
+    transport: str = "serial"
+    """How the robot is reached."""
+
+    policy: Path | None = None
+    """The policy (.onnx); by default the one shipped for the robot."""
+
+    out: Path | None = None
+    """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET nothing is recorded."""
+
+    dataset: Path | None = None
+    """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
+
+    seconds: float = 10.0
+    """Length of an episode [s]."""
+
+    episodes: int = 1
+    """How many episodes."""
+
+    seed: int = 0
+    """Noted in the recording; the policy itself is not random."""
+
+    task: str = ""
+    """What the policy is to do, in words, for the recording."""
+
+    dry_run: bool = False
+    """Compute everything and send nothing: the robot is neither homed nor armed."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def deploy(config: Deploy) -> RunReport:
+    """Run the policy and return how it went.
+
+    Raises:
+        PolicyMismatchError: The policy was made for another robot; the message names what differs.
+        DealHwError: What made it fail; the robot is passive and what was recorded is whole.
+    """
+    policy = config.policy or shipped_policy(config.robot)
+    plan = RunPlan(
+        robot=config.robot,
+        transport=config.transport,
+        profile="balance",
+        policy=str(policy or ""),
+        seconds=config.seconds,
+        seed=config.seed,
+        dry_run=config.dry_run,
+        home=not config.dry_run,
+    )
+    return run_episodes(
+        plan,
+        port=config.port,
+        dataset=dataset_folder(config.out, config.dataset, required=False),
+        episodes=config.episodes,
+        purpose="deploy",
+        task=config.task,
+        quiet=config.quiet,
+    )

@@ -1,0 +1,234 @@
+"""The `deal-hw` command: finds the verb, hands it its settings, turns what goes wrong into one line.
+
+A verb is a module of this package that holds a frozen dataclass of settings and a function that takes it.
+The table names them as text and imports only the verb that was asked for, so that `deal-hw --help` starts at
+once and `collect` never loads what only `train` needs.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from deal_hw import __version__
+from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError
+
+EXIT_OK = 0
+EXIT_ERROR = 2
+"""Something was wrong with what was asked for, or with the world; the message says what."""
+EXIT_INTERRUPTED = 130
+"""Ctrl-C, as shells count it: 128 + SIGINT."""
+
+TRACEBACK_VARIABLE = "DEAL_HW_TRACEBACK"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verb:
+    """One verb of the command.
+
+    Attributes:
+        module: The module that does it.
+        config: Its settings: a dataclass, or a union of dataclasses for a verb with sub-verbs.
+        function: Called with the settings; returns an exit code, or a report, which may have an `exit_code`.
+        help: One line.
+        example: Arguments that run, as `deal-hw --help` shows them.
+        extra: The extra of the distribution that installs what the verb needs; "" for the base install.
+    """
+
+    module: str
+    config: str
+    function: str
+    help: str
+    example: str
+    extra: str = ""
+
+
+def _verb(name: str, *, help: str, example: str, extra: str = "") -> Verb:
+    return Verb(
+        module=f"deal_hw.cli.{name}",
+        config=name.capitalize(),
+        function=name,
+        help=help,
+        example=example,
+        extra=extra,
+    )
+
+
+JOBS: Mapping[str, Verb] = MappingProxyType(
+    {
+        "collect": _verb(
+            "collect",
+            help="record the robot while it moves in a way that tells much",
+            example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
+        ),
+        "calibrate": _verb(
+            "calibrate",
+            help="find the simulator parameters that explain a recording",
+            example="calibrate runs/first/dataset --out runs/first",
+            extra="calib",
+        ),
+        "train": _verb(
+            "train",
+            help="train a policy under the calibrated distribution",
+            example="train cartpole --distribution runs/first/calibration/distribution.json --out runs/first",
+            extra="train",
+        ),
+        "deploy": _verb(
+            "deploy",
+            help="run a policy on the robot behind the safety filter",
+            example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/calibrated.onnx",
+        ),
+        "inspect": _verb(
+            "inspect",
+            help="see the real, the nominal and the calibrated motion on one screen",
+            example="inspect runs/first/dataset/episodes/000000.mcap",
+            extra="sim,viz",
+        ),
+    }
+)
+"""The five jobs, in the order of the loop."""
+
+TOOLS: Mapping[str, Verb] = MappingProxyType(
+    {
+        "demo": _verb(
+            "demo", help="do all five on an emulated cart-pole", example="demo --out runs/demo", extra="all"
+        ),
+        "emulate": _verb(
+            "emulate",
+            help="be a robot on the wire, with hidden physics",
+            example="emulate cartpole --profile realistic --seed 0",
+            extra="sim",
+        ),
+        "data": _verb(
+            "data", help="tell about a dataset, verify it, repair it", example="data info runs/first/dataset"
+        ),
+        "replay": _verb(
+            "replay",
+            help="send a recording's commands again, through the safety filter",
+            example="replay runs/first/dataset/episodes/000000.mcap --port /dev/ttyUSB0",
+        ),
+        "bench": _verb(
+            "bench",
+            help="measure how well calibration and the loop do, as JSON rows",
+            example="bench loop --profile sensor --seeds 0,1 --out loop.json",
+            extra="bench",
+        ),
+    }
+)
+"""What helps with the five."""
+
+VERBS: Mapping[str, Verb] = MappingProxyType({**JOBS, **TOOLS})
+
+
+def help_text() -> str:
+    """Return what `deal-hw --help` prints."""
+    lines = [
+        f"deal-hw {__version__}: record a robot, calibrate its simulator, retrain, deploy, compare.",
+        "",
+        "usage: deal-hw VERB [options]      deal-hw VERB --help lists the options of a verb",
+    ]
+    for title, verbs in (("the five jobs, in order", JOBS), ("beside them", TOOLS)):
+        lines += ["", f"{title}:"]
+        for name, verb in verbs.items():
+            lines += [f"  {name:<10} {verb.help}", f"  {'':<10}   deal-hw {verb.example}"]
+    lines += [
+        "",
+        "No robot at hand? `deal-hw demo` needs none; `deal-hw emulate cartpole` prints a port to use.",
+        f"with every verb: --help; --traceback (or {TRACEBACK_VARIABLE}=1) to see where an error came from",
+        "without a verb: --help, --version",
+    ]
+    return "\n".join(lines)
+
+
+def find(name: str) -> Verb:
+    """Return the verb of that name.
+
+    Raises:
+        UnknownNameError: There is none; the message lists the verbs, and the nearest one if any is near.
+    """
+    if name in VERBS:
+        return VERBS[name]
+    import difflib
+
+    error = UnknownNameError("verb", name, VERBS)
+    near = difflib.get_close_matches(name, VERBS, n=1)
+    if near:
+        error.args = (f"{error}; did you mean {near[0]!r}?",)
+    raise error
+
+
+def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], object]]:
+    """Return a verb's settings, parsed from its command-line arguments, and the function that takes them.
+
+    Raises:
+        UnknownNameError: There is no such verb.
+        SystemExit: The arguments do not parse, or asked for help.
+    """
+    verb = find(name)
+    import importlib
+
+    import tyro
+
+    module = importlib.import_module(verb.module)
+    settings = tyro.cli(
+        getattr(module, verb.config),
+        prog=f"deal-hw {name}",
+        args=list(arguments),
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    return settings, getattr(module, verb.function)
+
+
+def run(name: str, arguments: Sequence[str]) -> int:
+    """Run a verb with its command-line arguments and return its exit code.
+
+    Raises:
+        DealHwError: What the verb raised; or an extra is missing.
+        SystemExit: The arguments do not parse, or asked for help.
+    """
+    try:
+        settings, function = parse(name, arguments)
+        result = function(settings)
+    except ModuleNotFoundError as err:
+        package = (err.name or "").partition(".")[0]
+        if isinstance(err, DealHwError) or package in {"", "deal_hw"}:
+            raise
+        raise MissingExtraError(package, find(name).extra or "all") from err
+    code = getattr(result, "exit_code", result)
+    return code if isinstance(code, int) and not isinstance(code, bool) else EXIT_OK
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code.
+
+    Args:
+        arguments: What follows `deal-hw` on the command line; by default the process's own.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    show_traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "0") not in {"", "0"}
+    given = [word for word in given if word != "--traceback"]
+    if not given or given[0] in {"-h", "--help", "help"}:
+        print(help_text())
+        return EXIT_OK
+    if given[0] == "--version":
+        print(f"deal-hw {__version__}")
+        return EXIT_OK
+    try:
+        return run(given[0], given[1:])
+    except KeyboardInterrupt:
+        print("deal-hw: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except (DealHwError, OSError) as err:
+        # An OSError is the world's refusal (no such file, disk full), not a bug: it gets its one line, too.
+        if show_traceback:
+            raise
+        print(f"deal-hw: error: {err}", file=sys.stderr)
+        return EXIT_ERROR
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,67 @@
+"""``deal-hw replay``: send a recording's commands again, through the safety filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from deal_hw.cli.run_plan import RunPlan
+from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
+from deal_hw.control.behaviours import ReplayBehaviour
+from deal_hw.data.reader import read_trajectory
+from deal_hw.drivers import robot_description
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """Send the commands that a recording asked for again, through the safety filter, and record what happens."""
+
+    episode: tyro.conf.Positional[Path]
+    """The recording (.mcap)."""
+
+    port: str
+    """Where the robot is, such as /dev/ttyUSB0."""
+
+    transport: str = "serial"
+    """How the robot is reached."""
+
+    out: Path | None = None
+    """Run folder; the episode goes to OUT/dataset. Without OUT and DATASET nothing is recorded."""
+
+    dataset: Path | None = None
+    """Dataset folder instead of OUT/dataset."""
+
+    robot: str = ""
+    """The robot; by default the one that was recorded."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def replay(config: Replay) -> RunReport:
+    """Replay a recording from the robot's start pose and return how it went.
+
+    Raises:
+        DatasetError: The recording cannot be read or holds no command.
+        DealHwError: What made it fail; the robot is passive and what was recorded is whole.
+    """
+    trajectory = read_trajectory(config.episode)
+    robot = config.robot or str(trajectory.metadata.get("robot", ""))
+    behaviour = ReplayBehaviour(trajectory, robot_description(robot))
+    plan = RunPlan(
+        robot=robot,
+        transport=config.transport,
+        profile="replay",
+        recording=str(config.episode.resolve()),
+        seconds=behaviour.duration_s,
+    )
+    return run_episodes(
+        plan,
+        port=config.port,
+        dataset=dataset_folder(config.out, config.dataset, required=False),
+        episodes=1,
+        purpose="replay",
+        quiet=config.quiet,
+    )

@@ -1,0 +1,110 @@
+"""What a control process is told to do, and the robot and behaviour that it makes of it.
+
+Plain values, for they cross a process boundary as JSON. Imports neither torch, mujoco nor scipy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
+from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig, Segment
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
+
+Profile = Literal["rich", "chirp", "balance", "hold", "replay"]
+"""What a run does; `balance` runs the policy all the time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunPlan:
+    """One run of one robot.
+
+    Attributes:
+        robot: Its name.
+        transport: Name of the transport.
+        profile: What it does.
+        policy: Policy file; "" for none.
+        recording: Episode to replay; "" for none.
+        seconds: Length of the run [s].
+        seed: Fixes what is random in the behaviour.
+        dry_run: Whether to compute everything and send nothing.
+        home: Whether to bring the robot to its start pose first.
+        rich: Settings of the profile `rich`; its length is ``seconds``.
+        realtime: Whether to ask for SCHED_FIFO and locked memory.
+    """
+
+    robot: str
+    transport: str = "serial"
+    profile: Profile = "balance"
+    policy: str = ""
+    recording: str = ""
+    seconds: float = 4.0
+    seed: int = 0
+    dry_run: bool = False
+    home: bool = True
+    rich: RichConfig = field(default_factory=RichConfig)
+    realtime: bool = True
+
+    def __post_init__(self) -> None:
+        if self.profile not in get_args(Profile):
+            raise UnknownNameError("profile", self.profile, get_args(Profile))
+        if not 0 < self.seconds < float("inf"):
+            raise ConfigurationError(f"--seconds {self.seconds!r}: a run lasts longer than 0 s and not for ever")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> RunPlan:
+        """Return the plan that :meth:`to_json` wrote; other keys are ignored."""
+        known = {f.name: values[f.name] for f in dataclasses.fields(cls)}
+        rich = dict(known["rich"])
+        rich["hold_s"] = tuple(rich["hold_s"])
+        rich["segments"] = tuple(Segment(**part) for part in rich["segments"])
+        return cls(**{**known, "rich": RichConfig(**rich)})
+
+
+def shipped_policy(robot: str) -> Path | None:
+    """Return the policy that is shipped for a robot; None where there is none."""
+    path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{robot}_udr.onnx"))
+    return path if path.is_file() else None
+
+
+def make_behaviour(plan: RunPlan, description: RobotDescription) -> Behaviour:
+    """Return what the plan asks of the robot.
+
+    Raises:
+        PolicyError: The policy is missing or cannot run.
+        PolicyMismatchError: It was made for another robot.
+        DatasetError: The recording cannot be replayed.
+    """
+    if plan.profile == "hold":
+        return HoldBehaviour(description)
+    if plan.profile == "chirp":
+        return ChirpBehaviour(description, ChirpConfig(duration_s=plan.seconds))
+    if plan.profile == "replay":
+        from deal_hw.data.reader import read_trajectory
+
+        return ReplayBehaviour(read_trajectory(Path(plan.recording)), description)
+    if plan.profile == "rich":
+        config = dataclasses.replace(plan.rich, duration_s=plan.seconds)
+        balance = _policy(plan, description) if config.balance_s > 0 else None
+        return RichBehaviour(description, balance, config, plan.seed)
+    return _policy(plan, description)
+
+
+def _policy(plan: RunPlan, description: RobotDescription) -> Behaviour:
+    if not plan.policy:
+        raise PolicyError(
+            f"profile {plan.profile!r} needs a policy, and none is shipped for robot {plan.robot!r}; give --policy FILE, "
+            "or use --profile chirp or hold"
+        )
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    return PolicyBehaviour(OnnxPolicy(plan.policy), description)

@@ -1,0 +1,330 @@
+"""What collect, deploy and replay share: they are one run under a supervisor, with another behaviour and purpose."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deal_hw import __version__, errors
+from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.cadence import CadenceReport
+from deal_hw.control.handover import Beat
+from deal_hw.control.loop import RUNNING, Outcome
+from deal_hw.control.passive import make_passive
+from deal_hw.control.supervisor import OPERATOR, ChildEnd, Supervisor
+from deal_hw.data.recorder_launch import start_recorder
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import make_robot, robot_description
+from deal_hw.robot import Robot
+
+if TYPE_CHECKING:
+    from deal_hw.data.dataset import Dataset
+
+_LINK_WARNING = 0.01
+"""Share of corrupt and missing state frames above which the operator is told."""
+_EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeReport:
+    """How one episode went.
+
+    Attributes:
+        path: The recording; None where nothing was recorded.
+        outcome: How it ended.
+        reason: In words.
+        passive_confirmed: Whether the robot itself confirmed that it is passive.
+        cadence: How regular the control loop was; None where it never ran or was killed.
+        clipped: Cycles in which each limit changed a command, by limit.
+        cycles_sent: Commands sent.
+        states_recorded: State samples in the file.
+        warnings: What the operator should know.
+        error: Name of the error's class where it failed.
+    """
+
+    path: Path | None
+    outcome: Outcome
+    reason: str
+    passive_confirmed: bool
+    cadence: CadenceReport | None
+    clipped: dict[str, int]
+    cycles_sent: int
+    states_recorded: int
+    warnings: tuple[str, ...]
+    error: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "outcome": self.outcome.value, "reason": self.reason, "passive_confirmed": self.passive_confirmed,
+            "cadence": self.cadence.to_json() if self.cadence is not None else None, "clipped": self.clipped,
+            "cycles_sent": self.cycles_sent, "states_recorded": self.states_recorded, "warnings": list(self.warnings),
+            "error": self.error,
+        }  # fmt: skip
+
+    def raise_error(self) -> None:
+        """Raise the error that ended the episode, as the class that it was in the control process."""
+        if self.outcome is not Outcome.FAILED:
+            return
+        kind = getattr(errors, self.error, errors.DealHwError)
+        if not issubclass(kind, errors.DealHwError) or kind in (errors.UnknownNameError, errors.MissingExtraError):
+            kind = errors.DealHwError
+        raise kind(self.reason)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunReport:
+    """How a run of episodes went.
+
+    Attributes:
+        dataset: The dataset's folder; None where nothing was recorded.
+        episodes: The episodes, in order; the last is the one that did not finish, if any.
+    """
+
+    dataset: Path | None
+    episodes: tuple[EpisodeReport, ...]
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the last episode ended."""
+        return self.episodes[-1].outcome
+
+    @property
+    def exit_code(self) -> int:
+        """For the shell: 0 finished, 2 failed, 3 tripped by the safety module, 130 stopped by the operator."""
+        return _EXIT_CODES[self.outcome]
+
+
+def _ignore(beat: Beat) -> None:
+    return
+
+
+def dataset_folder(out: Path | None, dataset: Path | None, *, required: bool = True) -> Path | None:
+    """Return the dataset's folder from the options --out and --dataset.
+
+    Raises:
+        ConfigurationError: Both were given, or neither where one is required.
+    """
+    if out is not None and dataset is not None:
+        raise errors.ConfigurationError("give --out RUN or --dataset DIR, not both")
+    if out is None and dataset is None and required:
+        raise errors.ConfigurationError("give --out RUN (the episodes go to RUN/dataset) or --dataset DIR")
+    return out / "dataset" if out is not None else dataset
+
+
+def run_episodes(
+    plan: RunPlan,
+    *,
+    port: str,
+    dataset: Path | None,
+    episodes: int,
+    purpose: str,
+    task: str = "",
+    quiet: bool = False,
+    on_beat: Callable[[Beat], None] = _ignore,
+) -> RunReport:
+    """Run episodes one after the other on one port, each in a control process of its own.
+
+    Args:
+        plan: What to do; each episode adds its number to the seed.
+        port: The port.
+        dataset: Folder of the dataset, made or extended; None to record nothing.
+        episodes: How many.
+        purpose: "collect", "deploy" or "replay", for the metadata.
+        task: For the metadata.
+        quiet: Whether to print nothing.
+        on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
+
+    Raises:
+        DealHwError: What made it fail, after the robot was made passive and the recording closed.
+    """
+    if episodes < 1:
+        raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
+    description = robot_description(plan.robot)
+    # Whatever is wrong with policy or recording should be said before anybody touches the robot.
+    make_behaviour(plan, description)
+    robot = make_robot(plan.robot, plan.transport, port, MonotonicClock())
+    reports: list[EpisodeReport] = []
+    # The supervisor greets the robot itself, so that a wrong port is known before any process is started. From then on
+    # it only keeps the port, until the control process is dead.
+    with robot, _open_dataset(dataset, robot.description) as store:
+        for number in range(episodes):
+            run = _Episode(dataclasses.replace(plan, seed=plan.seed + number), robot, port, store, purpose, task)
+            title = f"{purpose} {plan.robot} {number + 1}/{episodes}"
+            with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.seconds) as show:
+                reports.append(run.run(lambda beat, show=show: (show(beat), on_beat(beat))))
+            if not quiet:
+                print_report(reports[-1])
+            if reports[-1].outcome is not Outcome.FINISHED:
+                break
+    reports[-1].raise_error()
+    return RunReport(dataset=dataset, episodes=tuple(reports))
+
+
+@contextlib.contextmanager
+def _open_dataset(folder: Path | None, description: RobotDescription) -> Iterator[Dataset | None]:
+    if folder is None:
+        yield None
+        return
+    from deal_hw.data.dataset import Dataset
+
+    with Dataset.create_or_open(folder, description, lambda text: print(text, file=sys.stderr)) as store:
+        yield store
+
+
+class _Episode:
+    """One episode: a recorder, a control process and the account of both."""
+
+    def __init__(
+        self, plan: RunPlan, robot: Robot, port: str, store: Dataset | None, purpose: str, task: str
+    ) -> None:
+        self._plan, self._robot, self._port, self._store = plan, robot, port, store
+        self._path = store.next_episode_path() if store is not None else None
+        self._metadata = {
+            "robot": plan.robot,
+            "description_digest": robot.description.digest(),
+            "purpose": purpose,
+            "task": task,
+            "profile": plan.profile,
+            "policy": plan.policy,
+            "policy_digest": _digest(plan.policy),
+            "recording": plan.recording,
+            "seed": plan.seed,
+            "seconds": plan.seconds,
+            "dry_run": plan.dry_run,
+            "deal_hw": __version__,
+        }
+
+    def run(self, on_beat: Callable[[Beat], None]) -> EpisodeReport:
+        """Run it and return the account."""
+        recorder = None
+        if self._path is not None:
+            recorder = start_recorder(self._path, self._robot.description.to_json(), self._metadata)
+            try:
+                recorder.wait_ready()
+            except BaseException:
+                recorder.finish()
+                raise
+        port_fd = self._robot.fileno()
+        end = Supervisor(
+            module="deal_hw.cli.control_process",
+            plan=self._plan.to_json(),
+            port_fd=port_fd,
+            passive=lambda: make_passive(self._robot, MonotonicClock()),
+            recorder=recorder,
+            on_beat=on_beat,
+        ).run()
+        report = account(end, self._path)
+        # The control process knows the port only as the descriptor that it inherited.
+        reason = report.reason.replace(f"inherited descriptor {port_fd}", self._port)
+        report = dataclasses.replace(report, reason=reason)
+        if self._store is not None and self._path is not None:
+            try:
+                self._store.note_episode(self._path, {"task": self._metadata["task"], **report.to_json()})
+            except (errors.DealHwError, OSError) as err:
+                # As on a full disk. The report matters more, and the next open takes the recording in.
+                report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
+        return report
+
+
+def _digest(policy: str) -> str:
+    return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16] if policy else ""
+
+
+def account(end: ChildEnd, path: Path | None) -> EpisodeReport:
+    """Return how an episode went from how its processes ended."""
+    result = end.result or {}
+    outcome, reason, error = _verdict(end, result)
+    warnings = list(result.get("warnings", ()))
+    if not end.passive_confirmed:
+        warnings.append(
+            "the robot did not confirm that it is passive: switch it off by hand. Where the cable is cut, only the "
+            "device's own watchdog can stop its motors"
+        )
+    cadence = CadenceReport.from_json(result["cadence"]) if result.get("cadence") else None
+    if cadence is not None and cadence.link_errors > _LINK_WARNING * max(cadence.states, 1):
+        share = cadence.link_errors / (cadence.states + cadence.link_errors)
+        warnings.append(
+            f"{cadence.link_errors} link errors, {share:.0%} of the state frames: check cable, connectors and grounding"
+        )
+    if end.recorder is not None and not end.recorder.complete:
+        why = "; ".join(end.recorder.errors) or "for an unknown reason"
+        warnings.append(f"the recording is incomplete ({why}); mend it with `deal-hw data repair {path}`")
+        if outcome is Outcome.FINISHED:
+            outcome, reason, error = Outcome.FAILED, f"the recorder failed: {why}", "DatasetError"
+    return EpisodeReport(
+        path=path,
+        outcome=outcome,
+        reason=reason,
+        passive_confirmed=end.passive_confirmed,
+        cadence=cadence,
+        clipped=dict(result.get("clipped", {})),
+        cycles_sent=int(result.get("cycles_sent", 0)),
+        states_recorded=end.recorder.states if end.recorder is not None else 0,
+        warnings=tuple(warnings),
+        error=error,
+    )
+
+
+def _verdict(end: ChildEnd, result: dict[str, Any]) -> tuple[Outcome, str, str]:
+    """Return outcome, reason in words and the error's class."""
+    if end.killed and end.stop_cause != OPERATOR:
+        return Outcome.FAILED, f"the control process was killed: {end.killed}", "SafetyError"
+    if end.stop_cause and end.stop_cause != OPERATOR:
+        return Outcome.FAILED, end.stop_cause, "DatasetError"
+    if result:
+        return Outcome(result["outcome"]), result["reason"], result["error"]
+    if end.stop_cause == OPERATOR:
+        return Outcome.STOPPED, OPERATOR, ""
+    code = end.exit_code
+    how = f"by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"with exit code {code}"
+    return Outcome.FAILED, f"the control process died {how} without a report", "SafetyError"
+
+
+def print_report(report: EpisodeReport) -> None:
+    """Print an account for the operator."""
+    print(f"{report.outcome.value}: {report.reason}")
+    if report.cadence is not None:
+        print("\n".join("  " + line for line in report.cadence.lines()))
+    for limit, cycles in report.clipped.items():
+        print(f"  clipped by the safety filter: {limit} in {cycles} cycles")
+    if report.path is not None:
+        print(f"  recorded {report.states_recorded} states in {report.path}")
+    for warning in report.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _progress(title: str, seconds: float) -> Iterator[Callable[[Beat], None]]:
+    """Show a progress bar on a terminal; nothing otherwise."""
+    if not sys.stderr.isatty():
+        yield _ignore
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=seconds)
+        started_ns = 0
+
+        def on_beat(beat: Beat) -> None:
+            nonlocal started_ns
+            if beat.phase != RUNNING:
+                bar.update(task, description=f"{title}: {beat.phase}")
+                return
+            if not started_ns:
+                started_ns = beat.stamp_ns
+                bar.update(task, description=title)
+            if beat.count % 10 == 0:
+                bar.update(task, completed=(beat.stamp_ns - started_ns) * 1e-9)
+
+        yield on_beat

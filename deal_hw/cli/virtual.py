@@ -1,0 +1,102 @@
+"""Emulated robots in virtual time: the same bytes, driver, loop and recorder as on the wire, faster than real time."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.clock import VirtualClock
+from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.safety import Safety
+from deal_hw.data.reader import read_trajectory
+from deal_hw.data.record import CycleRecord
+from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.types import FloatArray, Trajectory
+
+_START_NS = 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualEpisode:
+    """One recording of an emulated robot, with what really happened.
+
+    Attributes:
+        trajectory: The recording, as read back from its file.
+        true_position: Noise-free positions at the trajectory's samples and their device time, (T, J).
+        true_velocity: (T, J).
+        report: How the run went.
+    """
+
+    trajectory: Trajectory
+    true_position: FloatArray
+    true_velocity: FloatArray
+    report: LoopReport
+
+
+class VirtualCartpole:
+    """An emulated cart-pole in virtual time; each run homes it, arms it and leaves it passive.
+
+    Args:
+        truth: Its hidden parameters, profile and seed.
+    """
+
+    def __init__(self, truth: Truth) -> None:
+        self.truth = truth
+        self.clock = VirtualClock(_START_NS)
+        self.device = CartpoleDevice(truth, keep_truth=True)
+        self._transport = VirtualTransport(self.device, self.clock)
+
+    @property
+    def description(self) -> RobotDescription:
+        """The robot's description."""
+        return CartpoleRobot.description
+
+    def run(
+        self,
+        behaviour: Behaviour,
+        seconds: float,
+        path: Path | None = None,
+        metadata: Mapping[str, Any] | None = None,
+    ) -> VirtualEpisode:
+        """Run a behaviour and record it.
+
+        Args:
+            behaviour: What to do.
+            seconds: Length of the run [s].
+            path: File to write; a temporary one by default.
+            metadata: For the recording.
+        """
+        robot = CartpoleRobot(self._transport, self.clock)
+        ticks: list[int] = []
+        with tempfile.TemporaryDirectory() as folder:
+            file = path or Path(folder) / "episode.mcap"
+            with EpisodeRecorder(file, self.description.to_json(), metadata or {}, self.clock) as recorder:
+
+                def sink(record: CycleRecord) -> bool:
+                    ticks.extend(round(state.device_ns / 1e6) for state in record.states)
+                    recorder.write(record)
+                    return True
+
+                safety = Safety(self.description)
+                config = LoopConfig(duration_s=seconds)
+                report = ControlLoop(robot, behaviour, safety, self.clock, sink, config).run()
+            trajectory = read_trajectory(file)
+        position, velocity = _at(self.device.true_trajectory(), np.array(ticks))
+        return VirtualEpisode(trajectory, position, velocity, report)
+
+
+def _at(true: TrueTrajectory, ticks: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[FloatArray, FloatArray]:
+    rows = np.searchsorted(true.tick, ticks)
+    rows = np.minimum(rows, len(true.tick) - 1)
+    return true.position[rows], true.velocity[rows]

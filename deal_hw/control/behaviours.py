@@ -1,0 +1,160 @@
+"""Behaviours: what a run asks of the robot, cycle by cycle. numpy only; the safety filter judges all of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, DatasetError, PolicyError
+from deal_hw.policy import ObservationBuilder, Policy
+from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
+
+
+class Behaviour(Protocol):
+    """Turns states into commands."""
+
+    @property
+    def action(self) -> FloatArray | None:
+        """The unitless action behind the last command, (A,); None where there is none."""
+        ...
+
+    def reset(self) -> None:
+        """Start anew; the same state sequence gives the same commands again."""
+        ...
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the command for a state.
+
+        Args:
+            state: The newest state.
+            time_s: Time since the run's first cycle, on the grid of deadlines [s].
+        """
+        ...
+
+
+def position_command(
+    description: RobotDescription,
+    target: FloatArray,
+    *,
+    stiffness: float = 1.0,
+    damping: float = 1.0,
+    effort_limit: float = 1.0,
+    speed_limit: float = 1.0,
+) -> JointCommand:
+    """Return a position target, (A,), with the description's gains and limits, each times a factor."""
+    zeros = np.zeros(len(description.actuated))
+    return JointCommand(
+        position_target=np.array(target, dtype=float),
+        velocity_target=zeros,
+        stiffness=stiffness * np.array(description.stiffness),
+        damping=damping * np.array(description.damping),
+        effort=zeros,
+        effort_limit=effort_limit * np.array(description.effort_limit),
+        speed_limit=speed_limit * np.array(description.speed_limit),
+    )
+
+
+class PolicyBehaviour:
+    """Runs a policy: target = default + scale x action, with the gains and limits of the policy's spec.
+
+    Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on.
+
+    Raises:
+        PolicyMismatchError: The policy was made for another robot.
+        PolicyError: It returns an action of another shape.
+    """
+
+    def __init__(self, policy: Policy, description: RobotDescription) -> None:
+        spec = policy.spec
+        spec.check_fits(description)
+        self._policy = policy
+        self._observations = ObservationBuilder(spec)
+        self._scale = np.array(spec.action_scale)
+        self._default = np.array(spec.default_position)[list(description.actuated_index)]
+        zeros = np.zeros(len(spec.actuated))
+        self._template = JointCommand(
+            zeros, zeros, np.array(spec.stiffness), np.array(spec.damping), zeros, np.array(spec.effort_limit),
+            np.array(spec.speed_limit),
+        )  # fmt: skip
+        self.action: FloatArray | None = None
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._policy.reset()
+        self._observations.reset()
+        self.action = None
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the policy's command."""
+        observation = self._observations.build(state.position, state.velocity)
+        action = np.asarray(self._policy.act(observation), dtype=float)
+        if action.shape != self._scale.shape:
+            raise PolicyError(f"the policy returned an action of shape {action.shape}, expected {self._scale.shape}")
+        self.action = np.clip(action, -1.0, 1.0)
+        self._observations.record_action(self.action)
+        return dataclasses.replace(self._template, position_target=self._default + self._scale * self.action)
+
+
+class HoldBehaviour:
+    """Holds one position: the default pose, or the pose given."""
+
+    action: FloatArray | None = None
+
+    def __init__(self, description: RobotDescription, position: FloatArray | None = None) -> None:
+        default = np.array(description.default_position)[list(description.actuated_index)]
+        self._command = position_command(description, default if position is None else position)
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the one command."""
+        return self._command
+
+
+class ReplayBehaviour:
+    """Asks again, by time, for what a recording asked for.
+
+    Args:
+        trajectory: The recording.
+        description: The robot that it will run on.
+
+    Raises:
+        ConfigurationError: The recording is of another robot.
+        DatasetError: It holds no command.
+    """
+
+    action: FloatArray | None = None
+
+    def __init__(self, trajectory: Trajectory, description: RobotDescription) -> None:
+        if trajectory.actuated != description.actuated or trajectory.joint_names != description.joint_names:
+            raise ConfigurationError(
+                f"the recording is of joints {trajectory.joint_names} with actuated {trajectory.actuated}; robot "
+                f"{description.name!r} has {description.joint_names} with actuated {description.actuated}"
+            )
+        if not trajectory.sent_s.size:
+            raise DatasetError("the recording holds no command to replay")
+        self._trajectory = trajectory
+        self._time_s = trajectory.sent_s - trajectory.sent_s[0]
+        # Commands go out on a grid of periods: half a period of slack keeps send jitter from shifting them by one.
+        self._slack_s = 0.5 / description.control_rate_hz
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first command to one period after the last [s]."""
+        return float(self._time_s[-1]) + 2 * self._slack_s
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the command that was in force at this time of the recording."""
+        i = max(int(np.searchsorted(self._time_s, time_s + self._slack_s, side="right")) - 1, 0)
+        t = self._trajectory
+        zeros = np.zeros(len(t.actuated))
+        return JointCommand(
+            t.asked_position[i], zeros, t.stiffness[i], t.damping[i], zeros, t.effort_limit[i], t.speed_limit[i]
+        )

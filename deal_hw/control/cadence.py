@@ -1,0 +1,196 @@
+"""Pacing on absolute deadlines, and the report on how well it went. One class."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.errors import ConfigurationError
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Median, 99th percentile and largest of a set of durations [s]; NaN of none."""
+
+    p50_s: float
+    p99_s: float
+    max_s: float
+
+    @classmethod
+    def of(cls, samples_ns: array[int]) -> Spread:
+        """Return the spread of samples in ns."""
+        if not samples_ns:
+            return cls(float("nan"), float("nan"), float("nan"))
+        values = np.array(samples_ns) * 1e-9
+        return cls(*(round(float(v), 9) for v in (*np.percentile(values, (50, 99)), values.max())))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CadenceReport:
+    """How regular a run was.
+
+    Attributes:
+        rate_hz: The rate asked for [Hz].
+        cycles: Cycles run.
+        period: Time from one cycle's start to the next.
+        lateness: Time from a cycle's deadline to its start.
+        overruns: Cycles that started more than a tenth of a period late.
+        overruns_beyond_period: Of these, cycles that started a whole period late or more.
+        skipped_periods: Deadlines passed over because of that.
+        state_age: Age of the newest state when the command was computed.
+        sections: Time spent in each part of a cycle.
+        states: State samples received.
+        cycles_without_state: Cycles in which no new state had arrived.
+        losses: Hand-overs that the recorder refused.
+        link_errors: Corrupt frames and gaps in the state's sequence numbers.
+        scheduling: What the operating system granted.
+    """
+
+    rate_hz: float
+    cycles: int
+    period: Spread
+    lateness: Spread
+    overruns: int
+    overruns_beyond_period: int
+    skipped_periods: int
+    state_age: Spread
+    sections: dict[str, Spread] = field(default_factory=dict)
+    states: int = 0
+    cycles_without_state: int = 0
+    losses: int = 0
+    link_errors: int = 0
+    scheduling: str = "default"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; None for what was never measured."""
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: plain(part) for key, part in value.items()}
+            return None if isinstance(value, float) and value != value else value
+
+        return {key: plain(value) for key, value in dataclasses.asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> CadenceReport:
+        """Return the report that :meth:`to_json` wrote."""
+
+        def spread(part: dict[str, float | None]) -> Spread:
+            return Spread(**{key: float("nan") if value is None else value for key, value in part.items()})
+
+        changed: dict[str, Any] = {name: spread(values[name]) for name in ("period", "lateness", "state_age")}
+        changed["sections"] = {name: spread(part) for name, part in values["sections"].items()}
+        return cls(**{**values, **changed})
+
+    def lines(self) -> list[str]:
+        """Return the report as lines for a person."""
+
+        def ms(spread: Spread) -> str:
+            return f"{spread.p50_s * 1e3:.2f} / {spread.p99_s * 1e3:.2f} / {spread.max_s * 1e3:.2f} ms"
+
+        return [
+            f"cycles      {self.cycles} at {self.rate_hz:g} Hz, scheduling {self.scheduling}",
+            f"period      {ms(self.period)} (p50 / p99 / max)",
+            f"lateness    {ms(self.lateness)}",
+            f"overruns    {self.overruns}, beyond one period {self.overruns_beyond_period}",
+            f"state age   {ms(self.state_age)}",
+            f"states      {self.states}, cycles without {self.cycles_without_state}, link errors {self.link_errors}",
+            f"losses      {self.losses} hand-overs to the recorder refused",
+        ]
+
+
+class Cadence:
+    """Paces a loop on absolute deadlines: lateness never adds up, and periods that are over are skipped, not caught up.
+
+    Call :meth:`begin` once a cycle, after :attr:`deadline_ns`; the first call sets the grid of deadlines.
+    """
+
+    def __init__(self, clock: Clock, rate_hz: float) -> None:
+        if not rate_hz > 0:
+            raise ConfigurationError(f"the rate of a loop must be above 0 Hz, not {rate_hz!r}")
+        self._clock = clock
+        self._rate_hz = rate_hz
+        self._period_ns = round(1e9 / rate_hz)
+        self._first_ns: int | None = None
+        self._start_ns = 0
+        self._index = -1
+        self._skipped = 0
+        self._periods = array("q")
+        self._lateness = array("q")
+        self._ages = array("q")
+        self._sections: dict[str, array[int]] = {}
+
+    @property
+    def period_ns(self) -> int:
+        """Nominal period [ns]."""
+        return self._period_ns
+
+    @property
+    def deadline_ns(self) -> int:
+        """When the next cycle is due [ns]; now before the first."""
+        if self._first_ns is None:
+            return self._clock.now_ns()
+        return self._first_ns + (self._index + 1) * self._period_ns
+
+    @property
+    def next_index(self) -> int:
+        """Number of the next cycle on the grid, unless it starts late."""
+        return self._index + 1
+
+    def begin(self) -> tuple[int, int]:
+        """Wait for the deadline, start a cycle and return its number on the grid and its deadline [ns]."""
+        due = self.deadline_ns
+        self._clock.sleep_until_ns(due)
+        now = self._clock.now_ns()
+        if self._first_ns is None:
+            self._first_ns = due = now
+        else:
+            self._periods.append(now - self._start_ns)
+        late = now - due
+        self._lateness.append(late)
+        skipped = late // self._period_ns
+        self._skipped += skipped
+        self._index += 1 + skipped
+        self._start_ns = now
+        return self._index, due + skipped * self._period_ns
+
+    @property
+    def late_ns(self) -> int:
+        """How late the last cycle started, against the first deadline that it missed [ns]."""
+        return self._lateness[-1]
+
+    def note_state_age(self, age_ns: int) -> None:
+        """Note the age of the newest state when a command was computed [ns]."""
+        self._ages.append(age_ns)
+
+    @contextlib.contextmanager
+    def section(self, name: str) -> Iterator[None]:
+        """Time one part of the cycle."""
+        begun = self._clock.now_ns()
+        try:
+            yield
+        finally:
+            self._sections.setdefault(name, array("q")).append(self._clock.now_ns() - begun)
+
+    def report(self, **counts: Any) -> CadenceReport:
+        """Return the report; ``counts`` are the fields that the loop counts itself."""
+        lateness = np.array(self._lateness, dtype=np.int64)
+        return CadenceReport(
+            rate_hz=self._rate_hz,
+            cycles=len(self._lateness),
+            period=Spread.of(self._periods),
+            lateness=Spread.of(self._lateness),
+            overruns=int((lateness > self._period_ns // 10).sum()),
+            overruns_beyond_period=int((lateness >= self._period_ns).sum()),
+            skipped_periods=self._skipped,
+            state_age=Spread.of(self._ages),
+            sections={name: Spread.of(samples) for name, samples in self._sections.items()},
+            **counts,
+        )

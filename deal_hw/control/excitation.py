@@ -1,0 +1,148 @@
+"""Behaviours that excite a robot for calibration: random set-points after balancing, and a sine sweep."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.control.behaviours import Behaviour, position_command
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray, JointCommand, RobotState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segment:
+    """A part of the run in which other gains and limits are sent, as factors of the description's."""
+
+    start: float
+    """Start, as a fraction of the run."""
+    stop: float
+    """End, as a fraction of the run."""
+    stiffness: float = 1.0
+    damping: float = 1.0
+    effort_limit: float = 1.0
+    speed_limit: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.start < self.stop <= 1.0:
+            raise ConfigurationError(f"segment {self.start!r}..{self.stop!r}: fractions of the run, 0 <= start < stop <= 1")
+        for name in ("stiffness", "damping", "effort_limit", "speed_limit"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"segment factor {name} is {getattr(self, name)!r}; it must be above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RichConfig:
+    """Collection profile `rich`: balance, then random set-points; the pole may fall."""
+
+    duration_s: float = 4.0
+    """Length of the run [s]; segments are fractions of it."""
+    balance_s: float = 1.6
+    """Time spent balancing first [s]; 0 without a policy."""
+    amplitude: float = 0.12
+    """Set-points are drawn within this distance of the default position [m or rad]."""
+    hold_s: tuple[float, float] = (0.1, 0.3)
+    """Shortest and longest time that a set-point is held [s]."""
+    segments: tuple[Segment, ...] = ()
+    """Parts of the run with other gains and limits; the first that fits counts."""
+
+    def __post_init__(self) -> None:
+        low, high = self.hold_s
+        if not (self.duration_s > 0 and self.balance_s >= 0 and self.amplitude > 0 and 0 < low <= high):
+            raise ConfigurationError(f"not a usable collection profile: {self}")
+
+
+class RichBehaviour:
+    """Balances with a policy, then asks for random set-points held for random times.
+
+    Args:
+        description: The robot.
+        balance: What balances at first; None starts with the set-points at once.
+        config: The profile.
+        seed: Fixes the set-points; ``reset`` repeats them.
+    """
+
+    def __init__(
+        self, description: RobotDescription, balance: Behaviour | None, config: RichConfig, seed: int
+    ) -> None:
+        self._description = description
+        self._balance = balance
+        self._config = config
+        self._seed = seed
+        self._default = np.array(description.default_position)[list(description.actuated_index)]
+        self.action: FloatArray | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Start anew with the same set-points."""
+        self._rng = np.random.default_rng(self._seed)
+        self._until_s = -math.inf
+        self._target = self._default
+        self.action = None
+        if self._balance is not None:
+            self._balance.reset()
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the balancing command or the set-point in force, with the gains of the segment."""
+        if self._balance is not None and time_s < self._config.balance_s:
+            wanted = self._balance.command(state, time_s)
+            self.action = self._balance.action
+            return self._scaled(wanted.position_target, time_s)
+        self.action = None
+        # Half a millisecond of slack: times are multiples of the control period, not exact in binary.
+        if time_s + 5e-4 >= self._until_s:
+            self._target = self._default + self._rng.uniform(-1.0, 1.0, self._default.shape) * self._config.amplitude
+            self._until_s = time_s + self._rng.uniform(*self._config.hold_s)
+        return self._scaled(self._target, time_s)
+
+    def _scaled(self, target: FloatArray, time_s: float) -> JointCommand:
+        fraction = time_s / self._config.duration_s
+        for part in self._config.segments:
+            if part.start <= fraction < part.stop:
+                return position_command(
+                    self._description, target, stiffness=part.stiffness, damping=part.damping,
+                    effort_limit=part.effort_limit, speed_limit=part.speed_limit,
+                )  # fmt: skip
+        return position_command(self._description, target)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChirpConfig:
+    """Held-out motion family `chirp`: a sine sweep of the set-point."""
+
+    duration_s: float = 4.0
+    """Length of the sweep [s]."""
+    amplitude: float = 0.08
+    """Amplitude about the default position [m or rad]."""
+    low_hz: float = 0.3
+    """Frequency at the start [Hz]."""
+    high_hz: float = 4.0
+    """Frequency at the end [Hz]."""
+
+    def __post_init__(self) -> None:
+        if not (self.duration_s > 0 and self.amplitude > 0 and 0 < self.low_hz <= self.high_hz):
+            raise ConfigurationError(f"not a usable chirp: {self}")
+
+
+class ChirpBehaviour:
+    """Moves the set-point of all actuated joints along a linear sine sweep."""
+
+    action: FloatArray | None = None
+
+    def __init__(self, description: RobotDescription, config: ChirpConfig | None = None) -> None:
+        self._description = description
+        self._config = config or ChirpConfig()
+        self._default = np.array(description.default_position)[list(description.actuated_index)]
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the set-point of this time: the phase is the integral of a frequency that grows linearly."""
+        c = self._config
+        slope = (c.high_hz - c.low_hz) / c.duration_s
+        phase = 2 * math.pi * (c.low_hz * time_s + 0.5 * slope * time_s**2)
+        return position_command(self._description, self._default + c.amplitude * math.sin(phase))

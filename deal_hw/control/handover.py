@@ -1,0 +1,142 @@
+"""Channels out of the control process: cycles to the recorder, heartbeats and the report to the supervisor.
+
+Both are Unix sockets of whole datagrams (SOCK_SEQPACKET). The control process never waits on them: what the peer does
+not take at once is refused and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from deal_hw.data.record import CycleRecord, encode
+from deal_hw.errors import ConfigurationError, DatasetError
+
+BUFFER_BYTES = 1 << 20
+"""Asked of the kernel for the recorder's socket; it grants up to net.core.wmem_max, twice 208 kB by default."""
+_MOST_REFUSED = 50
+"""So many refusals in a row (one second at 50 Hz) mean that nobody records: the run ends."""
+_BEAT = struct.Struct("<cqdI")
+
+
+def socket_pair(buffer_bytes: int = BUFFER_BYTES) -> tuple[socket.socket, socket.socket]:
+    """Return (sender, receiver) of a datagram channel; the sender never blocks."""
+    sender, receiver = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, buffer_bytes)
+    sender.setblocking(False)
+    return sender, receiver
+
+
+class RecordSender:
+    """Hands cycle records to the recorder process: a sink for the control loop."""
+
+    def __init__(self, sender: socket.socket) -> None:
+        self._socket = sender
+        self._refused_in_a_row = 0
+
+    def __call__(self, record: CycleRecord) -> bool:
+        """Send a record; return False where the recorder's queue is full.
+
+        Raises:
+            DatasetError: The recorder is gone, or has taken nothing for a second.
+        """
+        try:
+            self._socket.send(encode(record))
+        except (BlockingIOError, ConfigurationError):
+            self._refused_in_a_row += 1
+            if self._refused_in_a_row >= _MOST_REFUSED:
+                raise DatasetError(
+                    f"the recorder has refused the last {self._refused_in_a_row} cycles: the disk is too slow or hangs"
+                ) from None
+            return False
+        except OSError as err:
+            raise DatasetError(f"the recorder is gone ({err.strerror}); what it had written is whole") from err
+        self._refused_in_a_row = 0
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Beat:
+    """One heartbeat.
+
+    Attributes:
+        stamp_ns: When it was sent, on the machine's monotonic clock, which all processes share [ns].
+        silence_s: The longest time until the next one [s].
+        phase: What the control process is doing.
+        count: Heartbeats before this one in the same phase.
+    """
+
+    stamp_ns: int
+    silence_s: float
+    phase: str
+    count: int
+
+    @property
+    def stale_ns(self) -> int:
+        """When the next heartbeat is overdue [ns]."""
+        return self.stamp_ns + round(self.silence_s * 1e9)
+
+
+class StatusSender:
+    """The control process's end of the channel to the supervisor."""
+
+    def __init__(self, sender: socket.socket) -> None:
+        self._socket = sender
+        self._phase = ""
+        self._count = 0
+
+    def beat(self, stamp_ns: int, phase: str, silence_s: float) -> None:
+        """Send a heartbeat; without a supervisor there is nobody to tell."""
+        self._count = self._count + 1 if phase == self._phase else 0
+        self._phase = phase
+        try:
+            self._socket.send(_BEAT.pack(b"H", stamp_ns, silence_s, self._count) + phase.encode())
+        except OSError:
+            return
+
+    def result(self, values: dict[str, Any]) -> None:
+        """Send the run's result as JSON; may wait a second, for the robot is passive by then."""
+        self._socket.settimeout(1.0)
+        try:
+            self._socket.send(b"R" + json.dumps(values).encode())
+        except OSError:
+            return
+
+
+class StatusReceiver:
+    """The supervisor's end."""
+
+    def __init__(self, receiver: socket.socket) -> None:
+        self._socket = receiver
+        self._socket.setblocking(False)
+        self.open = True
+        """False once the control process has closed its end."""
+
+    def fileno(self) -> int:
+        """Return the descriptor, for ``select``."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Close this end."""
+        self.open = False
+        self._socket.close()
+
+    def receive(self) -> Beat | dict[str, Any] | None:
+        """Return the next heartbeat or result; None when there is none at hand."""
+        try:
+            datagram = self._socket.recv(1 << 18)
+        except BlockingIOError:
+            return None
+        except OSError:
+            datagram = b""
+        if not datagram:
+            self.open = False
+            return None
+        if datagram[:1] == b"R":
+            values: dict[str, Any] = json.loads(datagram[1:])
+            return values
+        _, stamp_ns, silence_s, count = _BEAT.unpack_from(datagram)
+        return Beat(stamp_ns, silence_s, datagram[_BEAT.size :].decode(), count)

@@ -1,0 +1,382 @@
+"""The control loop: one class for collecting, deploying, replaying and for benches in virtual time."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.cadence import Cadence, CadenceReport
+from deal_hw.control.passive import ATTEMPTS, CONFIRM_S, make_passive
+from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
+from deal_hw.data.record import CycleFlag, CycleRecord
+from deal_hw.errors import ConfigurationError, DealHwError, TransportError, TransportTimeoutError
+from deal_hw.robot import Robot
+from deal_hw.types import Event, JointCommand, RobotState
+
+Sink = Callable[[CycleRecord], bool]
+"""Takes a record and never waits; False: refused. Raises a DealHwError where nobody will ever take one again."""
+
+
+RUNNING = "running"
+"""Name of the phase in which cycles run."""
+RUNNING_SILENCE_S = 0.3
+"""A loop without a heartbeat for this long is stalled: the cart-pole's own watchdog has stopped its motor by then [s]."""
+
+_MOST_WIRE = 512
+"""Raw messages in one record; a cycle has about 5."""
+
+
+class OperatorStop(BaseException):
+    """The operator asked to stop while the loop waited for the robot; no error, so not an Exception."""
+
+
+class Outcome(enum.Enum):
+    """How a run ended."""
+
+    FINISHED = "finished"
+    STOPPED = "stopped"
+    """By the operator."""
+    TRIPPED = "tripped"
+    """By the safety module."""
+    FAILED = "failed"
+    """By an error."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopConfig:
+    """Settings of one run."""
+
+    duration_s: float
+    """Length of the run, counted in control periods [s]."""
+    dry_run: bool = False
+    """Compute everything and send nothing: the robot is neither homed nor armed."""
+    home: bool = True
+    """Bring the robot to its start pose first."""
+    home_timeout_s: float = 20.0
+    arm_timeout_s: float = 1.0
+    state_timeout_s: float = 1.0
+    """How long to wait for the first state sample [s]."""
+    passive_attempts: int = ATTEMPTS
+    """How often the passive command is sent before giving up on a confirmation."""
+    passive_confirm_s: float = CONFIRM_S
+    """How long to wait for the confirmation of each [s]."""
+    record_wire: bool = True
+    """Hand the raw bytes to the recorder, too."""
+
+    def __post_init__(self) -> None:
+        if not self.duration_s > 0:
+            raise ConfigurationError(f"a run must last longer than 0 s, not {self.duration_s!r}")
+        if self.passive_attempts < 1:
+            raise ConfigurationError("passive_attempts must be at least 1: a run never ends without the passive command")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopReport:
+    """What came out of one run.
+
+    Attributes:
+        outcome: How it ended.
+        reason: In words, for the operator.
+        passive_confirmed: Whether the robot itself said that its motors no longer follow commands; also True where it
+            was never commanded.
+        cadence: How regular it was.
+        clipped: Cycles in which each limit changed the command, by limit.
+        cycles_sent: Commands sent.
+        error: Name of the error's class where it failed.
+    """
+
+    outcome: Outcome
+    reason: str
+    passive_confirmed: bool
+    cadence: CadenceReport
+    clipped: dict[str, int]
+    cycles_sent: int
+    error: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "outcome": self.outcome.value, "reason": self.reason, "passive_confirmed": self.passive_confirmed,
+            "cadence": self.cadence.to_json(), "clipped": self.clipped, "cycles_sent": self.cycles_sent,
+            "error": self.error,
+        }  # fmt: skip
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> LoopReport:
+        """Return the report that :meth:`to_json` wrote."""
+        return cls(
+            **{**values, "outcome": Outcome(values["outcome"]), "cadence": CadenceReport.from_json(values["cadence"])}
+        )
+
+
+class ControlLoop:
+    """Connects, homes, arms, runs cycles on absolute deadlines, and leaves the robot passive whatever happens.
+
+    Args:
+        robot: The robot; the loop connects and disconnects it.
+        behaviour: What to ask of it.
+        safety: Judges every command.
+        clock: The clock of deadlines and stamps; virtual for benches.
+        sink: Takes each cycle's record.
+        config: Settings.
+        progress: Called with the phase's name and the longest time until the next call [s]: the heartbeat.
+        scheduling: What the operating system granted, for the report.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        behaviour: Behaviour,
+        safety: Safety,
+        clock: Clock,
+        sink: Sink,
+        config: LoopConfig,
+        *,
+        progress: Callable[[str, float], None] = lambda phase, silence_s: None,
+        scheduling: str = "default",
+    ) -> None:
+        self._robot, self._behaviour, self._safety = robot, behaviour, safety
+        self._clock, self._sink, self._config, self._progress = clock, sink, config, progress
+        self._scheduling = scheduling
+        self._cadence = Cadence(clock, robot.description.control_rate_hz)
+        self._stop_reason = ""
+        self._raise_on_stop = self._connected = False
+        self._state: RobotState | None = None
+        self._pending: list[RobotState] = []
+        self._events: list[Event] = []
+        self._clipped: dict[str, int] = {}
+        self._noted_flags: tuple[str, ...] = ()
+        self._states = self._blind = self._losses = self._sent = self._errors_seen = 0
+
+    def request_stop(self, reason: str = "stopped by the operator") -> None:
+        """End the run; safe to call from a signal handler and from the behaviour."""
+        self._stop_reason = self._stop_reason or reason
+        if self._raise_on_stop:
+            self._raise_on_stop = False
+            raise OperatorStop(reason)
+
+    def note(self, kind: str, message: str, **data: Any) -> None:
+        """Put an event into the next record."""
+        self._events.append(Event(self._clock.now_ns(), kind, message, data))
+
+    def run(self) -> LoopReport:
+        """Run once. Errors come back in the report, after the robot was made passive."""
+        outcome, reason, error, confirmed = Outcome.FAILED, "", "", False
+        try:
+            self._raise_on_stop = True
+            if self._stop_reason:
+                raise OperatorStop(self._stop_reason)
+            self._prepare()
+            self._raise_on_stop = False
+            outcome, reason = self._cycles()
+        except (OperatorStop, KeyboardInterrupt):
+            outcome, reason = Outcome.STOPPED, self._stop_reason or "stopped by the operator"
+        except Exception as err:
+            reason, error = str(err) or type(err).__name__, type(err).__name__
+        finally:
+            # First of all, and before anything that might fail: the robot.
+            self._raise_on_stop = False
+            confirmed = self._make_passive()
+            self._close(reason)
+        return LoopReport(
+            outcome=outcome, reason=reason, passive_confirmed=confirmed, cadence=self._report(), clipped=self._clipped,
+            cycles_sent=self._sent, error=error,
+        )  # fmt: skip
+
+    def _prepare(self) -> None:
+        c = self._config
+        self._phase("connecting", 10.0)
+        self._robot.connect()
+        self._connected = True
+        self._behaviour.reset()
+        if c.home and not c.dry_run:
+            self._phase("homing", c.home_timeout_s + 2.0)
+            self._robot.home(c.home_timeout_s)
+        self._phase("arming", c.arm_timeout_s + c.state_timeout_s + 2.0)
+        self._await_state()
+        if not c.dry_run:
+            self._safety.arm(self._input(operator_stop=False))
+            self._robot.arm(c.arm_timeout_s)
+            self.note("armed", "the motors follow commands")
+            # What waited in buffers meanwhile is old: the first cycle takes what comes from now on.
+            self._drain()
+            self._await_state()
+        # The recording starts with the sample that the first command answers, not with hands that set up the robot.
+        self._pending = self._pending[-1:]
+
+    def _await_state(self) -> None:
+        self._receive(self._robot.read_state(self._config.state_timeout_s))
+        self._drain()
+
+    def _phase(self, name: str, silence_s: float) -> None:
+        self._progress(name, silence_s)
+
+    def _cycles(self) -> tuple[Outcome, str]:
+        count = round(self._config.duration_s * self._robot.description.control_rate_hz)
+        while True:
+            self._collect_until(self._cadence.deadline_ns)
+            if self._cadence.next_index >= count:
+                break
+            index, deadline_ns = self._cadence.begin()
+            self._phase(RUNNING, RUNNING_SILENCE_S)
+            verdict = self._cycle(index, deadline_ns)
+            if verdict.state is SafetyState.PASSIVE:
+                stopped = verdict.flags[:1] == ("operator_stop",)
+                return (Outcome.STOPPED if stopped else Outcome.TRIPPED), verdict.reason
+            if self._config.dry_run and self._stop_reason:
+                return Outcome.STOPPED, self._stop_reason
+        self._safety.stop("the run is over")
+        return Outcome.FINISHED, "the run is over"
+
+    def _cycle(self, index: int, deadline_ns: int) -> Verdict:
+        start_ns = self._clock.now_ns()
+        state, flags = self._state, CycleFlag.NONE
+        wanted: JointCommand | None = None
+        if self._cadence.late_ns >= self._cadence.period_ns:
+            flags |= CycleFlag.OVERRUN
+        if not self._pending:
+            self._blind += 1
+            flags |= CycleFlag.NO_STATE
+        # A policy must not see numbers that are not: its memory would carry them on.
+        if state is not None and bool(np.isfinite(state.position).all() and np.isfinite(state.velocity).all()):
+            with self._cadence.section("behaviour"):
+                wanted = self._behaviour.command(state, index * self._cadence.period_ns * 1e-9)
+        computed_ns = self._clock.now_ns()
+        age_ns = computed_ns - state.receive_ns if state is not None else -1
+        if age_ns >= 0:
+            self._cadence.note_state_age(age_ns)
+        with self._cadence.section("safety"):
+            cycle = self._input(operator_stop=bool(self._stop_reason), action_age_ns=computed_ns - start_ns)
+            verdict = self._safety.step(cycle, wanted)
+        flags |= self._note_verdict(verdict)
+        sent, sent_ns = None, -1
+        if verdict.send and verdict.command is not None:
+            with self._cadence.section("send"):
+                sent_ns = self._clock.now_ns()
+                sent = self._robot.send_command(verdict.command)
+                self._sent += 1
+        elif verdict.state is SafetyState.PASSIVE:
+            self._robot.passive()
+        with self._cadence.section("record"):
+            self._hand_over(
+                index, deadline_ns, start_ns, asked=wanted, sent=sent, sent_ns=sent_ns, state_age_ns=age_ns, flags=flags
+            )
+        return verdict
+
+    def _note_verdict(self, verdict: Verdict) -> CycleFlag:
+        flags = CycleFlag.NONE
+        for name in verdict.clipped:
+            self._clipped[name] = self._clipped.get(name, 0) + 1
+            if self._clipped[name] == 1:
+                self.note("clipped", f"the safety filter changed a command: {name}", limit=name)
+        if verdict.clipped:
+            flags |= CycleFlag.CLIPPED
+        if "action_late" in verdict.flags:
+            flags |= CycleFlag.POLICY_LATE
+        if self._robot.link_errors > self._errors_seen:
+            self._errors_seen = self._robot.link_errors
+            flags |= CycleFlag.LINK_ERROR
+        if verdict.state is SafetyState.PASSIVE:
+            self.note("passive", verdict.reason, flags=list(verdict.flags))
+        elif verdict.flags and verdict.flags != self._noted_flags:
+            self.note("would trip", "while disarmed: " + ", ".join(verdict.flags), flags=list(verdict.flags))
+        self._noted_flags = verdict.flags
+        return flags
+
+    def _hand_over(
+        self,
+        index: int,
+        deadline_ns: int,
+        start_ns: int,
+        *,
+        asked: JointCommand | None = None,
+        sent: JointCommand | None = None,
+        sent_ns: int = -1,
+        state_age_ns: int = -1,
+        flags: CycleFlag = CycleFlag.NONE,
+    ) -> None:
+        # Homing may take long: what does not fit a datagram is the oldest.
+        wire = tuple(self._robot.take_wire()[-_MOST_WIRE:])
+        record = CycleRecord(
+            cycle=index,
+            deadline_ns=deadline_ns,
+            start_ns=start_ns,
+            states=tuple(self._pending),
+            action=self._behaviour.action,
+            asked=asked,
+            sent=sent,
+            sent_sequence=self._robot.last_sequence if sent is not None else -1,
+            sent_ns=sent_ns,
+            state_age_ns=state_age_ns,
+            safety_state=self._safety.state.value,
+            flags=int(flags),
+            events=tuple(self._events),
+            wire=wire if self._config.record_wire else (),
+            lost=self._losses,
+        )
+        self._pending, self._events = [], []
+        if not self._sink(record):
+            self._losses += 1
+
+    def _collect_until(self, deadline_ns: int) -> None:
+        """Take states as they arrive, so that each carries its own receive stamp."""
+        while (left_ns := deadline_ns - self._clock.now_ns()) > 0:
+            try:
+                self._receive(self._robot.read_state(left_ns * 1e-9))
+            except TransportTimeoutError:
+                break
+        self._drain()
+
+    def _drain(self) -> None:
+        try:
+            while True:
+                self._receive(self._robot.read_state(0.0))
+        except TransportTimeoutError:
+            return
+
+    def _receive(self, state: RobotState) -> None:
+        self._state = state
+        self._pending.append(state)
+        self._states += 1
+
+    def _input(self, *, operator_stop: bool, action_age_ns: int = 0) -> CycleInput:
+        return CycleInput(
+            now_ns=self._clock.now_ns(), state=self._state, action_age_ns=action_age_ns,
+            link_errors=self._robot.link_errors, operator_stop=operator_stop,
+        )  # fmt: skip
+
+    def _make_passive(self) -> bool:
+        """Send the passive command until the robot confirms it; return whether it did."""
+        if self._safety.state.armed:
+            self._safety.stop("the run ended")
+        self._phase("making passive", 2.0)
+        if self._config.dry_run or not self._connected:
+            return True
+        # What it reads is not recorded: nobody knows which of the samples the passive command found.
+        return make_passive(self._robot, self._clock, self._config.passive_attempts, self._config.passive_confirm_s)
+
+    def _close(self, reason: str) -> None:
+        """Hand over what is left, then disconnect."""
+        try:
+            now = self._clock.now_ns()
+            self.note("ended", reason or "the run ended")
+            self._hand_over(self._cadence.next_index, now, now)
+        except (DealHwError, OSError):
+            self._losses += 1
+        finally:
+            try:
+                self._robot.disconnect()
+            except (TransportError, OSError):
+                pass
+
+    def _report(self) -> CadenceReport:
+        return self._cadence.report(
+            states=self._states, cycles_without_state=self._blind, losses=self._losses,
+            link_errors=self._robot.link_errors, scheduling=self._scheduling,
+        )  # fmt: skip

@@ -1,0 +1,90 @@
+"""What a process with a deadline asks of the operating system: priority, memory that stays, and to die with its parent."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import resource
+import signal
+from dataclasses import dataclass
+
+_PR_SET_PDEATHSIG = 1
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_FIFO_PRIORITY = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """What the operating system granted.
+
+    Attributes:
+        scheduling: Scheduling and memory, in words for the cadence report.
+        warnings: What it refused, with the remedy; empty where all was granted.
+    """
+
+    scheduling: str
+    warnings: tuple[str, ...]
+
+
+def become_realtime() -> Granted:
+    """Ask for SCHED_FIFO and locked memory and freeze the garbage collector; call once, after all imports.
+
+    What is refused is a warning, never an error: the loop still runs, only less regularly.
+    """
+    words, warnings = [], []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+        words.append("SCHED_FIFO")
+    except OSError as err:
+        words.append("default")
+        warnings.append(
+            f"SCHED_FIFO was refused ({err.strerror}); expect late cycles under load. Remedy: an rtprio line for this "
+            "user in /etc/security/limits.conf, or CAP_SYS_NICE"
+        )
+    if (reason := _lock_memory()) is None:
+        words.append("mlockall")
+    else:
+        warnings.append(
+            f"mlockall was refused ({reason}); a page fault may delay a cycle. Remedy: a memlock line for this user in "
+            "/etc/security/limits.conf, or CAP_IPC_LOCK"
+        )
+    gc.collect()
+    gc.freeze()
+    return Granted(" + ".join(words), tuple(warnings))
+
+
+def _lock_memory() -> str | None:
+    """Lock the process's memory; return why not."""
+    # With MCL_FUTURE under a finite limit, a later allocation beyond it fails and kills the loop in the middle of a
+    # run; so future pages are locked only where there is no limit.
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or os.geteuid() == 0
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | (_MCL_FUTURE if unlimited else 0)) == 0:
+        return None
+    return os.strerror(ctypes.get_errno())
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Have the kernel send SIGTERM when the parent dies, so that the loop ends by its passive route.
+
+    Args:
+        parent_pid: The parent's process id, as the parent gave it.
+
+    Raises:
+        ProcessLookupError: The parent is gone already.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    # The parent may have died before the call above: then no signal ever comes.
+    if os.getppid() != parent_pid:
+        raise ProcessLookupError(f"the parent process {parent_pid} is gone")
+
+
+def kill_self_after(seconds: float) -> None:
+    """Have the kernel kill this process after a time [s] unless it has ended by itself: the last resort of an orphan."""
+    with contextlib.suppress(ValueError):
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -1,0 +1,256 @@
+"""Safety between policy and motors: checks each cycle, clips what can be clipped, trips on the rest.
+
+Pure: no I/O, no torch, and time is an argument. Limits are data of the robot (``description.limits``). Clipping changes
+a command and says so; a trip sends nothing more, latches and gives its reason in words.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.control.safety_filter import SafetyFilter, is_finite
+from deal_hw.control.safety_machine import SafetyFlags, SafetyMachine, SafetyState
+from deal_hw.description import RobotDescription
+from deal_hw.errors import SafetyError
+from deal_hw.types import FloatArray, JointCommand, RobotState, Status
+
+__all__ = ["CycleInput", "Safety", "SafetyConfig", "SafetyFlags", "SafetyState", "Verdict"]
+
+_DRIFT = 5e-4
+"""Largest rate difference between host and device clock that counts as drift (a bad crystal has 1e-4)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyConfig:
+    """What the safety module allows beyond the limits of the robot."""
+
+    clock_jump_s: float = 0.1
+    """A device clock that runs ahead of the host's by this much has jumped [s]."""
+    link_window_s: float = 1.0
+    """Time over which link errors are counted [s]."""
+    link_error_share: float = 0.3
+    """Errors in the window over state frames due in it that trip; a corrupt frame counts twice (itself, its gap)."""
+    confirm_s: float = 0.2
+    """The device must report itself armed within this time after arming [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("clock_jump_s", "link_window_s", "link_error_share", "confirm_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)!r}; it must be above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CycleInput:
+    """What the safety module needs to know about one cycle.
+
+    Attributes:
+        now_ns: Host clock [ns].
+        state: The newest state; None before the first.
+        action_age_ns: How long the policy took [ns].
+        link_errors: Link errors since the connection, as the robot counts them.
+        operator_stop: Whether the operator asked to stop.
+    """
+
+    now_ns: int
+    state: RobotState | None
+    action_age_ns: int = 0
+    link_errors: int = 0
+    operator_stop: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the safety module decided in one cycle.
+
+    Attributes:
+        state: The state after the cycle.
+        command: What may be sent; None where nothing may be (not finite, or passive).
+        clipped: Names of the limits that changed the command.
+        flags: What was wrong, whether it tripped or, while disarmed, only would have.
+        reason: Why it is passive, in words; "" otherwise.
+    """
+
+    state: SafetyState
+    command: JointCommand | None
+    clipped: tuple[str, ...]
+    flags: tuple[str, ...]
+    reason: str
+
+    @property
+    def send(self) -> bool:
+        """Whether the command is to be sent: only while armed."""
+        return self.state.armed and self.command is not None
+
+
+class Safety:
+    """Checks and filters the commands for one robot."""
+
+    def __init__(self, description: RobotDescription, config: SafetyConfig | None = None) -> None:
+        self._description = description
+        self._config = config or SafetyConfig()
+        self._filter = SafetyFilter(description)
+        self._machine = SafetyMachine(round(description.limits.ease_in_s * 1e9))
+        self._index = list(description.actuated_index)
+        self._errors_due = self._config.link_error_share * self._config.link_window_s * description.state_rate_hz
+        self.reason = ""
+        """Why it is passive, in words."""
+        self._reset(0)
+
+    def _reset(self, now_ns: int) -> None:
+        self._armed_ns = now_ns
+        self._seen_armed = False
+        self._start: FloatArray | None = None
+        self._previous: FloatArray | None = None
+        self._offset_ns: int | None = None
+        self._offset_at_ns = 0
+        self._errors: deque[tuple[int, int]] = deque()
+
+    @property
+    def state(self) -> SafetyState:
+        """Where the state machine stands."""
+        return self._machine.state
+
+    def arm(self, cycle: CycleInput) -> None:
+        """Allow commands from now on; the measured position is the first target.
+
+        Raises:
+            SafetyError: Not DISARMED, or something is wrong already; the message says what.
+        """
+        self._reset(cycle.now_ns)
+        wrong = self._failures(cycle, None)
+        if wrong or cycle.state is None:
+            raise SafetyError("refusing to arm: " + "; ".join(wrong.values()))
+        self._machine.arm(cycle.now_ns)
+        self._start = self._previous = cycle.state.position[self._index]
+
+    def step(self, cycle: CycleInput, wanted: JointCommand | None) -> Verdict:
+        """Judge one cycle.
+
+        Args:
+            cycle: What is known.
+            wanted: The command asked for; None where there is none yet.
+        """
+        failures = self._failures(cycle, wanted)
+        was_armed = self.state.armed
+        flags = SafetyFlags(**dict.fromkeys(failures, True))
+        state = self._machine.update(cycle.now_ns, flags)
+        if was_armed and not state.armed:
+            self.reason = "; ".join(failures[name] for name in flags.raised)
+        if state is SafetyState.PASSIVE or wanted is None or cycle.state is None or not is_finite(wanted):
+            return Verdict(state, None, (), flags.raised, self.reason)
+        command, clipped = self._clip(cycle.now_ns, wanted, cycle.state.position[self._index])
+        return Verdict(state, command, clipped, flags.raised, self.reason)
+
+    def stop(self, reason: str) -> None:
+        """Go passive for a reason that is no failure of a check, such as the end of the run."""
+        if self.state is not SafetyState.PASSIVE:
+            self.reason = reason
+        self._machine.stop()
+
+    def rearm(self) -> None:
+        """Leave PASSIVE for DISARMED: the operator's explicit decision.
+
+        Raises:
+            SafetyError: It is armed.
+        """
+        self._machine.rearm()
+        self.reason = ""
+
+    def _clip(
+        self, now_ns: int, wanted: JointCommand, measured: FloatArray
+    ) -> tuple[JointCommand, tuple[str, ...]]:
+        start = measured if self._start is None else self._start
+        previous = measured if self._previous is None else self._previous
+        share = self._machine.authority(now_ns)
+        if share < 1.0:
+            eased = start + share * (wanted.position_target - start)
+            wanted = JointCommand(
+                eased, wanted.velocity_target, wanted.stiffness, wanted.damping, wanted.effort, wanted.effort_limit,
+                wanted.speed_limit,
+            )  # fmt: skip
+        command, clipped = self._filter.clip(wanted, previous, measured)
+        self._previous = command.position_target
+        return command, clipped
+
+    def _failures(self, cycle: CycleInput, wanted: JointCommand | None) -> dict[str, str]:
+        """Return flag name -> reason in words for all that is wrong."""
+        found: dict[str, str] = {}
+        limits = self._description.limits
+        if cycle.operator_stop:
+            found["operator_stop"] = "stopped by the operator"
+        if cycle.state is None:
+            found["no_state"] = "no state sample has arrived"
+        else:
+            self._check_age(cycle.now_ns, cycle.state, found)
+            self._check_status(cycle.now_ns, cycle.state.status, found)
+            self._check_motion(cycle.state, found)
+        if wanted is not None and not is_finite(wanted):
+            found["action_not_finite"] = "the policy asked for a command that is not finite"
+        if cycle.action_age_ns > round(limits.action_age_s * 1e9):
+            took_ms, limit_ms = cycle.action_age_ns * 1e-6, limits.action_age_s * 1e3
+            found["action_late"] = f"the policy took {took_ms:.1f} ms, at most {limit_ms:g} ms are allowed"
+        self._check_link(cycle.now_ns, cycle.link_errors, found)
+        return found
+
+    def _check_age(self, now_ns: int, state: RobotState, found: dict[str, str]) -> None:
+        # Data that waited in a buffer carry a fresh receive stamp: only the device's clock gives them away. So the age
+        # counts from the least transit time seen, which may creep up by the clocks' drift.
+        offset = state.receive_ns - state.device_ns
+        if self._offset_ns is None:
+            self._offset_ns, self._offset_at_ns = offset, state.receive_ns
+        crept = self._offset_ns + round(_DRIFT * (state.receive_ns - self._offset_at_ns))
+        ahead = self._offset_ns - offset
+        if ahead > round(self._config.clock_jump_s * 1e9):
+            found["clock_jump"] = f"the device's clock jumped ahead by {ahead * 1e-9:.3f} s"
+        self._offset_ns, self._offset_at_ns = min(offset, crept), state.receive_ns
+        age_ns = now_ns - state.receive_ns + offset - self._offset_ns
+        limit_ns = round(self._description.limits.state_age_s * 1e9)
+        if age_ns > limit_ns:
+            found["state_stale"] = (
+                f"the newest state is {age_ns * 1e-6:.0f} ms old, at most {limit_ns * 1e-6:g} ms are allowed"
+            )
+
+    def _check_status(self, now_ns: int, status: Status, found: dict[str, str]) -> None:
+        if Status.FAULT in status:
+            found["device_fault"] = "the device reports a fault"
+        if not self.state.armed:
+            return
+        # Samples from before the arming may still be under way: its status counts once it has confirmed.
+        self._seen_armed = self._seen_armed or (Status.ARMED in status and Status.WATCHDOG not in status)
+        if not self._seen_armed and now_ns - self._armed_ns < self._config.confirm_s * 1e9:
+            return
+        if Status.WATCHDOG in status:
+            found["device_watchdog"] = "the device's watchdog stopped its motors because commands stayed away"
+        if Status.ARMED not in status:
+            found["device_disarmed"] = "the device disarmed itself"
+
+    def _check_motion(self, state: RobotState, found: dict[str, str]) -> None:
+        if not (np.isfinite(state.position).all() and np.isfinite(state.velocity).all()):
+            found["state_not_finite"] = "the robot reports a state that is not finite"
+            return
+        names, units = self._description.joint_names, self._description.position_units
+        limits = self._description.limits
+        for j, (low, high) in enumerate(limits.trip_position):
+            if not low <= state.position[j] <= high:
+                found["position"] = (
+                    f"joint {names[j]!r} is at {state.position[j]:.3f} {units[j]}, outside {low:g}..{high:g}"
+                )
+        for j, most in enumerate(limits.trip_velocity):
+            if abs(state.velocity[j]) > most:
+                found["velocity"] = (
+                    f"joint {names[j]!r} moves at {state.velocity[j]:.2f} {units[j]}/s, faster than {most:g}"
+                )
+
+    def _check_link(self, now_ns: int, errors: int, found: dict[str, str]) -> None:
+        window = self._errors
+        window.append((now_ns, errors))
+        while now_ns - window[0][0] > self._config.link_window_s * 1e9:
+            window.popleft()
+        count = errors - window[0][1]
+        if count > self._errors_due:
+            found["link_errors"] = (
+                f"{count} link errors in the last {self._config.link_window_s:g} s: check cable and connectors"
+            )

@@ -1,0 +1,125 @@
+"""The safety state machine: pure, with settable time, on flags whose False means no failure.
+
+    DISARMED --arm--> EASING_IN --time--> ACTIVE
+                          |                  |
+                          +--- any flag -----+--> PASSIVE (latched) --rearm--> DISARMED
+
+Nothing leaves PASSIVE but an explicit re-arm, and a re-arm leads to DISARMED only: arming is a second decision.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from dataclasses import dataclass
+
+from deal_hw.errors import SafetyError
+
+
+class SafetyState(enum.Enum):
+    """Whether commands may reach the robot, and how."""
+
+    DISARMED = "disarmed"
+    """Nothing is sent."""
+    EASING_IN = "easing in"
+    """Targets move from the measured pose towards the policy's."""
+    ACTIVE = "active"
+    PASSIVE = "passive"
+    """Latched: only the passive command is sent."""
+
+    @property
+    def armed(self) -> bool:
+        """Whether commands are sent in this state."""
+        return self in (SafetyState.EASING_IN, SafetyState.ACTIVE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyFlags:
+    """What can be wrong in one cycle; False means no failure. The order is the order in which reasons are named.
+
+    Attributes:
+        operator_stop: The operator asked to stop.
+        no_state: No state sample has arrived yet.
+        state_stale: The newest state is too old, or was held up on its way.
+        clock_jump: The device's clock jumped, as after a restart.
+        device_fault: The device reports a fault.
+        device_watchdog: The device stopped its motors because commands stayed away.
+        device_disarmed: The device says that its motors do not follow commands.
+        position: A joint is outside its trip range.
+        velocity: A joint is faster than its trip speed.
+        state_not_finite: The state holds NaN or infinity.
+        action_not_finite: The command asked for holds NaN or infinity.
+        action_late: The policy took too long.
+        link_errors: Too large a share of the state frames is corrupt or lost.
+    """
+
+    operator_stop: bool = False
+    no_state: bool = False
+    state_stale: bool = False
+    clock_jump: bool = False
+    device_fault: bool = False
+    device_watchdog: bool = False
+    device_disarmed: bool = False
+    position: bool = False
+    velocity: bool = False
+    state_not_finite: bool = False
+    action_not_finite: bool = False
+    action_late: bool = False
+    link_errors: bool = False
+
+    @property
+    def raised(self) -> tuple[str, ...]:
+        """Names of the flags that are set."""
+        return tuple(f.name for f in dataclasses.fields(self) if getattr(self, f.name))
+
+
+class SafetyMachine:
+    """The state machine alone: it knows no robot and reads no clock.
+
+    Args:
+        ease_in_ns: Time from arming to full authority [ns].
+    """
+
+    def __init__(self, ease_in_ns: int) -> None:
+        self._ease_in_ns = ease_in_ns
+        self._armed_ns = 0
+        self.state = SafetyState.DISARMED
+
+    def arm(self, now_ns: int) -> None:
+        """Go from DISARMED to EASING_IN.
+
+        Raises:
+            SafetyError: The machine is not DISARMED.
+        """
+        if self.state is not SafetyState.DISARMED:
+            raise SafetyError(f"cannot arm while {self.state.value}: re-arm explicitly first")
+        self._armed_ns = now_ns
+        self.state = SafetyState.EASING_IN
+
+    def update(self, now_ns: int, flags: SafetyFlags) -> SafetyState:
+        """Move on by one cycle: trip on any flag, else finish easing in when its time is over."""
+        if self.state.armed and flags.raised:
+            self.state = SafetyState.PASSIVE
+        elif self.state is SafetyState.EASING_IN and now_ns - self._armed_ns >= self._ease_in_ns:
+            self.state = SafetyState.ACTIVE
+        return self.state
+
+    def authority(self, now_ns: int) -> float:
+        """Return the share of the policy's wish that is granted: 0 at arming, 1 once ACTIVE."""
+        if self.state is SafetyState.EASING_IN:
+            return (now_ns - self._armed_ns) / self._ease_in_ns
+        return 1.0
+
+    def stop(self) -> None:
+        """Go to PASSIVE from any state."""
+        self.state = SafetyState.PASSIVE
+
+    def rearm(self) -> None:
+        """Leave PASSIVE for DISARMED; the one way out of the latch.
+
+        Raises:
+            SafetyError: The machine is armed.
+        """
+        if self.state.armed:
+            raise SafetyError(f"cannot re-arm while {self.state.value}: stop first")
+        self.state = SafetyState.DISARMED

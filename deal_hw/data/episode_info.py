@@ -1,0 +1,97 @@
+"""What the index of a dataset says of one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from deal_hw.data.checks import Severity, Verdict, check
+from deal_hw.data.clock_sync import synchronize
+from deal_hw.data.excitation import excitation
+from deal_hw.data.reader import Episode, read_episode
+from deal_hw.errors import DatasetError, EmptyRecordingError, InsufficientDataError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeInfo:
+    """What ``dataset.json`` says of one episode.
+
+    Attributes:
+        file: Path inside the dataset, such as "episodes/000000.mcap".
+        purpose: Why it was recorded, such as "collect" or "deploy".
+        policy_digest: Digest of the policy that commanded; "" where none did.
+        wall_utc: Wall-clock time at its start, ISO 8601.
+        duration_s: Device time from the first to the last sample [s].
+        states: State samples.
+        commands: Commands sent.
+        cycles: Control cycles.
+        verdicts: The telemetry checks, as :meth:`deal_hw.data.checks.Verdict.to_json` writes them.
+        excitation: Movement, as :meth:`deal_hw.data.excitation.Excitation.to_json` writes it.
+        clock: Relation of the clocks, as :meth:`deal_hw.data.clock_sync.ClockSync.to_json` writes it; None
+            where it cannot be told.
+        note: What the operator should know, such as a repair.
+        facts: What the collector adds: outcome, cadence, task, ...
+    """
+
+    file: str
+    purpose: str
+    policy_digest: str
+    wall_utc: str
+    duration_s: float
+    states: int
+    commands: int
+    cycles: int
+    verdicts: tuple[Mapping[str, str], ...]
+    excitation: Mapping[str, Any] | None
+    clock: Mapping[str, Any] | None
+    note: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # The file field decides which file is read, and dataset.json may come from elsewhere.
+        if Path(self.file).parts[:1] != ("episodes",) or ".." in Path(self.file).parts:
+            raise DatasetError(f"episode file {self.file!r} is not inside the dataset's episodes/ folder")
+
+
+def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | None = None) -> EpisodeInfo:
+    """Read an episode and return what the index says of it; one without samples gives zeros and a note.
+
+    Args:
+        path: The file.
+        file: The same, inside the dataset.
+        note: For the operator.
+        facts: Plain JSON values that the collector adds.
+    """
+    try:
+        episode = read_episode(path)
+    except EmptyRecordingError as error:
+        return EpisodeInfo(
+            file=file, purpose="", policy_digest="", wall_utc="", duration_s=0.0, states=0, commands=0,
+            cycles=0, verdicts=(Verdict("length", Severity.FAIL, str(error)).to_json(),), excitation=None,
+            clock=None, note=note or "empty", facts=facts or {},
+        )  # fmt: skip
+    trajectory = episode.trajectory
+    return EpisodeInfo(
+        file=file,
+        purpose=str(episode.metadata.get("purpose", "")),
+        policy_digest=str(episode.metadata.get("policy_digest", "")),
+        wall_utc=episode.wall_utc,
+        duration_s=trajectory.duration_s,
+        states=trajectory.device_s.size,
+        commands=trajectory.sent_s.size,
+        cycles=episode.cycles.cycle.size,
+        verdicts=tuple(verdict.to_json() for verdict in check(trajectory)),
+        excitation=excitation(trajectory).to_json(),
+        clock=_clock(episode),
+        note=note,
+        facts=facts or {},
+    )
+
+
+def _clock(episode: Episode) -> Mapping[str, Any] | None:
+    try:
+        return synchronize(episode.trajectory).to_json()
+    except InsufficientDataError:
+        return None

@@ -1,0 +1,141 @@
+"""Reads MCAP files that may be torn or damaged, record by record, without trusting any of them.
+
+The readers of the mcap library stop at the first thing that is wrong; this one goes on with the next chunk,
+and says which byte ranges it could not use.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import CRCValidationError, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+
+_PREFIX = struct.Struct("<BQ")
+_CHUNK_MARK = struct.pack("<I", 4) + b"zstd"
+_CHUNK_MARK_OFFSET = _PREFIX.size + 8 + 8 + 8 + 4
+"""From a chunk record's first byte to its compression name: prefix, start, end, uncompressed size, CRC."""
+# A flipped bit in a compressed frame's head can announce any size, hence MemoryError.
+_PARSE_ERRORS = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, MemoryError)
+_OPCODES = frozenset(int(opcode) for opcode in Opcode)
+_TYPES: dict[int, type[McapRecord]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+    Opcode.CHUNK: Chunk,
+    Opcode.DATA_END: DataEnd,
+    Opcode.FOOTER: Footer,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One readable record; a chunk comes with what is in it.
+
+    Attributes:
+        offset: Where it starts in the file.
+        record: The record.
+        contents: Schemas, channels and messages of a chunk.
+    """
+
+    offset: int
+    record: McapRecord
+    contents: tuple[McapRecord, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Bytes that could not be used.
+
+    Attributes:
+        offset: Where they start.
+        size: How many.
+        reason: Why.
+        torn: They are the unfinished end of a file, not damage.
+    """
+
+    offset: int
+    size: int
+    reason: str
+    torn: bool
+
+
+def scan(data: bytes) -> Iterator[Found | Lost]:
+    """Yield the records of a file in order, and what lies between them unreadable.
+
+    Ends after the footer; a file without one ends with a :class:`Lost` (of size 0 if it was cut between
+    records). Records of other kinds (message indexes, summary) are passed over: a writer makes them anew.
+    """
+    offset = len(MCAP0_MAGIC)
+    while True:
+        if offset + _PREFIX.size > len(data):
+            yield Lost(offset, len(data) - offset, "the file ends without a footer", torn=True)
+            return
+        opcode, size = _PREFIX.unpack_from(data, offset)
+        end = offset + _PREFIX.size + size
+        result = _parse(opcode, data[offset + _PREFIX.size : end], offset) if end <= len(data) else None
+        if isinstance(result, str) or result is None:
+            # The length may be what is wrong, so the next readable chunk decides where to go on.
+            resumed = _next_chunk(data, offset + 1)
+            torn = result is None and resumed is None
+            if isinstance(result, str) and (resumed is None or resumed > end):
+                resumed = end
+            stop = len(data) if resumed is None else resumed
+            yield Lost(offset, stop - offset, result or "a record that is cut off", torn)
+            if resumed is None:
+                return
+            offset = resumed
+            continue
+        if isinstance(result, Found):
+            yield result
+            if isinstance(result.record, Footer):
+                if data[end:] != MCAP0_MAGIC:
+                    yield Lost(end, len(data) - end, "the file does not end after its footer", torn=True)
+                return
+        offset = end
+
+
+def _parse(opcode: int, body: bytes, offset: int) -> Found | str | bool:
+    """Return the record, why it is unusable, or True for a kind that is passed over."""
+    kind = _TYPES.get(opcode)
+    if kind is None:
+        sound = opcode in _OPCODES and (opcode != Opcode.MESSAGE_INDEX or _is_message_index(body))
+        return sound or "a record that makes no sense"
+    try:
+        record: McapRecord = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
+        contents = tuple(breakup_chunk(record, validate_crc=True)) if isinstance(record, Chunk) else ()
+    except _PARSE_ERRORS as error:
+        return f"a damaged {kind.__name__.lower()} ({str(error) or type(error).__name__})"
+    return Found(offset, record, contents)
+
+
+def _is_message_index(body: bytes) -> bool:
+    return len(body) >= 6 and len(body) == 6 + int.from_bytes(body[2:6], "little")
+
+
+def _next_chunk(data: bytes, start: int) -> int | None:
+    """Return where the next readable chunk starts, at or after ``start``."""
+    mark = data.find(_CHUNK_MARK, start + _CHUNK_MARK_OFFSET)
+    while mark >= 0:
+        offset = mark - _CHUNK_MARK_OFFSET
+        opcode, size = _PREFIX.unpack_from(data, offset)
+        end = offset + _PREFIX.size + size
+        if opcode == Opcode.CHUNK and end <= len(data):
+            if isinstance(_parse(opcode, data[offset + _PREFIX.size : end], offset), Found):
+                return offset
+        mark = data.find(_CHUNK_MARK, mark + 1)
+    return None
+
+
+def messages(found: Found) -> Iterator[Message]:
+    """Yield the messages of a chunk."""
+    return (record for record in found.contents if isinstance(record, Message))

@@ -1,0 +1,287 @@
+"""What one control cycle hands to the recorder: one datagram in a static binary layout.
+
+The control process must not wait for disk, compression or a schema, so a cycle leaves it as one datagram over
+a non-blocking Unix socket. The layout is little-endian, versioned and closed by a CRC-32; nothing in it is
+executable.
+
+======  ==========================================================================================
+part    content
+======  ==========================================================================================
+head    magic, version, counts, the scalars of :class:`CycleRecord`
+states  each: six int64 (receive_ns, device_ns, sequence, command_sequence, command_age_ns, status),
+        then position, velocity, effort as J float64 each
+arrays  action (K float64), asked and sent (7 x A float64 each), where present
+texts   safety state, events (stamp, kind, message, JSON), wire (stamp, channel, payload)
+tail    CRC-32 of all bytes before it
+======  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+import struct
+import zlib
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, ProtocolError, VersionMismatchError
+from deal_hw.transport import Message
+from deal_hw.types import Event, FloatArray, JointCommand, RobotState, Status
+
+MAGIC = b"DHCR"
+VERSION = 1
+MAX_DATAGRAM_BYTES = 128 * 1024
+"""A sender refuses more; Linux carries up to about 200 kB at its default socket buffer."""
+
+_HEAD = struct.Struct("<4sHHHHHHiBxHI7q")
+_STATE = struct.Struct("<6q")
+_EVENT = struct.Struct("<qHII")
+_WIRE = struct.Struct("<qHI")
+_CRC = struct.Struct("<I")
+_HAS_ASKED, _HAS_SENT = 1, 2
+_COMMAND_FIELDS = tuple(field.name for field in fields(JointCommand))
+
+
+class CycleFlag(enum.IntFlag):
+    """What was unusual in a cycle; the bits of :attr:`CycleRecord.flags`."""
+
+    NONE = 0
+    OVERRUN = 1
+    """The cycle started more than one period after its deadline."""
+    CLIPPED = 2
+    """The safety filter changed what was asked for."""
+    NO_STATE = 4
+    """No state sample arrived since the last cycle."""
+    POLICY_LATE = 8
+    """The policy's action came too late for this cycle."""
+    SEND_FAILED = 16
+    """The transport did not take the command."""
+    LINK_ERROR = 32
+    """Corrupt frames or gaps were seen since the last cycle."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleRecord:
+    """Everything of one control cycle that is worth keeping; all stamps on the host's monotonic clock.
+
+    Attributes:
+        cycle: Number of the cycle, from 0.
+        deadline_ns: When the cycle should have started [ns].
+        start_ns: When it started [ns].
+        states: The samples received since the last cycle, in order of arrival.
+        action: What the policy returned, (K,); None without a policy or an action.
+        asked: The command asked of the safety filter; None where none was.
+        sent: The command really sent; None where none was (disarmed, dry run).
+        sent_sequence: Number of the command sent; -1 where none was.
+        sent_ns: When it was sent [ns]; -1 where none was.
+        state_age_ns: Age of the newest state when the action was computed [ns]; -1 where there was none.
+        safety_state: Name of the safety filter's state.
+        flags: :class:`CycleFlag` bits.
+        events: What happened in the cycle.
+        wire: Raw bytes since the last cycle, channels "rx" and "tx".
+        lost: Hand-overs to the recorder refused so far; a sender counts them.
+    """
+
+    cycle: int
+    deadline_ns: int
+    start_ns: int
+    states: tuple[RobotState, ...] = ()
+    action: FloatArray | None = None
+    asked: JointCommand | None = None
+    sent: JointCommand | None = None
+    sent_sequence: int = -1
+    sent_ns: int = -1
+    state_age_ns: int = -1
+    safety_state: str = ""
+    flags: int = 0
+    events: tuple[Event, ...] = ()
+    wire: tuple[Message, ...] = ()
+    lost: int = 0
+
+
+def encode(record: CycleRecord) -> bytes:
+    """Return the datagram of a record.
+
+    Raises:
+        ConfigurationError: Arrays do not fit each other, a number is out of range, or the datagram is too
+            long. A sender in a control loop counts this as a loss like a refused hand-over.
+    """
+    try:
+        body = _encode_body(record)
+    except struct.error as error:
+        raise ConfigurationError(
+            f"cycle {record.cycle}: a number does not fit the record ({error})"
+        ) from error
+    size = len(body) + _CRC.size
+    if size > MAX_DATAGRAM_BYTES:
+        raise ConfigurationError(
+            f"cycle {record.cycle}: the record has {size} bytes, at most {MAX_DATAGRAM_BYTES} fit; "
+            "hand over fewer raw bytes or events at once"
+        )
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def _encode_body(record: CycleRecord) -> bytes:
+    joints = record.states[0].position.size if record.states else 0
+    commands = [command for command in (record.asked, record.sent) if command is not None]
+    actuated = commands[0].position_target.size if commands else 0
+    present = _HAS_ASKED * (record.asked is not None) | _HAS_SENT * (record.sent is not None)
+    safety_state = _text(record.safety_state)
+    action_size = -1 if record.action is None else record.action.size
+    parts = [
+        _HEAD.pack(
+            MAGIC, VERSION, joints, len(record.states), actuated, len(record.events), len(record.wire),
+            action_size, present, len(safety_state), record.flags, record.cycle, record.deadline_ns,
+            record.start_ns, record.sent_sequence, record.sent_ns, record.state_age_ns, record.lost,
+        )
+    ]  # fmt: skip
+    parts.extend(_encode_state(state, joints) for state in record.states)
+    if record.action is not None:
+        parts.append(_floats(record.action, action_size, "action"))
+    for command in commands:
+        parts.extend(_floats(getattr(command, name), actuated, name) for name in _COMMAND_FIELDS)
+    parts.append(safety_state)
+    parts.extend(_encode_event(event) for event in record.events)
+    parts.extend(_encode_message(message) for message in record.wire)
+    return b"".join(parts)
+
+
+def decode(datagram: bytes) -> CycleRecord:
+    """Return the record in a datagram; its arrays are read-only views.
+
+    Raises:
+        ProtocolError: The bytes are corrupt or cut off.
+        VersionMismatchError: The sender speaks another version.
+    """
+    if len(datagram) < _HEAD.size + _CRC.size:
+        least = _HEAD.size + _CRC.size
+        raise ProtocolError(f"cycle record cut off: {len(datagram)} bytes, at least {least} expected")
+    if datagram[:4] != MAGIC:
+        raise ProtocolError(f"not a cycle record: it starts with {datagram[:4]!r}, expected {MAGIC!r}")
+    if (version := int.from_bytes(datagram[4:6], "little")) != VERSION:
+        raise VersionMismatchError(f"cycle record of version {version}; this recorder reads {VERSION}")
+    body = datagram[: -_CRC.size]
+    if zlib.crc32(body) != _CRC.unpack_from(datagram, len(body))[0]:
+        raise ProtocolError(f"cycle record of {len(datagram)} bytes is corrupt or cut off: wrong CRC-32")
+    try:
+        return _decode_body(body)
+    except (struct.error, ValueError) as error:
+        raise ProtocolError(
+            f"cycle record of {len(datagram)} bytes does not hold what its head says: {error}"
+        ) from error
+
+
+def _decode_body(body: bytes) -> CycleRecord:
+    (
+        _, _, joints, state_count, actuated, event_count, wire_count, action_size, present, text_size, flags,
+        cycle, deadline_ns, start_ns, sent_sequence, sent_ns, state_age_ns, lost,
+    ) = _HEAD.unpack_from(body)  # fmt: skip
+    cursor = _Cursor(body, _HEAD.size)
+    states = tuple(_decode_state(cursor, joints) for _ in range(state_count))
+    action = cursor.floats(action_size) if action_size >= 0 else None
+    asked = _decode_command(cursor, actuated) if present & _HAS_ASKED else None
+    sent = _decode_command(cursor, actuated) if present & _HAS_SENT else None
+    safety_state = cursor.text(text_size)
+    events = tuple(_decode_event(cursor) for _ in range(event_count))
+    wire = tuple(_decode_message(cursor) for _ in range(wire_count))
+    cursor.finish()
+    return CycleRecord(
+        cycle=cycle, deadline_ns=deadline_ns, start_ns=start_ns, states=states, action=action, asked=asked,
+        sent=sent, sent_sequence=sent_sequence, sent_ns=sent_ns, state_age_ns=state_age_ns,
+        safety_state=safety_state, flags=flags, events=events, wire=wire, lost=lost,
+    )  # fmt: skip
+
+
+class _Cursor:
+    """Reads a body from front to back and refuses to read past its end."""
+
+    def __init__(self, body: bytes, offset: int) -> None:
+        self._body = body
+        self._offset = offset
+
+    def take(self, size: int) -> bytes:
+        end = self._offset + size
+        if end > len(self._body):
+            raise ValueError(f"{size} bytes wanted at {self._offset} of {len(self._body)}")
+        part = self._body[self._offset : end]
+        self._offset = end
+        return part
+
+    def unpack(self, layout: struct.Struct) -> tuple[int, ...]:
+        return layout.unpack(self.take(layout.size))
+
+    def floats(self, count: int) -> FloatArray:
+        return np.frombuffer(self.take(8 * count), dtype="<f8")
+
+    def text(self, size: int) -> str:
+        return self.take(size).decode()
+
+    def finish(self) -> None:
+        if self._offset != len(self._body):
+            raise ValueError(f"{len(self._body) - self._offset} bytes too many")
+
+
+def _floats(values: FloatArray, size: int, name: str) -> bytes:
+    if values.shape != (size,):
+        raise ConfigurationError(f"{name} has shape {values.shape}, the rest of the record has ({size},)")
+    return np.asarray(values, dtype="<f8").tobytes()
+
+
+def _text(value: str) -> bytes:
+    return value.encode("utf-8", "backslashreplace")
+
+
+def _encode_state(state: RobotState, joints: int) -> bytes:
+    return b"".join(
+        (
+            _STATE.pack(
+                state.receive_ns, state.device_ns, state.sequence, state.command_sequence,
+                state.command_age_ns, state.status,
+            ),
+            _floats(state.position, joints, "position"),
+            _floats(state.velocity, joints, "velocity"),
+            _floats(state.effort, joints, "effort"),
+        )
+    )  # fmt: skip
+
+
+def _decode_state(cursor: _Cursor, joints: int) -> RobotState:
+    receive_ns, device_ns, sequence, command_sequence, command_age_ns, status = cursor.unpack(_STATE)
+    position, velocity, effort = (cursor.floats(joints) for _ in range(3))
+    return RobotState(
+        position=position, velocity=velocity, effort=effort, receive_ns=receive_ns, device_ns=device_ns,
+        sequence=sequence, command_sequence=command_sequence, command_age_ns=command_age_ns,
+        status=Status(status),
+    )  # fmt: skip
+
+
+def _decode_command(cursor: _Cursor, actuated: int) -> JointCommand:
+    return JointCommand(**{name: cursor.floats(actuated) for name in _COMMAND_FIELDS})
+
+
+def _encode_event(event: Event) -> bytes:
+    # The control loop must not die of an odd value in a note for the operator: it goes in as its text.
+    try:
+        data = json.dumps(dict(event.data), default=str).encode() if event.data else b""
+    except (TypeError, ValueError):
+        data = json.dumps({"unreadable": repr(event.data)}).encode()
+    kind, message = _text(event.kind), _text(event.message)
+    return _EVENT.pack(event.stamp_ns, len(kind), len(message), len(data)) + kind + message + data
+
+
+def _decode_event(cursor: _Cursor) -> Event:
+    stamp_ns, kind, message, data = cursor.unpack(_EVENT)
+    texts = cursor.text(kind), cursor.text(message)
+    return Event(stamp_ns, *texts, json.loads(cursor.take(data)) if data else {})
+
+
+def _encode_message(message: Message) -> bytes:
+    channel = _text(message.channel)
+    return _WIRE.pack(message.stamp_ns, len(channel), len(message.payload)) + channel + message.payload
+
+
+def _decode_message(cursor: _Cursor) -> Message:
+    stamp_ns, channel, payload = cursor.unpack(_WIRE)
+    return Message(channel=cursor.text(channel), payload=cursor.take(payload), stamp_ns=stamp_ns)

@@ -1,0 +1,254 @@
+"""Mends an episode that was torn by a kill or damaged on disk, and checks whole ones."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from mcap.records import Channel, DataEnd, Header, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from deal_hw.data.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recorder import LIBRARY
+from deal_hw.data.schemas import CHANNELS
+from deal_hw.errors import DatasetError, EmptyRecordingError
+
+REPAIR_NAME = "deal-hw.repair"
+
+
+@dataclass(frozen=True, slots=True)
+class RepairReport:
+    """What a check or repair of a file found.
+
+    Attributes:
+        path: The file.
+        repaired: It was rewritten.
+        torn: It had no footer.
+        messages: Readable messages.
+        chunks: Readable chunks.
+        damaged: Damaged places, in words.
+        lost_bytes: Bytes that could not be used.
+        lost_spans_s: Stretches of the recording in which messages are missing, host time since the first [s].
+        original: Where the original was kept; None where it was not.
+    """
+
+    path: Path
+    repaired: bool
+    torn: bool
+    messages: int
+    chunks: int
+    damaged: tuple[str, ...] = ()
+    lost_bytes: int = 0
+    lost_spans_s: tuple[tuple[float, float], ...] = ()
+    original: Path | None = None
+
+    @property
+    def sound(self) -> bool:
+        """Nothing is wrong with the file."""
+        return not self.torn and not self.damaged
+
+    def describe(self) -> str:
+        """Return one paragraph for the operator."""
+        if self.sound:
+            return f"{self.path}: sound, {self.messages} messages in {self.chunks} chunks"
+        wrong = (["no footer (the recorder was killed or the disk was full)"] if self.torn else []) + [
+            *self.damaged
+        ]
+        text = (
+            f"{self.path}: {'; '.join(wrong)}. {self.messages} messages in {self.chunks} chunks are readable"
+        )
+        if self.lost_bytes:
+            text += f", {self.lost_bytes} bytes are lost"
+        for start_s, end_s in self.lost_spans_s:
+            text += f", a hole of {end_s - start_s:.3f} s begins {start_s:.3f} s into the recording"
+        if self.repaired:
+            text += ". Rewritten"
+            text += f"; the damaged original is {self.original}" if self.original else ""
+        return text
+
+
+def verify(path: Path) -> RepairReport:
+    """Check a file, checksums included, without changing it.
+
+    Raises:
+        EmptyRecordingError: It has 0 bytes.
+        DatasetError: It cannot be read or is not an MCAP file of deal-hw.
+    """
+    return _inspect(Path(path), _load(Path(path))).report
+
+
+def repair(path: Path) -> RepairReport:
+    """Rewrite a torn or damaged file from what is readable; a sound one is left alone.
+
+    The original stays as ``.torn`` until the new file is whole and in place. After damage other than a torn
+    end it is kept for good: another tool may get more out of it.
+
+    Raises:
+        EmptyRecordingError: It has 0 bytes.
+        DatasetError: It cannot be read or written, is not an MCAP file of deal-hw, or has nothing readable.
+    """
+    path = Path(path)
+    data = _load(path)
+    found = _inspect(path, data)
+    report = found.report
+    if report.sound:
+        return report
+    kept, fresh = _unused(path.with_name(path.name + ".torn")), path.with_name(path.name + ".repairing")
+    try:
+        with open(fresh, "wb") as file:
+            _rewrite(data, found, file)
+            file.flush()
+            os.fsync(file.fileno())
+        if not verify(fresh).sound:
+            raise DatasetError(f"{path}: the repaired copy does not verify; the original is untouched")
+        os.link(path, kept)
+        os.replace(fresh, path)
+        if not report.damaged:
+            kept.unlink()
+    except OSError as error:
+        raise DatasetError(
+            f"{path} cannot be repaired: {error.strerror}; the original is untouched"
+        ) from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    return RepairReport(
+        path=path, repaired=True, torn=report.torn, messages=report.messages, chunks=report.chunks,
+        damaged=report.damaged, lost_bytes=report.lost_bytes, lost_spans_s=report.lost_spans_s,
+        original=kept if report.damaged else None,
+    )  # fmt: skip
+
+
+def _unused(path: Path) -> Path:
+    number = 0
+    candidate = path
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}.{number}")
+    return candidate
+
+
+@dataclass(frozen=True, slots=True)
+class _Findings:
+    report: RepairReport
+    header: Header
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+
+
+def _load(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
+    if not data:
+        raise EmptyRecordingError(f"{path} is empty (0 bytes); there is nothing to repair")
+    if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+        raise DatasetError(f"{path} is not an MCAP file; it starts with {data[:8]!r}")
+    return data
+
+
+def _inspect(path: Path, data: bytes) -> _Findings:
+    schemas, channels = _known()
+    header = Header(profile="ros2", library=LIBRARY)
+    losses: list[Lost] = []
+    spans: list[tuple[float, float]] = []
+    first_ns = last_ns = None
+    chunks = count = 0
+    hole = False
+    checksum: str | None = None
+    for item in scan(data):
+        if isinstance(item, Lost):
+            losses.append(item)
+            hole = True
+            continue
+        if isinstance(item.record, Header):
+            header = item.record
+        elif isinstance(item.record, DataEnd):
+            checksum = _checksum(data, item.offset, item.record)
+        for record in (item.record, *item.contents):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+        stamps = [message.log_time for message in messages(item)]
+        if stamps:
+            chunks, count = chunks + 1, count + len(stamps)
+            first_ns = min(stamps) if first_ns is None else first_ns
+            if hole and last_ns is not None:
+                spans.append(((last_ns - first_ns) * 1e-9, (min(stamps) - first_ns) * 1e-9))
+            last_ns, hole = max(stamps), False
+    if not header.library.startswith("deal-hw"):
+        raise DatasetError(
+            f"{path} was written by {header.library!r}; only recordings of deal-hw can be mended"
+        )
+    damaged = [f"{loss.reason} at byte {loss.offset}" for loss in losses if not loss.torn]
+    damaged += [checksum] if checksum and not damaged else []
+    report = RepairReport(
+        path=path, repaired=False, torn=any(loss.torn for loss in losses), messages=count, chunks=chunks,
+        damaged=tuple(damaged), lost_bytes=sum(loss.size for loss in losses), lost_spans_s=tuple(spans),
+    )  # fmt: skip
+    return _Findings(report, header, schemas, channels)
+
+
+def _checksum(data: bytes, offset: int, end: DataEnd) -> str | None:
+    if end.data_section_crc in (0, zlib.crc32(data[:offset])):
+        return None
+    return "the checksum over the whole recording does not match"
+
+
+def _known() -> tuple[dict[int, Schema], dict[int, Channel]]:
+    """Return the schemas and channels as a recorder numbers them, for a file whose first chunk is damaged."""
+    schemas: dict[str, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for number, (topic, kind) in enumerate(CHANNELS.items(), start=1):
+        if kind.name not in schemas:
+            definition = kind.definition.encode()
+            schemas[kind.name] = Schema(
+                id=len(schemas) + 1, data=definition, encoding="ros2msg", name=kind.name
+            )
+        channels[number] = Channel(
+            id=number, topic=topic, message_encoding="cdr", metadata={}, schema_id=schemas[kind.name].id
+        )
+    return {schema.id: schema for schema in schemas.values()}, channels
+
+
+def _rewrite(data: bytes, findings: _Findings, file: IO[bytes]) -> None:
+    """Write all that is readable, chunk by chunk, and what was lost."""
+    writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile=findings.header.profile, library=LIBRARY)
+    schemas = {
+        number: writer.register_schema(schema.name, schema.encoding, schema.data)
+        for number, schema in sorted(findings.schemas.items())
+    }
+    channels = {
+        number: writer.register_channel(
+            channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
+        )
+        for number, channel in sorted(findings.channels.items())
+    }
+    for item in scan(data):
+        if not isinstance(item, Found):
+            continue
+        if isinstance(item.record, Metadata):
+            writer.add_metadata(item.record.name, item.record.metadata)
+        for message in messages(item):
+            _copy(writer, message, channels)
+        if item.contents:
+            writer.flush()  # type: ignore[no-untyped-call]
+    lost = {"lost_bytes": str(findings.report.lost_bytes), "report": findings.report.describe()}
+    writer.add_metadata(REPAIR_NAME, lost)
+    writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _copy(writer: Writer, message: Message, channels: dict[int, int]) -> None:
+    if message.channel_id in channels:
+        writer.add_message(
+            channels[message.channel_id],
+            message.log_time,
+            message.data,
+            message.publish_time,
+            message.sequence,
+        )

@@ -1,0 +1,197 @@
+"""The messages inside an episode file: ROS 2 message definitions and their CDR encoding.
+
+Each type is data, a list of fields; the ros2msg text that goes into the file and the bytes of a message both
+follow from it, so that they cannot disagree. rerun, Foxglove and mcap_ros2 decode the messages from that
+text alone.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.errors import ProtocolError, UnknownNameError
+
+_HEADER = b"\x00\x01\x00\x00"
+"""CDR encapsulation, little-endian; alignment counts from its end."""
+_SCALARS = {"int64": struct.Struct("<q"), "uint32": struct.Struct("<I"), "bool": struct.Struct("<?")}
+_LENGTH = _SCALARS["uint32"]
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """One message type.
+
+    Attributes:
+        name: ROS 2 name.
+        fields: Pairs of ros2msg type (int64, uint32, bool, string, string[], uint8[], float64[]) and name.
+    """
+
+    name: str
+    fields: tuple[tuple[str, str], ...]
+
+    @property
+    def definition(self) -> str:
+        """The ros2msg text."""
+        return "\n".join(f"{kind} {name}" for kind, name in self.fields) + "\n"
+
+    def encode(self, *values: Any) -> bytes:
+        """Return the CDR bytes of one message; values in the order of the fields."""
+        out = bytearray()
+        for (kind, _), value in zip(self.fields, values, strict=True):
+            if kind in _SCALARS:
+                layout = _SCALARS[kind]
+                _pad(out, layout.size)
+                out += layout.pack(value)
+            elif kind == "string[]":
+                _put_length(out, len(value))
+                for text in value:
+                    _put_text(out, text)
+            elif kind == "string":
+                _put_text(out, value)
+            else:
+                _put_length(out, len(value))
+                if kind == "float64[]":
+                    _put_floats(out, value)
+                else:
+                    out += value
+        return _HEADER + out
+
+    def decode(self, data: bytes) -> tuple[Any, ...]:
+        """Return the values of one message in the order of the fields; float64[] as read-only arrays.
+
+        Raises:
+            ProtocolError: The bytes are not such a message.
+        """
+        if data[:4] != _HEADER:
+            raise ProtocolError(f"{self.name}: not little-endian CDR, it starts with {data[:4]!r}")
+        cursor = _Reader(data[4:])
+        try:
+            return tuple(cursor.value(kind) for kind, _ in self.fields)
+        except (struct.error, ValueError) as error:
+            raise ProtocolError(f"{self.name}: {len(data)} bytes do not hold the message: {error}") from error
+
+
+class _Reader:
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._offset = 0
+
+    def value(self, kind: str) -> Any:
+        if kind in _SCALARS:
+            return self._scalar(_SCALARS[kind])
+        if kind == "string":
+            return self._text()
+        count = self._scalar(_LENGTH)
+        if kind == "string[]":
+            return tuple(self._text() for _ in range(count))
+        if kind == "uint8[]":
+            return self._take(count)
+        if count:
+            self._offset += -self._offset % 8
+        return np.frombuffer(self._take(8 * count), dtype="<f8")
+
+    def _scalar(self, layout: struct.Struct) -> Any:
+        self._offset += -self._offset % layout.size
+        (value,) = layout.unpack_from(self._data, self._offset)
+        self._offset += layout.size
+        return value
+
+    def _text(self) -> str:
+        return self._take(self._scalar(_LENGTH))[:-1].decode()
+
+    def _take(self, size: int) -> bytes:
+        part = self._data[self._offset : self._offset + size]
+        if len(part) != size:
+            raise ValueError(f"{size} bytes wanted at {self._offset} of {len(self._data)}")
+        self._offset += size
+        return part
+
+
+def _pad(out: bytearray, size: int) -> None:
+    out += bytes(-len(out) % size)
+
+
+def _put_length(out: bytearray, length: int) -> None:
+    _pad(out, 4)
+    out += _LENGTH.pack(length)
+
+
+def _put_text(out: bytearray, text: str) -> None:
+    data = text.encode("utf-8", "backslashreplace") + b"\0"
+    _put_length(out, len(data))
+    out += data
+
+
+def _put_floats(out: bytearray, values: Any) -> None:
+    if len(values):
+        _pad(out, 8)
+        out += np.asarray(values, dtype="<f8").tobytes()
+
+
+ROBOT = MessageType(
+    "deal_hw_msgs/msg/Robot",
+    (("string", "description_json"), ("string[]", "joint_names"), ("string[]", "actuated")),
+)
+STATE = MessageType(
+    "deal_hw_msgs/msg/State",
+    (
+        ("int64", "receive_ns"), ("int64", "device_ns"), ("int64", "sequence"),
+        ("int64", "command_sequence"), ("int64", "command_age_ns"), ("uint32", "status"),
+        ("float64[]", "position"), ("float64[]", "velocity"), ("float64[]", "effort"),
+    ),
+)  # fmt: skip
+COMMAND = MessageType(
+    "deal_hw_msgs/msg/Command",
+    (
+        ("int64", "stamp_ns"), ("int64", "cycle"), ("int64", "sequence"), ("float64[]", "position_target"),
+        ("float64[]", "velocity_target"), ("float64[]", "stiffness"), ("float64[]", "damping"),
+        ("float64[]", "effort"), ("float64[]", "effort_limit"), ("float64[]", "speed_limit"),
+    ),
+)  # fmt: skip
+CYCLE = MessageType(
+    "deal_hw_msgs/msg/Cycle",
+    (
+        ("int64", "cycle"), ("int64", "deadline_ns"), ("int64", "start_ns"), ("int64", "state_age_ns"),
+        ("int64", "lost"), ("uint32", "flags"), ("bool", "has_action"), ("float64[]", "action"),
+        ("string", "safety_state"),
+    ),
+)  # fmt: skip
+EVENT = MessageType(
+    "deal_hw_msgs/msg/Event",
+    (("int64", "stamp_ns"), ("string", "kind"), ("string", "message"), ("string", "data_json")),
+)
+WIRE = MessageType("deal_hw_msgs/msg/Wire", (("int64", "stamp_ns"), ("uint8[]", "payload")))
+
+CHANNELS: Mapping[str, MessageType] = {
+    "/robot": ROBOT,
+    "/state": STATE,
+    "/command": COMMAND,
+    "/command/asked": COMMAND,
+    "/cycle": CYCLE,
+    "/events": EVENT,
+    "/wire/rx": WIRE,
+    "/wire/tx": WIRE,
+}
+"""Topic -> type, in the order in which a recorder registers them: the n-th has channel id n, from 1.
+
+Repair relies on that order where the part of a file that names the channels is damaged: append, never
+reorder.
+"""
+
+
+def message_type(topic: str) -> MessageType:
+    """Return the type of the messages on a topic.
+
+    Raises:
+        UnknownNameError: No such topic.
+    """
+    if topic.startswith("/wire/"):
+        return WIRE
+    if topic not in CHANNELS:
+        raise UnknownNameError("topic", topic, CHANNELS)
+    return CHANNELS[topic]

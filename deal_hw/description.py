@@ -1,0 +1,148 @@
+"""Contract of a robot description: facts about one robot, each with its source."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorModel:
+    """What stands between the true state and the reported one.
+
+    Attributes:
+        noise: Standard deviation of white noise on positions, (J,) [m or rad].
+        resolution: Quantisation step of positions, (J,) [m or rad]; 0 for none.
+        velocity_window_s: Velocities are position differences over this time [s]; 0: the true velocity.
+    """
+
+    noise: tuple[float, ...]
+    resolution: tuple[float, ...]
+    velocity_window_s: float
+
+    @property
+    def position_std(self) -> FloatArray:
+        """Standard deviation of a reported position, quantisation included, (J,)."""
+        return np.sqrt(np.square(self.noise) + np.square(self.resolution) / 12.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyLimits:
+    """What the safety filter enforces, arrays as tuples in the order of the actuated joints (A) unless said.
+
+    Attributes:
+        target: Lowest and highest position target, (A, 2).
+        target_step: Largest change of the target from one command to the next, (A,).
+        target_distance: Largest distance of the target from the measured position, (A,).
+        trip_position: Leaving this range of measured positions trips, (J, 2); infinite where free.
+        trip_velocity: Exceeding this measured speed trips, (J,).
+        stiffness: Highest stiffness that may be sent, (A,).
+        damping: Highest damping that may be sent, (A,).
+        effort: Highest effort limit that may be sent, (A,).
+        speed: Highest speed limit that may be sent, (A,).
+        state_age_s: Older states trip [s].
+        action_age_s: A policy that is later than this trips [s].
+        ease_in_s: Time over which control is handed to the policy [s].
+    """
+
+    target: tuple[tuple[float, float], ...]
+    target_step: tuple[float, ...]
+    target_distance: tuple[float, ...]
+    trip_position: tuple[tuple[float, float], ...]
+    trip_velocity: tuple[float, ...]
+    stiffness: tuple[float, ...]
+    damping: tuple[float, ...]
+    effort: tuple[float, ...]
+    speed: tuple[float, ...]
+    state_age_s: float
+    action_age_s: float
+    ease_in_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotDescription:
+    """Facts about one robot.
+
+    Attributes:
+        name: The robot's name, as on the command line.
+        joint_names: The J joints in the one order that every array follows.
+        actuated: The A joints that take commands, in command order.
+        position_units: Unit of each joint's position, "m" or "rad", (J,).
+        default_position: The pose that policies are relative to, (J,).
+        stiffness: Default kp, (A,).
+        damping: Default kd, (A,).
+        effort_limit: Default effort limit, (A,).
+        speed_limit: Default speed limit of the set-point, (A,).
+        control_rate_hz: Rate of commands.
+        device_rate_hz: Rate of the P-D loop inside the device.
+        state_rate_hz: Rate of state samples.
+        limits: What the safety filter enforces.
+        sensor: The nominal sensor model.
+        mjcf: The robot's MuJoCo model.
+        sources: Where each number comes from, by attribute name.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    actuated: tuple[str, ...]
+    position_units: tuple[str, ...]
+    default_position: tuple[float, ...]
+    stiffness: tuple[float, ...]
+    damping: tuple[float, ...]
+    effort_limit: tuple[float, ...]
+    speed_limit: tuple[float, ...]
+    control_rate_hz: float
+    device_rate_hz: float
+    state_rate_hz: float
+    limits: SafetyLimits
+    sensor: SensorModel
+    mjcf: Path
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.actuated if name not in self.joint_names]
+        if unknown:
+            raise ConfigurationError(f"robot {self.name!r}: actuated joints {unknown} are not among {self.joint_names}")
+        J, A = len(self.joint_names), len(self.actuated)
+        for name, length in (
+            ("position_units", J), ("default_position", J), ("stiffness", A), ("damping", A), ("effort_limit", A),
+            ("speed_limit", A),
+        ):  # fmt: skip
+            if len(getattr(self, name)) != length:
+                raise ConfigurationError(
+                    f"robot {self.name!r}: {name} has {len(getattr(self, name))} entries, expected {length}"
+                )
+
+    @property
+    def actuated_index(self) -> tuple[int, ...]:
+        """Index of each actuated joint among the joints, (A,)."""
+        return tuple(self.joint_names.index(name) for name in self.actuated)
+
+    @property
+    def steps_per_control(self) -> int:
+        """Device periods in one control period."""
+        return round(self.device_rate_hz / self.control_rate_hz)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; the MJCF goes in as its digest."""
+        import dataclasses
+
+        values = dataclasses.asdict(self)
+        values["mjcf"] = hashlib.sha256(self.mjcf.read_bytes()).hexdigest()
+        values["sources"] = dict(self.sources)
+        return values
+
+    def digest(self) -> str:
+        """Return a digest that changes when any fact changes; sources do not count."""
+        values = self.to_json()
+        values.pop("sources")
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,133 @@
+"""Every error that deal-hw raises on purpose.
+
+The tree (built-in parents in parentheses)::
+
+    DealHwError
+    ├── ConfigurationError (ValueError)        a setting that cannot be used
+    │   └── UnknownNameError                   a name that is not in a table; lists the table
+    ├── MissingExtraError (ImportError)        an optional dependency is absent
+    ├── TransportError (ConnectionError)       the byte path to the robot
+    │   ├── PortNotFoundError                  no such port
+    │   ├── PortBusyError                      somebody else holds the port
+    │   ├── TransportLostError                 unplugged in flight
+    │   └── TransportTimeoutError (TimeoutError)
+    ├── ProtocolError                          bytes that do not make sense
+    │   ├── FrameError                         one corrupt frame; the stream goes on
+    │   ├── VersionMismatchError               the peer speaks another version
+    │   └── WrongDeviceError                   the peer is not the robot that was asked for
+    ├── SafetyError                            a command that must not be sent
+    ├── PolicyError                            a policy that cannot run
+    │   └── PolicyMismatchError                a policy for another robot or another observation
+    ├── DatasetError                           a recording that cannot be used
+    │   ├── EmptyRecordingError
+    │   └── TornRecordingError                 no footer: `deal-hw data repair` mends it
+    └── CalibrationError
+        └── InsufficientDataError              too short or without excitation; says what to record
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class DealHwError(Exception):
+    """Base of all errors raised on purpose by deal-hw."""
+
+
+class ConfigurationError(DealHwError, ValueError):
+    """A setting that cannot be used."""
+
+
+class UnknownNameError(ConfigurationError):
+    """A name that is not in a table.
+
+    Args:
+        what: The kind of thing that was looked up, such as ``"parameter"``.
+        given: The name that was given.
+        allowed: The names that exist.
+    """
+
+    def __init__(self, what: str, given: str, allowed: Iterable[str]) -> None:
+        self.given = given
+        self.allowed = tuple(allowed)
+        super().__init__(f"unknown {what} {given!r}; known: {', '.join(self.allowed) or '(none)'}")
+
+
+class MissingExtraError(DealHwError, ImportError):
+    """An optional dependency is absent.
+
+    Args:
+        package: The package that could not be imported.
+        extra: The extra of deal-hw that installs it.
+    """
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"{package} is not installed; install it with: pip install 'deal-hw[{extra}]'")
+
+
+class TransportError(DealHwError, ConnectionError):
+    """The byte path to the robot failed."""
+
+
+class PortNotFoundError(TransportError):
+    """The port does not exist or cannot be opened."""
+
+
+class PortBusyError(TransportError):
+    """Another process holds the port."""
+
+
+class TransportLostError(TransportError):
+    """The peer vanished while the transport was open."""
+
+
+class TransportTimeoutError(TransportError, TimeoutError):
+    """Nothing arrived in time."""
+
+
+class ProtocolError(DealHwError):
+    """Bytes that do not make sense."""
+
+
+class FrameError(ProtocolError):
+    """One frame is corrupt; the stream goes on with the next."""
+
+
+class VersionMismatchError(ProtocolError):
+    """The peer speaks another version of the protocol."""
+
+
+class WrongDeviceError(ProtocolError):
+    """The peer is not the robot that was asked for."""
+
+
+class SafetyError(DealHwError):
+    """A command that must not be sent."""
+
+
+class PolicyError(DealHwError):
+    """A policy that cannot run."""
+
+
+class PolicyMismatchError(PolicyError):
+    """A policy made for another robot, observation or action."""
+
+
+class DatasetError(DealHwError):
+    """A recording that cannot be used."""
+
+
+class EmptyRecordingError(DatasetError):
+    """The recording holds no state sample."""
+
+
+class TornRecordingError(DatasetError):
+    """The recording has no footer, as after a kill; ``deal-hw data repair`` mends it."""
+
+
+class CalibrationError(DealHwError):
+    """The calibration cannot be done."""
+
+
+class InsufficientDataError(CalibrationError):
+    """The recording is too short or without excitation."""

@@ -1,0 +1,266 @@
+"""Contract of parameters: what may be searched, in which range and scale, and what is known about it afterwards.
+
+A :class:`Parameter` is named after the element and the MuJoCo field it changes. The search runs in the unit cube;
+:meth:`ParameterSpace.normalize` and :meth:`ParameterSpace.unnormalize` are the one pair that maps to it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.types import FloatArray
+
+Scale = Literal["log", "linear"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """One physical parameter.
+
+    Attributes:
+        name: Unique name, ``<element>.<quantity>``.
+        kind: Name of the function in ``deal_hw.sim.parameters`` that applies it.
+        elements: MuJoCo elements it changes together (symmetry); one is the usual case.
+        unit: SI unit.
+        nominal: The value the user's model has.
+        low: Lower end of the search range.
+        high: Upper end of the search range.
+        scale: Whether equal steps are equal ratios ("log") or equal differences ("linear").
+        known: Measured by other means (ruler, scale); not searched.
+    """
+
+    name: str
+    kind: str
+    elements: tuple[str, ...]
+    unit: str
+    nominal: float
+    low: float
+    high: float
+    scale: Scale = "log"
+    known: bool = False
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
+            raise ConfigurationError(
+                f"parameter {self.name!r}: range [{self.low:g}, {self.high:g}] {self.unit} must have low < high"
+            )
+        if self.scale == "log" and self.low <= 0:
+            raise ConfigurationError(
+                f"parameter {self.name!r}: a log scale needs a positive range, got low={self.low:g} {self.unit}"
+            )
+        if not self.low <= self.nominal <= self.high:
+            raise ConfigurationError(
+                f"parameter {self.name!r}: the nominal value {self.nominal:g} lies outside "
+                f"[{self.low:g}, {self.high:g}] {self.unit}; widen the range or correct the model"
+            )
+
+
+class ParameterSpace:
+    """An ordered set of parameters; arrays (N, K) follow the order of the K free ones.
+
+    Args:
+        parameters: All parameters, known ones included.
+    """
+
+    def __init__(self, parameters: Iterable[Parameter]) -> None:
+        self.parameters = tuple(parameters)
+        names = [p.name for p in self.parameters]
+        if len(set(names)) != len(names):
+            raise ConfigurationError(f"parameter names repeat: {names}")
+        self.free = tuple(p for p in self.parameters if not p.known)
+        log = np.array([p.scale == "log" for p in self.free], dtype=bool)
+        self._log = log
+        self.low = np.array([p.low for p in self.free])
+        self.high = np.array([p.high for p in self.free])
+        self.nominal = np.array([p.nominal for p in self.free])
+        safe_low = np.where(log, self.low, 1.0)
+        self._offset = np.where(log, np.log(safe_low), self.low)
+        self._width = np.where(log, np.log(np.where(log, self.high, np.e)), self.high) - self._offset
+
+    def __len__(self) -> int:
+        return len(self.free)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.free)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(p.name for p in self.free)
+
+    @property
+    def log_scale(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Which free parameters are searched on a log scale, (K,)."""
+        return self._log.copy()
+
+    @property
+    def known(self) -> dict[str, float]:
+        """The parameters that are not searched, with their values."""
+        return {p.name: p.nominal for p in self.parameters if p.known}
+
+    def __getitem__(self, name: str) -> Parameter:
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        raise UnknownNameError("parameter", name, (p.name for p in self.parameters))
+
+    def to_scale(self, theta: FloatArray) -> FloatArray:
+        """Map physical values, (..., K), to the scale in which steps are taken: log or linear."""
+        return np.where(self._log, np.log(np.where(self._log, theta, 1.0)), theta)
+
+    def from_scale(self, value: FloatArray) -> FloatArray:
+        """Undo :meth:`to_scale`."""
+        return np.where(self._log, np.exp(np.where(self._log, value, 0.0)), value)
+
+    def normalize(self, theta: FloatArray) -> FloatArray:
+        """Map physical values, (..., K), to the unit cube; values outside the range leave the cube."""
+        return np.asarray((self.to_scale(theta) - self._offset) / self._width)
+
+    def unnormalize(self, unit: FloatArray) -> FloatArray:
+        """Map the unit cube, (..., K), to physical values."""
+        return self.from_scale(self._offset + np.asarray(unit) * self._width)
+
+    @property
+    def width(self) -> FloatArray:
+        """Width of the range in its own scale, (K,): ln(high / low) or high - low."""
+        return self._width.copy()
+
+    @property
+    def center(self) -> FloatArray:
+        """Physical values at the centre of the range, in each parameter's own scale, (K,)."""
+        return self.unnormalize(np.full(len(self), 0.5))
+
+    def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Draw uniformly in the unit cube; returns physical values, (count, K)."""
+        return self.unnormalize(rng.random((count, len(self))))
+
+    def with_ratio(self, xi: float) -> ParameterSpace:
+        """Return the space whose log ranges are [nominal / xi, nominal * xi] (BENCHMARK's fixed ratio).
+
+        Raises:
+            ConfigurationError: ``xi`` is not above 1.
+        """
+        if not xi > 1:
+            raise ConfigurationError(f"the ratio xi must be above 1, got {xi:g}")
+        return ParameterSpace(
+            dataclasses.replace(p, low=p.nominal / xi, high=p.nominal * xi) if p.scale == "log" else p
+            for p in self.parameters
+        )
+
+    def with_known(self, values: Mapping[str, float]) -> ParameterSpace:
+        """Return the space with these parameters known at these values (ranges grow to hold them)."""
+        for name in values:
+            self[name]
+        return ParameterSpace(
+            dataclasses.replace(
+                p, nominal=values[p.name], low=min(p.low, values[p.name]), high=max(p.high, values[p.name]), known=True
+            )
+            if p.name in values
+            else p
+            for p in self.parameters
+        )
+
+    def with_free(self, names: Iterable[str]) -> ParameterSpace:
+        """Return the space in which exactly these parameters are searched; the others keep their nominal value."""
+        wanted = set(names)
+        for name in wanted:
+            self[name]
+        return ParameterSpace(dataclasses.replace(p, known=p.name not in wanted) for p in self.parameters)
+
+    def with_range(self, name: str, low: float, high: float) -> ParameterSpace:
+        """Return the space with another range for one parameter."""
+        self[name]
+        return ParameterSpace(
+            dataclasses.replace(p, low=low, high=high) if p.name == name else p for p in self.parameters
+        )
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Return plain JSON values."""
+        return [dataclasses.asdict(p) for p in self.parameters]
+
+    @classmethod
+    def from_json(cls, values: Iterable[Mapping[str, Any]]) -> ParameterSpace:
+        """Return the space that :meth:`to_json` wrote."""
+        return cls(Parameter(**{**v, "elements": tuple(v["elements"])}) for v in values)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterDistribution:
+    """What is known about the parameters: the thing a policy is trained under.
+
+    In each parameter's own scale (log or linear) a Gaussian, cut off at the range; or uniform over the range.
+
+    Attributes:
+        space: The parameters.
+        mean: Physical values, (K,).
+        covariance: In each parameter's own scale, (K, K); None for uniform over the range.
+        latency_s: Lowest and highest total latency (actuation plus sensing) [s].
+    """
+
+    space: ParameterSpace
+    mean: FloatArray
+    covariance: FloatArray | None
+    latency_s: tuple[float, float]
+
+    @classmethod
+    def uniform(cls, space: ParameterSpace, latency_s: tuple[float, float]) -> ParameterDistribution:
+        """Return the distribution of uniform domain randomisation (UDR)."""
+        return cls(space=space, mean=space.center, covariance=None, latency_s=latency_s)
+
+    @classmethod
+    def point(cls, space: ParameterSpace, theta: FloatArray, latency_s: float) -> ParameterDistribution:
+        """Return the distribution that knows everything (the oracle's)."""
+        K = len(space)
+        return cls(
+            space=space, mean=np.asarray(theta, dtype=float), covariance=np.zeros((K, K)),
+            latency_s=(latency_s, latency_s),
+        )  # fmt: skip
+
+    def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Draw physical values, (count, K), inside the range."""
+        if self.covariance is None:
+            return self.space.sample(rng, count)
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        draws = self.space.to_scale(self.mean) + rng.standard_normal((count, len(self.space))) @ root.T
+        return np.clip(self.space.from_scale(draws), self.space.low, self.space.high)
+
+    def sample_latency(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Draw total latencies, (count,) [s]."""
+        return rng.uniform(self.latency_s[0], self.latency_s[1], count)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "format": "deal_hw.parameter_distribution/1",
+            "space": self.space.to_json(),
+            "mean": dict(zip(self.space.names, map(float, self.mean), strict=True)),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "latency_s": list(self.latency_s),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> ParameterDistribution:
+        """Return the distribution that :meth:`to_json` wrote."""
+        if values.get("format") != "deal_hw.parameter_distribution/1":
+            raise ConfigurationError(f"not a parameter distribution: format is {values.get('format')!r}")
+        space = ParameterSpace.from_json(values["space"])
+        covariance = values["covariance"]
+        return cls(
+            space=space,
+            mean=np.array([values["mean"][name] for name in space.names]),
+            covariance=None if covariance is None else np.array(covariance, dtype=float),
+            latency_s=(float(values["latency_s"][0]), float(values["latency_s"][1])),
+        )
+
+    def digest(self) -> str:
+        """Return a digest of the distribution; a policy carries the one it was trained under."""
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]

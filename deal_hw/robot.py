@@ -1,0 +1,98 @@
+"""Contract of a robot: a description plus a way to read and command it."""
+
+from __future__ import annotations
+
+import abc
+from types import TracebackType
+from typing import ClassVar, Self
+
+from deal_hw.description import RobotDescription
+from deal_hw.transport import Message
+from deal_hw.types import JointCommand, RobotState
+
+
+class Robot(abc.ABC):
+    """A robot behind a transport. The constructor does no I/O; ``connect`` and ``disconnect`` are idempotent.
+
+    A driver never waits longer than it is told to, never retries silently, and does not judge commands: that is the
+    safety filter's work. What it cannot represent on the wire it rounds, and returns what was really sent.
+    """
+
+    description: ClassVar[RobotDescription]
+
+    @abc.abstractmethod
+    def connect(self) -> None:
+        """Open the transport and check that the right robot answers, in the right version.
+
+        Raises:
+            TransportError: The port is missing, busy or silent.
+            WrongDeviceError: Something else answers.
+            VersionMismatchError: The protocol versions differ.
+        """
+
+    @abc.abstractmethod
+    def disconnect(self) -> None:
+        """Close the transport. Does not send ``passive``: the caller does, last of all commands."""
+
+    @abc.abstractmethod
+    def home(self, timeout_s: float) -> None:
+        """Bring the robot to its start pose and wait until it is there.
+
+        Raises:
+            TransportTimeoutError: It is not there in time.
+        """
+
+    @abc.abstractmethod
+    def arm(self, timeout_s: float) -> None:
+        """Let the motors follow commands; clears a latched watchdog.
+
+        Raises:
+            TransportTimeoutError: The robot does not confirm in time.
+        """
+
+    @abc.abstractmethod
+    def read_state(self, timeout_s: float) -> RobotState:
+        """Return the next state sample in order of arrival.
+
+        Args:
+            timeout_s: How long to wait [s]; 0 polls.
+
+        Raises:
+            TransportTimeoutError: No sample in time.
+            TransportLostError: The robot vanished.
+        """
+
+    @abc.abstractmethod
+    def send_command(self, command: JointCommand) -> JointCommand:
+        """Send PD targets and return what was really sent (rounded to the wire's resolution)."""
+
+    @abc.abstractmethod
+    def passive(self) -> None:
+        """Send the least harmful command that this robot has (motor off, or damping). Never blocks."""
+
+    @property
+    @abc.abstractmethod
+    def last_sequence(self) -> int:
+        """Sequence number of the last command sent; -1 before the first."""
+
+    @property
+    @abc.abstractmethod
+    def link_errors(self) -> int:
+        """Corrupt frames and gaps in the state's sequence numbers so far."""
+
+    @abc.abstractmethod
+    def fileno(self) -> int:
+        """A file descriptor that becomes readable when state may have arrived (for ``select``)."""
+
+    @abc.abstractmethod
+    def take_wire(self) -> list[Message]:
+        """Return and forget the raw messages since the last call; channels "rx" and "tx"."""
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.disconnect()

@@ -1,0 +1,109 @@
+"""A recording on the device's own time grid, as the simulator needs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import InsufficientDataError
+from deal_hw.types import FloatArray, IntArray, Status, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """T samples and the commands in force, on a grid of S device periods.
+
+    Attributes:
+        step_s: Device period [s].
+        sample: Grid index of each sample, (T,).
+        position: Reported positions, (T, J).
+        velocity: Reported velocities, (T, J).
+        target: Position target in force at each period, before any latency, (S, A).
+        stiffness: Sent stiffness in force, (S, A).
+        damping: (S, A).
+        effort_limit: (S, A).
+        speed_limit: (S, A).
+        usable: Samples between which the simulator may predict: armed, no watchdog, no gap to the next, (T,).
+        start_setpoint: The set-point at the first period, (A,).
+    """
+
+    step_s: float
+    sample: IntArray
+    position: FloatArray
+    velocity: FloatArray
+    target: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+    effort_limit: FloatArray
+    speed_limit: FloatArray
+    usable: npt.NDArray[np.bool_]
+    start_setpoint: FloatArray
+
+    @property
+    def steps(self) -> int:
+        """Periods S on the grid."""
+        return int(self.target.shape[0])
+
+
+def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
+    """Put a recording on the device's time grid.
+
+    A state sample says which command was in force and how long ago the device received it, so the reception of each
+    command is known on the device's clock to the microsecond, whatever the wire did in between. A command acts from
+    the first period that starts at or after its reception.
+
+    Args:
+        trajectory: The recording.
+        description: The robot.
+
+    Returns:
+        The episode, from the first armed sample with a command in force to the last armed one.
+
+    Raises:
+        InsufficientDataError: There is no such sample.
+    """
+    step_s = 1.0 / description.device_rate_hz
+    armed = (trajectory.status & int(Status.ARMED)) != 0
+    known = armed & (trajectory.command_sequence >= 0)
+    known &= np.isin(trajectory.command_sequence, trajectory.sent_sequence)
+    if known.sum() < 2:
+        raise InsufficientDataError(
+            "the recording has no armed samples with a command in force; record again with `deal-hw collect`"
+        )
+    rows = np.arange(int(np.argmax(known)), len(known) - int(np.argmax(known[::-1])))
+    device = np.round(trajectory.device_s / step_s).astype(np.int64)
+    sequence, age = trajectory.command_sequence[rows], trajectory.command_age_s[rows]
+    # Acts from the next period boundary on; the small part keeps a reception on the boundary on this side of it.
+    acts = np.ceil((trajectory.device_s[rows] - np.nan_to_num(age)) / step_s - 1e-3).astype(np.int64)
+    # The set-point starts to move with the first command, before the first sample that reports it.
+    origin = min(int(acts[0]), int(device[rows[0]]))
+    sample = device[rows] - origin
+    steps = int(sample[-1])
+
+    order = {int(s): i for i, s in enumerate(trajectory.sent_sequence)}
+    in_force = np.zeros(max(steps, 1), dtype=np.int64)
+    seen, first = np.unique(np.where(known[rows], sequence, -1), return_index=True)
+    for number, at in zip(seen, first, strict=True):
+        if number < 0:
+            continue
+        in_force[max(int(acts[at]) - origin, 0) :] = order[int(number)]
+    gap = np.diff(sample, append=sample[-1])
+    usable = armed[rows] & known[rows] & ((trajectory.status[rows] & int(Status.WATCHDOG)) == 0)
+    usable &= gap <= 2 * round(description.device_rate_hz / description.state_rate_hz)
+    usable &= np.isfinite(trajectory.position[rows]).all(axis=1)
+    return Episode(
+        step_s=step_s,
+        sample=sample,
+        position=trajectory.position[rows],
+        velocity=trajectory.velocity[rows],
+        target=trajectory.position_target[in_force],
+        stiffness=trajectory.stiffness[in_force],
+        damping=trajectory.damping[in_force],
+        effort_limit=trajectory.effort_limit[in_force],
+        speed_limit=trajectory.speed_limit[in_force],
+        usable=usable,
+        start_setpoint=trajectory.position[rows[0]][list(description.actuated_index)],
+    )

@@ -1,0 +1,57 @@
+"""The set-point generator in front of a position servo: it moves towards the target at a limited speed.
+
+MuJoCo has no such limit, so it is applied to the control before the engine sees it. The set-point depends on targets,
+limit and time only, never on the state, so whole episodes are computed at once, and a constant latency only shifts it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deal_hw.types import FloatArray
+
+
+def slew(start: FloatArray, target: FloatArray, rate: FloatArray) -> FloatArray:
+    """Follow a target at a limited rate.
+
+    Args:
+        start: Set-point before the first step, (N, A).
+        target: Target in force at each step, (S, A) or (N, S, A).
+        rate: Largest change a step, (N, A) or (N, S, A).
+
+    Returns:
+        The set-point after each step, (N, S, A).
+    """
+    count, steps = start.shape[0], target.shape[-2]
+    targets = np.broadcast_to(target, (count, steps, start.shape[1]))
+    rates = rate if rate.ndim == 3 else np.broadcast_to(rate[:, None], targets.shape)
+    out = np.empty((steps, *start.shape))
+    now = start
+    # Steps first in memory: each step then writes one contiguous row.
+    for s in range(steps):
+        limit = rates[:, s]
+        now = now + np.clip(targets[:, s] - now, -limit, limit)
+        out[s] = now
+    return np.moveaxis(out, 0, 1)
+
+
+def delay(setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray) -> FloatArray:
+    """Delay set-points by a latency, linear between steps.
+
+    Args:
+        setpoint: (N, S, A).
+        latency_steps: Latency of each member in steps, (N,); may be fractional.
+        before: Set-point before the first step, (N, A).
+
+    Returns:
+        The delayed set-point, (N, S, A).
+    """
+    whole = np.floor(latency_steps).astype(int)
+    part = (latency_steps - whole)[:, None, None]
+    longest = int(whole.max(initial=0)) + 1
+    padded = np.concatenate([np.repeat(before[:, None], longest, axis=1), setpoint], axis=1)
+    steps = setpoint.shape[1]
+    index = longest - whole[:, None] + np.arange(steps)
+    late = np.take_along_axis(padded, index[..., None], axis=1)
+    later = np.take_along_axis(padded, index[..., None] - 1, axis=1)
+    return np.asarray((1 - part) * late + part * later)

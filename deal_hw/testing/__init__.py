@@ -1,0 +1,11 @@
+"""Contract suites for new robots and transports, and faults to test them with.
+
+A test class inherits a suite and says what is under test; pytest is imported by the suites only, so that the faults can
+be used outside of tests::
+
+    from deal_hw.testing.transport_suite import TransportPair, TransportSuite
+
+    class TestMyTransport(TransportSuite):
+        @pytest.fixture
+        def pair(self): ...
+"""

@@ -1,0 +1,129 @@
+"""Faults of a wire, on request: corrupt, lost and repeated frames, and a cable that is pulled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, TransportLostError
+from deal_hw.transport import Message, Transport
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultRates:
+    """How often something happens to a frame, each a probability from 0 to 1.
+
+    Attributes:
+        corrupt: One byte becomes another.
+        drop: The frame is lost.
+        duplicate: The frame comes twice.
+    """
+
+    corrupt: float = 0.0
+    drop: float = 0.0
+    duplicate: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("corrupt", "drop", "duplicate"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ConfigurationError(f"{name} is a probability from 0 to 1, got {getattr(self, name)}")
+
+
+class FrameFaults:
+    """Applies :class:`FaultRates` to a byte stream of delimited frames, or to whole messages.
+
+    Attributes:
+        corrupted: Frames changed so far.
+        dropped: Frames lost so far.
+        duplicated: Frames repeated so far.
+
+    Args:
+        rates: How often.
+        rng: Source of randomness.
+        delimiter: End of a frame; None: every call is one frame.
+    """
+
+    def __init__(self, rates: FaultRates, rng: np.random.Generator, delimiter: bytes | None = b"\x00") -> None:
+        self.corrupted = self.dropped = self.duplicated = 0
+        self._rates = rates
+        self._rng = rng
+        self._delimiter = delimiter
+
+    def apply(self, data: bytes) -> bytes:
+        """Return what arrives of ``data``, which holds whole frames."""
+        if self._delimiter is None:
+            return self._frame(data)
+        frames = data.split(self._delimiter)
+        out = b"".join(self._frame(frame + self._delimiter) for frame in frames[:-1])
+        return out + frames[-1]
+
+    def _frame(self, frame: bytes) -> bytes:
+        corrupt, drop, duplicate = self._rng.random(3) < (self._rates.corrupt, self._rates.drop, self._rates.duplicate)
+        if drop:
+            self.dropped += 1
+            return b""
+        if corrupt and frame:
+            self.corrupted += 1
+            changed = bytearray(frame)
+            changed[int(self._rng.integers(len(frame)))] ^= int(self._rng.integers(1, 256))
+            frame = bytes(changed)
+        if duplicate:
+            self.duplicated += 1
+            return frame + frame
+        return frame
+
+
+class FaultyTransport(Transport):
+    """A transport whose messages suffer on the way.
+
+    Args:
+        inner: The transport that works.
+        received: What happens to messages from the device.
+        sent: What happens to messages to the device.
+    """
+
+    def __init__(
+        self, inner: Transport, received: FrameFaults | None = None, sent: FrameFaults | None = None
+    ) -> None:
+        self.inner = inner
+        self._received = received
+        self._sent = sent
+        self._unplugged = False
+
+    def unplug(self) -> None:
+        """Pull the cable."""
+        self._unplugged = True
+
+    def open(self) -> None:
+        """Open the inner transport."""
+        self._check()
+        self.inner.open()
+
+    def close(self) -> None:
+        """Close the inner transport."""
+        self.inner.close()
+
+    def send(self, message: Message) -> None:
+        """Send what is left of the message."""
+        self._check()
+        payload = message.payload if self._sent is None else self._sent.apply(message.payload)
+        if payload:
+            self.inner.send(Message(message.channel, payload, message.stamp_ns))
+
+    def receive(self, timeout_s: float) -> Message:
+        """Receive what is left of a message; a lost one is skipped and the wait starts again."""
+        while True:
+            self._check()
+            message = self.inner.receive(timeout_s)
+            payload = message.payload if self._received is None else self._received.apply(message.payload)
+            if payload:
+                return Message(message.channel, payload, message.stamp_ns)
+
+    def fileno(self) -> int:
+        """Return the inner transport's descriptor."""
+        return int(self.inner.fileno())  # type: ignore[attr-defined]
+
+    def _check(self) -> None:
+        if self._unplugged:
+            raise TransportLostError("the cable was pulled (fault injection)")

@@ -1,0 +1,63 @@
+"""A policy without a network: state feedback. For tests of what runs policies, and as a reference for trained ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.policy import Observation, ObservationTerm, PolicySpec
+from deal_hw.types import FloatArray
+
+CARTPOLE_GAINS = (1.65, 1.04, 0.475, 0.171)
+"""Balances the nominal cart-pole: target per cart position, pole angle and their rates."""
+
+
+def feedback_spec(description: RobotDescription, action_scale: float = 0.25) -> PolicySpec:
+    """Return the spec of a policy that observes all positions, then all velocities, unscaled."""
+    quantities = ("position", "velocity")
+    return PolicySpec(
+        robot=description.name,
+        joint_names=description.joint_names,
+        actuated=description.actuated,
+        observation=tuple(ObservationTerm(q, name, 1.0) for q in quantities for name in description.joint_names),
+        action_scale=(action_scale,) * len(description.actuated),
+        default_position=description.default_position,
+        stiffness=description.stiffness,
+        damping=description.damping,
+        effort_limit=description.effort_limit,
+        speed_limit=description.speed_limit,
+        control_rate_hz=description.control_rate_hz,
+    )
+
+
+class LinearPolicy:
+    """Action = gains x observation, for one actuated joint.
+
+    Args:
+        spec: What it observes.
+        gains: Target per observed quantity, (O,) [m or rad per unit].
+        disturb: Called with the number of the call, from 0, and the action; returns the action to give instead.
+    """
+
+    def __init__(
+        self,
+        spec: PolicySpec,
+        gains: Sequence[float] = CARTPOLE_GAINS,
+        disturb: Callable[[int, FloatArray], FloatArray] = lambda call, action: action,
+    ) -> None:
+        self.spec = spec
+        self.calls = 0
+        self._gains = np.array(gains) / spec.action_scale[0]
+        self._disturb = disturb
+
+    def reset(self) -> None:
+        """Count the calls anew."""
+        self.calls = 0
+
+    def act(self, observation: Observation) -> FloatArray:
+        """Return the action, (1,)."""
+        action = np.array([float(np.dot(self._gains, observation))])
+        self.calls += 1
+        return self._disturb(self.calls - 1, action)

@@ -1,0 +1,158 @@
+"""Messages between robot, policy, recorder and calibration.
+
+All quantities are SI: m, rad, s, N, N·m. Stamps are monotonic nanoseconds of the clock that is named. Arrays follow
+the joint order of the robot's :class:`~deal_hw.description.RobotDescription`: J joints, of which A are actuated.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+class Status(enum.IntFlag):
+    """What a robot says of itself; each driver maps its own bits onto these."""
+
+    NONE = 0
+    ARMED = 1
+    """The motors follow commands."""
+    HOMED = 2
+    """The position reference is valid."""
+    HOMING = 4
+    WATCHDOG = 8
+    """The device stopped its motors because commands stayed away; latched until it is armed again."""
+    EFFORT_CLAMPED = 16
+    """The device's own effort limit is in force."""
+    SPEED_CLAMPED = 32
+    """The device's own speed limit is in force."""
+    AT_END_STOP = 64
+    FAULT = 128
+
+
+@dataclass(frozen=True, slots=True)
+class RobotState:
+    """One sample of a robot's state.
+
+    Attributes:
+        position: Joint positions, (J,) [m or rad].
+        velocity: Joint velocities, (J,) [m/s or rad/s].
+        effort: The device's own estimate of joint efforts, (J,) [N or N·m].
+        receive_ns: Host clock at reception [ns].
+        device_ns: Device clock at which the sample was sent [ns].
+        sequence: Number of the sample, counted by the device.
+        command_sequence: Number of the command in force; -1 before the first.
+        command_age_ns: Device time since that command was received [ns]; -1 before the first.
+        status: What the robot says of itself.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    effort: FloatArray
+    receive_ns: int
+    device_ns: int
+    sequence: int
+    command_sequence: int
+    command_age_ns: int
+    status: Status
+
+
+@dataclass(frozen=True, slots=True)
+class JointCommand:
+    """PD targets for the actuated joints, each array (A,).
+
+    Attributes:
+        position_target: [m or rad].
+        velocity_target: [m/s or rad/s].
+        stiffness: kp [N/m or N·m/rad].
+        damping: kd [N·s/m or N·m·s/rad].
+        effort: Feed-forward effort [N or N·m].
+        effort_limit: The effort the device may use [N or N·m].
+        speed_limit: How fast the device may move its set-point [m/s or rad/s].
+    """
+
+    position_target: FloatArray
+    velocity_target: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+    effort: FloatArray
+    effort_limit: FloatArray
+    speed_limit: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something worth knowing that happened at one moment.
+
+    Attributes:
+        stamp_ns: Host clock [ns].
+        kind: A short name such as ``"armed"``, ``"clipped"``, ``"passive"``, ``"overrun"``.
+        message: One sentence for the operator.
+        data: Plain JSON values.
+    """
+
+    stamp_ns: int
+    kind: str
+    message: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """One recording: T state samples and C commands.
+
+    Attributes:
+        joint_names: The J joints.
+        actuated: The A actuated joints.
+        receive_s: Host time of each sample since the first, (T,) [s].
+        device_s: Device time of each sample since the first, (T,) [s]; the time base of calibration.
+        position: (T, J).
+        velocity: (T, J).
+        effort: (T, J).
+        status: (T,), :class:`Status` bits.
+        command_sequence: The command in force at each sample, (T,); -1 where none.
+        command_age_s: Device time since that command was received, (T,) [s]; NaN where none.
+        sent_s: Host time of each command, on the time base of ``receive_s``, (C,) [s].
+        sent_sequence: Number of each command, (C,).
+        asked_position: Position targets the policy asked for, (C, A).
+        position_target: Position targets really sent, (C, A).
+        stiffness: (C, A).
+        damping: (C, A).
+        effort_limit: (C, A).
+        speed_limit: (C, A).
+        events: What happened.
+        metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
+    """
+
+    joint_names: tuple[str, ...]
+    actuated: tuple[str, ...]
+    receive_s: FloatArray
+    device_s: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    effort: FloatArray
+    status: IntArray
+    command_sequence: IntArray
+    command_age_s: FloatArray
+    sent_s: FloatArray
+    sent_sequence: IntArray
+    asked_position: FloatArray
+    position_target: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+    effort_limit: FloatArray
+    speed_limit: FloatArray
+    events: Sequence[Event] = ()
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def duration_s(self) -> float:
+        """Device time between the first and the last sample [s]."""
+        return float(self.device_s[-1] - self.device_s[0]) if self.device_s.size else 0.0

@@ -1,0 +1,13 @@
+"""The one door to rerun: its absence becomes the error that names the extra."""
+
+from __future__ import annotations
+
+from deal_hw.errors import MissingExtraError
+
+try:
+    import rerun as rr
+    import rerun.blueprint as rrb
+except ImportError as err:
+    raise MissingExtraError("rerun-sdk", "viz") from err
+
+__all__ = ["rr", "rrb"]

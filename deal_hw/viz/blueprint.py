@@ -1,0 +1,115 @@
+"""How an inspected episode opens: 3D and summary at the left, traces stacked at the right, events below."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.types import Trajectory
+from deal_hw.viz.backend import rrb
+from deal_hw.viz.columns import DEVICE_TIMELINE
+
+_STACKED_JOINTS = 3
+"""Robots with more joints get a grid of small plots instead of a stack."""
+
+
+def inspect_blueprint(trajectory: Trajectory, description: RobotDescription, sets: tuple[str, ...]) -> Any:
+    """Return the layout.
+
+    Args:
+        trajectory: The recording.
+        description: The robot.
+        sets: Names of the parameter sets that are shown beside it.
+    """
+    right = rrb.Tabs(
+        _motion(trajectory, description, sets),
+        _velocities(trajectory, description, sets),
+        _commands(trajectory, description),
+        _plot("/cadence", "Cadence [ms]"),
+        active_tab=0,
+    )
+    left = rrb.Vertical(
+        _robot(trajectory, description),
+        rrb.TextDocumentView(origin="/summary", name="Summary"),
+        row_shares=[3, 4],
+    )
+    bottom = rrb.Horizontal(
+        rrb.TextLogView(origin="/events", name="Events"),
+        rrb.StateTimelineView(origin="/status", name="Status"),
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(rrb.Horizontal(left, right, column_shares=[2, 3]), bottom, row_shares=[5, 1]),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=DEVICE_TIMELINE, play_state="paused", loop_mode="all"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _plot(origin: str, name: str, contents: list[str] | None = None) -> Any:
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents or ["$origin/**"],
+        name=name,
+        # Plots that move together are read together.
+        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+    )
+
+
+def _stack(name: str, plots: list[Any], joints: int) -> Any:
+    return rrb.Vertical(*plots, name=name) if joints <= _STACKED_JOINTS else rrb.Grid(*plots, name=name)
+
+
+def _motion(trajectory: Trajectory, description: RobotDescription, sets: tuple[str, ...]) -> Any:
+    plots = []
+    for joint, unit in zip(trajectory.joint_names, description.position_units, strict=True):
+        plots.append(_plot(f"/joints/{joint}/position", f"{joint} position [{unit}]"))
+        if sets:
+            plots.append(_plot(f"/joints/{joint}/error", f"{joint}: predicted minus real [{unit}]"))
+    return _stack("Motion", plots, len(trajectory.joint_names))
+
+
+def _velocities(trajectory: Trajectory, description: RobotDescription, sets: tuple[str, ...]) -> Any:
+    plots = []
+    for joint, unit in zip(trajectory.joint_names, description.position_units, strict=True):
+        plots.append(_plot(f"/joints/{joint}/velocity", f"{joint} velocity [{unit}/s]"))
+        if sets:
+            plots.append(_plot(f"/joints/{joint}/velocity_error", f"{joint}: predicted minus real [{unit}/s]"))
+    return _stack("Velocity", plots, len(trajectory.joint_names))
+
+
+def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
+    plots = []
+    for joint in trajectory.actuated:
+        unit = description.position_units[description.joint_names.index(joint)]
+        shown = [f"/commands/{joint}/**", f"/joints/{joint}/position/real"]
+        plots.append(_plot("/", f"{joint}: target asked, target sent, position [{unit}]", shown))
+        plots.append(_plot(f"/joints/{joint}/effort", f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]"))
+    return _stack("Commands", plots, len(trajectory.actuated))
+
+
+def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
+    """Return the 3D view, looking along +y from far enough to see what sliding joints cover."""
+    slides = [
+        high for (_, high), unit in zip(description.limits.trip_position, description.position_units, strict=True)
+        if unit == "m" and np.isfinite(high)
+    ]
+    reach = max([0.4, *slides])
+    eye = rrb.EyeControls3D(
+        kind=rrb.components.Eye3DKind.Orbital,
+        position=(0.35 * reach, -2.6 * reach, 0.9 * reach),
+        look_target=(0.0, 0.0, 0.3 * reach),
+        eye_up=(0.0, 0.0, 1.0),
+    )
+    return rrb.Spatial3DView(
+        origin="/world",
+        name="Robot: real solid, predictions as ghosts",
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
+        background=rrb.components.BackgroundKind.GradientDark,
+    )
+

@@ -1,0 +1,23 @@
+"""The one set of colours, from Okabe and Ito (2008): told apart with any kind of colour vision, on dark and on white."""
+
+from __future__ import annotations
+
+Color = tuple[int, int, int]
+
+REAL: Color = (86, 180, 233)
+"""Blue: what the robot reported."""
+NOMINAL: Color = (230, 159, 0)
+"""Orange: what the user's model predicts."""
+CALIBRATED: Color = (0, 178, 130)
+"""Green: what the calibrated model predicts; a little lighter than the original for thin lines on black."""
+ASKED: Color = (150, 150, 150)
+SENT: Color = (240, 228, 66)
+ALARM: Color = (213, 94, 0)
+OTHERS: tuple[Color, ...] = ((204, 121, 167), (148, 103, 189), (230, 230, 230))
+"""For parameter sets of other names."""
+
+
+def color_of(name: str, others_before: int = 0) -> Color:
+    """Return the colour of a trace: ``"real"``, ``"nominal"``, ``"calibrated"`` or another parameter set."""
+    known = {"real": REAL, "nominal": NOMINAL, "calibrated": CALIBRATED}
+    return known.get(name, OTHERS[others_before % len(OTHERS)])

@@ -1,0 +1,88 @@
+"""What stands beside the traces in words: the recording, the errors of each parameter set, the parameters."""
+
+from __future__ import annotations
+
+from deal_hw.calibration import CalibrationResult
+from deal_hw.description import RobotDescription
+from deal_hw.sim.overlay import Overlay
+from deal_hw.types import Trajectory
+
+
+def summary_markdown(
+    trajectory: Trajectory,
+    description: RobotDescription,
+    overlay: Overlay | None,
+    result: CalibrationResult | None,
+    note: str = "",
+) -> str:
+    """Return the summary as markdown.
+
+    Args:
+        trajectory: The recording.
+        description: The robot.
+        overlay: Predictions, if there are any.
+        result: The calibration, if there is one.
+        note: One more sentence, such as why there is no overlay.
+    """
+    parts = [_recording(trajectory, description)]
+    if note:
+        parts.append(f"**{note}**")
+    if overlay is not None:
+        parts.append(_errors(overlay, description))
+    if result is not None:
+        parts += [_parameters(result), _verdict(result)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _recording(trajectory: Trajectory, description: RobotDescription) -> str:
+    purpose = trajectory.metadata.get("purpose", "recording")
+    return (
+        f"# {description.name}: {purpose}\n\n{trajectory.duration_s:.2f} s, {len(trajectory.device_s)} samples, "
+        f"{len(trajectory.sent_s)} commands, {len(trajectory.events)} events"
+    )
+
+
+def _errors(overlay: Overlay, description: RobotDescription) -> str:
+    lines = [
+        f"## Prediction over {overlay.window_s:.2f} s windows",
+        "",
+        "Open loop, restarted from the measured state. RMSE, and in brackets its share of the measured range.",
+        "",
+        "| set | " + " | ".join(overlay.joint_names) + " | latency |",
+        "|---" * (len(overlay.joint_names) + 2) + "|",
+    ]
+    for name, prediction in overlay.predictions.items():
+        rmse = (prediction.window_rmse**2).mean(axis=0) ** 0.5
+        cells = [
+            f"{1e3 * value:.3g} m{unit} ({100 * share:.2g} %)"
+            for value, unit, share in zip(rmse, description.position_units, prediction.position_nrmse, strict=True)
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + f" | {1e3 * prediction.latency_s:.1f} ms |")
+    return "\n".join(lines)
+
+
+def _parameters(result: CalibrationResult) -> str:
+    lines = [
+        f"## Parameters ({result.method})",
+        "",
+        "| parameter | nominal | estimate | 90 % interval | unit | |",
+        "|---|---|---|---|---|---|",
+    ]
+    for k, p in enumerate(result.space):
+        verdict = result.verdicts[k] if result.verdicts else ""
+        low, high = result.interval[k]
+        lines.append(
+            f"| {p.name} | {p.nominal:.4g} | {result.estimate[k]:.4g} | {low:.4g} to {high:.4g} | {p.unit} | "
+            f"{'' if verdict == 'identifiable' else verdict} |"
+        )
+    for name, value in result.space.known.items():
+        lines.append(f"| {name} | {value:.4g} | | measured | {result.space[name].unit} | |")
+    low_ms, high_ms = (1e3 * value for value in result.latency_interval_s)
+    lines.append(f"| latency | | {1e3 * result.latency_s:.1f} | {low_ms:.1f} to {high_ms:.1f} | ms | |")
+    return "\n".join(lines)
+
+
+def _verdict(result: CalibrationResult) -> str:
+    lines = [f"- alarm: {alarm}" for alarm in result.alarms]
+    lines += [f"- the data cannot see: {direction}" for direction in result.null_directions]
+    return "\n".join(lines)

@@ -1,0 +1,99 @@
+"""Draws hidden truths that can be balanced at all: an oracle that knows the truth must manage it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deal_hw.clock import VirtualClock
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.device import START_ANGLE_RAD, CartpoleDevice
+from deal_hw.drivers.cartpole.lqr import TARGET_LIMIT_M, LqrController, design_lqr
+from deal_hw.drivers.cartpole.profiles import profile as find_profile
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.truth import Truth, candidate_truth
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.errors import ConfigurationError, TransportTimeoutError
+from deal_hw.types import JointCommand
+
+BALANCE_S = 6.0
+FALLEN_RAD = 0.3
+MAX_DRAWS = 200
+
+
+def draw_truth(profile: str, seed: int, *, xi: float = 5.0) -> Truth:
+    """Return the hidden truth of a seed: the first draw that the oracle balances; ``refused`` counts those before.
+
+    Args:
+        profile: Name of the profile.
+        seed: Seed of the draw.
+        xi: Ratio of the range around the nominal parameters.
+
+    Raises:
+        UnknownNameError: There is no such profile.
+        ConfigurationError: ``xi`` is not above 1, or no draw can be balanced.
+    """
+    find_profile(profile)
+    if seed < 0:
+        raise ConfigurationError(f"a seed is 0 or more, got {seed}")
+    rng = np.random.default_rng([seed, 0x7207])
+    for refused in range(MAX_DRAWS):
+        truth = candidate_truth(profile, rng, seed=seed, xi=xi, refused=refused)
+        if oracle_balances(truth):
+            return truth
+    raise ConfigurationError(
+        f"none of {MAX_DRAWS} draws of seed {seed} with xi={xi:g} can be balanced in profile {profile!r}; use a smaller xi"
+    )
+
+
+def oracle_balances(truth: Truth) -> bool:
+    """Return whether the balancer that knows the truth holds the pole for 6 s from either side."""
+    profile = find_profile(truth.profile)
+    # It plans for the mean of the jitter: that is all that anybody could.
+    jitter = (profile.actuation_jitter_ticks + profile.sensing_jitter_ticks) / 2
+    latency_ticks = truth.actuation_ticks + truth.sensing_ticks + round(jitter)
+    controller = design_lqr(truth.parameters, latency_ticks, profile.sensor)
+    return all(balances(truth, controller, angle) for angle in (START_ANGLE_RAD, -START_ANGLE_RAD))
+
+
+def balances(truth: Truth, controller: LqrController, start_angle_rad: float, duration_s: float = BALANCE_S) -> bool:
+    """Return whether a controller holds |angle| < 0.3 rad and the cart within the target range, over the real wire."""
+    clock = VirtualClock()
+    device = CartpoleDevice(truth, start_angle_rad=start_angle_rad)
+    robot = CartpoleRobot(VirtualTransport(device, clock), clock)
+    robot.connect()
+    robot.home(timeout_s=2.0)
+    robot.arm(timeout_s=1.0)
+    controller.reset()
+    period_ns = round(1e9 / DESCRIPTION.control_rate_hz)
+    deadline_ns = clock.now_ns()
+    for _ in range(round(duration_s * DESCRIPTION.control_rate_hz)):
+        deadline_ns += period_ns
+        position = _newest_position(robot, clock, deadline_ns)
+        if position is not None:
+            robot.send_command(default_command(controller.act(position)))
+        cart, pole = device.true_position
+        if abs(pole) >= FALLEN_RAD or abs(cart) >= TARGET_LIMIT_M:
+            return False
+    return True
+
+
+def default_command(target_m: float) -> JointCommand:
+    """Return a position target with the description's gains and limits."""
+    return JointCommand(
+        position_target=np.array([target_m]),
+        velocity_target=np.zeros(1),
+        stiffness=np.array(DESCRIPTION.stiffness),
+        damping=np.array(DESCRIPTION.damping),
+        effort=np.zeros(1),
+        effort_limit=np.array(DESCRIPTION.effort_limit),
+        speed_limit=np.array(DESCRIPTION.speed_limit),
+    )
+
+
+def _newest_position(robot: CartpoleRobot, clock: VirtualClock, deadline_ns: int) -> np.ndarray | None:
+    position = None
+    while True:
+        try:
+            position = robot.read_state(max(0, deadline_ns - clock.now_ns()) / 1e9).position
+        except TransportTimeoutError:
+            return position

@@ -1,0 +1,94 @@
+"""The hidden truth of an emulated cart-pole. Only the emulator and benches import this; never a calibrator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.drivers.cartpole.description import k9_space, parameter_space
+from deal_hw.drivers.cartpole.profiles import profile as find_profile
+from deal_hw.errors import ConfigurationError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """What a calibrator has to find out.
+
+    Attributes:
+        profile: Name of the profile.
+        seed: Seed of the draw, of noise and of the start angles.
+        parameters: Every parameter by name, known ones included [SI units of ``parameter_space()``].
+        actuation_ticks: A command acts that many device ticks after it was received.
+        sensing_ticks: A frame reports the state of that many device ticks ago.
+        refused: Draws before this one that the oracle policy could not balance.
+    """
+
+    profile: str
+    seed: int
+    parameters: Mapping[str, float]
+    actuation_ticks: int = 0
+    sensing_ticks: int = 0
+    refused: int = 0
+
+    @property
+    def latency_s(self) -> float:
+        """Total latency, actuation plus sensing, without jitter [s]."""
+        return (self.actuation_ticks + self.sensing_ticks) * 1e-3
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "profile": self.profile,
+            "seed": self.seed,
+            "parameters": dict(self.parameters),
+            "actuation_ticks": self.actuation_ticks,
+            "sensing_ticks": self.sensing_ticks,
+            "latency_s": self.latency_s,
+            "refused": self.refused,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Truth:
+        """Return the truth that :meth:`to_json` wrote.
+
+        Raises:
+            ConfigurationError: A value is missing or means nothing.
+        """
+        try:
+            parameters = {p.name: float(values["parameters"][p.name]) for p in parameter_space().parameters}
+            return cls(
+                profile=find_profile(values["profile"]).name,
+                seed=int(values["seed"]),
+                parameters=parameters,
+                actuation_ticks=int(values["actuation_ticks"]),
+                sensing_ticks=int(values["sensing_ticks"]),
+                refused=int(values["refused"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise ConfigurationError(f"not the truth of a cart-pole: {error!r}; --reveal-to writes one") from error
+
+
+def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:
+    """Return a truth that equals the description, without latency unless given among the changes."""
+    parameters = {p.name: p.nominal for p in parameter_space().parameters}
+    return Truth(profile=profile, seed=seed, parameters=parameters, **changes)
+
+
+def candidate_truth(profile: str, rng: np.random.Generator, *, seed: int, xi: float, refused: int) -> Truth:
+    """Draw the free parameters log-uniformly in the 10-90 % part of [nominal / xi, nominal * xi], and a latency."""
+    space = k9_space().with_ratio(xi).with_known(k9_space().known)
+    values = space.unnormalize(rng.uniform(0.1, 0.9, len(space)))
+    low, high = find_profile(profile).latency_ticks
+    total = int(rng.integers(low, high + 1))
+    sensing = int(rng.integers(0, total + 1))
+    return Truth(
+        profile=profile,
+        seed=seed,
+        parameters={**space.known, **dict(zip(space.names, map(float, values), strict=True))},
+        actuation_ticks=total - sensing,
+        sensing_ticks=sensing,
+        refused=refused,
+    )

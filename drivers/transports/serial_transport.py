@@ -1,0 +1,164 @@
+"""Bytes over a serial port (USB, UART or a pty)."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import stat
+import termios
+
+import serial
+from serial.tools import list_ports
+
+from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.errors import (
+    ConfigurationError,
+    PortBusyError,
+    PortNotFoundError,
+    TransportError,
+    TransportLostError,
+    TransportTimeoutError,
+)
+from deal_hw.transport import Message, Transport
+
+_READ_SIZE = 4096
+
+
+class SerialTransport(Transport):
+    """A serial port, opened exclusively; the channel of its messages is "".
+
+    pyserial opens and sets up the port. Reading and writing go straight to the file descriptor: that is faster, and a
+    child process can go on with a descriptor that it inherited (:meth:`from_fd`). The lock belongs to the open file,
+    so it holds until the last process closes it.
+
+    Args:
+        port: Path of the port, such as ``/dev/ttyACM0``.
+        baud_rate: Bits per second.
+        clock: Gives the stamps.
+    """
+
+    def __init__(self, port: str, baud_rate: int = 1_000_000, clock: Clock | None = None) -> None:
+        self.port = port
+        self._baud_rate = baud_rate
+        self._clock = clock or MonotonicClock()
+        self._adopted: int | None = None
+        self._serial: serial.Serial | None = None
+        self._fd = -1
+        self._poll = select.poll()
+
+    @classmethod
+    def from_fd(cls, fd: int, clock: Clock | None = None) -> SerialTransport:
+        """Return a transport over a port that a parent process opened; it closes ``fd`` when closed."""
+        transport = cls(f"inherited descriptor {fd}", clock=clock)
+        transport._adopted = fd
+        return transport
+
+    def open(self) -> None:
+        """Open the port and forget what it had received before."""
+        if self._fd >= 0:
+            return
+        self._fd = self._open_port() if self._adopted is None else self._adopt(self._adopted)
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+
+    def close(self) -> None:
+        """Close the port."""
+        fd, self._fd = self._fd, -1
+        if self._serial is not None:
+            with contextlib.suppress(OSError):
+                self._serial.close()
+            self._serial = None
+        elif fd >= 0:
+            with contextlib.suppress(OSError):
+                os.close(fd)
+
+    def send(self, message: Message) -> None:
+        """Write at once; what the port does not take is an error, never a wait."""
+        fd = self.fileno()
+        try:
+            written = os.write(fd, message.payload)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            raise self._lost(error) from error
+        if written < len(message.payload):
+            raise TransportTimeoutError(
+                f"{self.port}: took {written} of {len(message.payload)} bytes; the device does not drain its input"
+            )
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return all bytes at hand, waiting up to ``timeout_s`` for the first."""
+        fd = self.fileno()
+        deadline_ms = max(0.0, timeout_s * 1e3)
+        if not self._poll.poll(deadline_ms):
+            raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s")
+        try:
+            data = os.read(fd, _READ_SIZE)
+        except BlockingIOError as error:
+            raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s") from error
+        except OSError as error:
+            raise self._lost(error) from error
+        if not data:
+            raise self._lost(None)
+        return Message("", data, self._clock.now_ns())
+
+    def fileno(self) -> int:
+        """Return the descriptor of the open port, for ``select`` and for child processes."""
+        if self._fd < 0:
+            raise TransportLostError(f"{self.port}: the port is not open")
+        return self._fd
+
+    def _open_port(self) -> int:
+        try:
+            port = serial.Serial(self.port, self._baud_rate, timeout=0, write_timeout=0, exclusive=True)
+        except (serial.SerialException, OSError) as error:
+            raise self._open_error(error) from error
+        except ValueError as error:
+            raise ConfigurationError(f"{self.port}: {error}") from error
+        # FTDI adapters hold bytes back for up to 16 ms without this; ptys and many drivers do not know it.
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            port.set_low_latency_mode(True)
+        self._serial = port
+        _read_nothing_means_gone(port.fileno())
+        return int(port.fileno())
+
+    def _adopt(self, fd: int) -> int:
+        try:
+            if not stat.S_ISCHR(os.fstat(fd).st_mode):
+                raise ConfigurationError(f"descriptor {fd} is not a serial port")
+            os.set_blocking(fd, False)
+            termios.tcflush(fd, termios.TCIFLUSH)
+            _read_nothing_means_gone(fd)
+        except (OSError, termios.error) as error:
+            raise TransportLostError(f"descriptor {fd} cannot be used as a serial port: {error}") from error
+        return fd
+
+    def _open_error(self, error: Exception) -> TransportError:
+        code = getattr(error, "errno", None)
+        text = str(error)
+        if code in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in text:
+            return PortBusyError(
+                f"{self.port} is held by another process; close the other collector or monitor (see `fuser {self.port}`)"
+            )
+        if code == errno.EACCES:
+            return PortNotFoundError(
+                f"{self.port} may not be opened by this user; add yourself to the group that owns it (often `dialout`)"
+            )
+        if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
+            known = ", ".join(sorted(entry.device for entry in list_ports.comports())) or "none"
+            return PortNotFoundError(f"there is no serial port {self.port!r}; ports at hand: {known}")
+        return PortNotFoundError(f"{self.port} cannot be opened as a serial port: {text}")
+
+    def _lost(self, error: OSError | None) -> TransportLostError:
+        reason = f" ({error.strerror})" if error is not None else ""
+        return TransportLostError(f"{self.port}: the device vanished{reason}; check the cable and the power")
+
+
+def _read_nothing_means_gone(fd: int) -> None:
+    # pyserial sets VMIN to 0, where an empty read means both "nothing yet" and "hung up".
+    settings = termios.tcgetattr(fd)
+    settings[6][termios.VMIN] = 1
+    settings[6][termios.VTIME] = 0
+    termios.tcsetattr(fd, termios.TCSANOW, settings)

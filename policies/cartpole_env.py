@@ -1,0 +1,155 @@
+"""The balancing task of the cart-pole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.servo_loop import BoolArray
+from deal_hw.policies.vector_env import ServoVectorEnv
+from deal_hw.policy import ObservationTerm, PolicySpec
+from deal_hw.types import FloatArray
+
+CART, POLE = 0, 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BalanceTask:
+    """Settings of the task; the defaults are what the shipped policy was trained with.
+
+    Attributes:
+        ticks: Control periods in an episode.
+        start_angle_rad: Largest pole angle at the start.
+        start_position_m: Largest cart position at the start.
+        end_angle_rad: A larger pole angle ends the episode.
+        end_position_m: A larger cart position ends the episode.
+        action_scale_m: Cart target at action 1.
+        angle_weight: Cost of the pole angle [1/rad].
+        speed_weight: Cost of the cart speed [s/m].
+        position_weight: Cost of the squared cart position [1/m²].
+        action_weight: Cost of the change of the action from tick to tick.
+        host_delay_s: Lowest and highest delay that the host adds to the robot's own latency: the newest of 200 state
+            samples a second is 0 to 5 ms old when the policy looks, and wire and computation take up to 2 ms.
+    """
+
+    ticks: int = 250
+    start_angle_rad: float = 0.05
+    start_position_m: float = 0.03
+    end_angle_rad: float = 0.5
+    end_position_m: float = 0.35
+    action_scale_m: float = 0.25
+    angle_weight: float = 5.0
+    speed_weight: float = 0.1
+    position_weight: float = 4.0
+    action_weight: float = 0.0
+    host_delay_s: tuple[float, float] = (0.0, 0.007)
+
+    def __post_init__(self) -> None:
+        if self.ticks < 1:
+            raise ConfigurationError(f"ticks must be at least 1, got {self.ticks}")
+        for name in ("end_angle_rad", "end_position_m", "action_scale_m"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
+        low, high = self.host_delay_s
+        if not 0 <= low <= high:
+            raise ConfigurationError(f"host_delay_s must be (low, high) with 0 <= low <= high, got {self.host_delay_s}")
+
+
+def balance_spec(
+    description: RobotDescription,
+    task: BalanceTask,
+    trained_under: str = "",
+    training: Mapping[str, Any] | None = None,
+) -> PolicySpec:
+    """Return the layout of observation and action.
+
+    Three periods of state and three former actions: enough to know the set-point's way through a latency of up to two
+    periods, and to tell a heavy cart from a light one by how it answered.
+    """
+    cart, pole = description.joint_names[CART], description.joint_names[POLE]
+    terms: list[ObservationTerm] = []
+    for delay in (0, 1, 2):
+        terms += [
+            ObservationTerm("position", cart, 5.0, delay),
+            ObservationTerm("sin_position", pole, 10.0, delay),
+            ObservationTerm("velocity", cart, 2.0, delay),
+            ObservationTerm("velocity", pole, 0.5, delay),
+        ]
+    terms += [ObservationTerm("action", cart, 1.0, delay) for delay in (1, 2, 3)]
+    return PolicySpec(
+        robot=description.name,
+        joint_names=description.joint_names,
+        actuated=description.actuated,
+        observation=tuple(terms),
+        action_scale=(task.action_scale_m,),
+        default_position=description.default_position,
+        stiffness=description.stiffness,
+        damping=description.damping,
+        effort_limit=description.effort_limit,
+        speed_limit=description.speed_limit,
+        control_rate_hz=description.control_rate_hz,
+        trained_under=trained_under,
+        training=dict(training or {}),
+    )
+
+
+class CartPoleEnv(ServoVectorEnv):
+    """Keep the pole upright with a small angle and a slow cart, near the middle of the rail.
+
+    The reward of a tick, from the true state after it, is::
+
+        1 - angle_weight |angle| - speed_weight |cart speed| - position_weight cart² - action_weight (a - a_before)²
+
+    and 0 in the tick in which the pole has fallen or the cart has left its range, which ends the episode. The first
+    term makes staying up worth more than any way of ending; the second is the paper's Table 2: among policies that
+    stay up, the return falls with the mean |angle|.
+
+    Args:
+        description: The robot.
+        distribution: What each member's parameters and latency are drawn from.
+        count: Members N.
+        task: The settings.
+        sensor: The sensor model; the description's by default.
+        threads: Threads of the physics; None for all CPUs.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        distribution: ParameterDistribution,
+        count: int,
+        *,
+        task: BalanceTask | None = None,
+        sensor: SensorModel | None = None,
+        threads: int | None = 1,
+    ) -> None:
+        self.task = task or BalanceTask()
+        super().__init__(
+            description, distribution, balance_spec(description, self.task, distribution.digest()), count,
+            ticks=self.task.ticks, host_delay_s=self.task.host_delay_s, sensor=sensor, threads=threads,
+        )  # fmt: skip
+
+    def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+        """Draw starts near upright, at rest."""
+        reach = np.array([self.task.start_position_m, self.task.start_angle_rad])
+        return rng.uniform(-1.0, 1.0, (count, 2)) * reach, np.zeros((count, 2))
+
+    def reward(self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the reward of one tick; the class says how it is made."""
+        task = self.task
+        cost = task.angle_weight * np.abs(position[:, POLE]) + task.speed_weight * np.abs(velocity[:, CART])
+        cost += task.position_weight * np.square(position[:, CART])
+        cost += task.action_weight * np.square(action - before).sum(axis=1)
+        return np.asarray(1.0 - cost)
+
+    def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
+        """Return who fell or left the range."""
+        task = self.task
+        fell = np.abs(position[:, POLE]) > task.end_angle_rad
+        return np.asarray(fell | (np.abs(position[:, CART]) > task.end_position_m))

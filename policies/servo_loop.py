@@ -1,0 +1,203 @@
+"""N simulated robots as a host sees them at the control rate: delayed targets, limited set-point, noisy reports.
+
+The environments of training and the evaluation stand on this one class. It does, batched, what the emulated device
+does frame by frame; the calibrator's :class:`~deal_hw.sim.batch.ServoBatch` is the physics below.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.model import load_model
+from deal_hw.types import FloatArray, IntArray
+
+BoolArray = npt.NDArray[np.bool_]
+
+EXACT_SENSOR = SensorModel(noise=(), resolution=(), velocity_window_s=0.0)
+"""Reports the true state."""
+
+
+def delayed_setpoints(
+    start: FloatArray, older: FloatArray, newer: FloatArray, switch: IntArray, rate: FloatArray, steps: int
+) -> FloatArray:
+    """Return the set-point at each step of one control period, in closed form.
+
+    A latency is a whole number of steps, so within a period the target changes at most once; towards a constant
+    target the slewed set-point is a clipped ramp. Equal to :func:`deal_hw.sim.servo.slew` on the same targets.
+
+    Args:
+        start: Set-point before the first step, (N, A).
+        older: Target in force before the change, (N, A).
+        newer: Target in force from it on, (N, A).
+        switch: Steps for which the older one is in force, (N,).
+        rate: Largest change a step, (N, A).
+        steps: Steps S in a control period.
+
+    Returns:
+        (N, S, A).
+    """
+    count = np.arange(1, steps + 1)
+    before = np.minimum(count[None, :], switch[:, None])[..., None] * rate[:, None]
+    after = np.maximum(count[None, :] - switch[:, None], 0)[..., None] * rate[:, None]
+    reach = switch[:, None] * rate
+    middle = start + np.clip(older - start, -reach, reach)
+    first = start[:, None] + np.clip((older - start)[:, None], -before, before)
+    second = middle[:, None] + np.clip((newer - middle)[:, None], -after, after)
+    return np.where((count[None, :] <= switch[:, None])[..., None], first, second)
+
+
+class ServoLoop:
+    """N robots, each with its own parameters, latency and noise.
+
+    Args:
+        description: The robot.
+        space: The parameters that members differ in.
+        count: Members N.
+        longest_latency_s: The longest total latency that :meth:`restart` will be given [s].
+        sensor: What stands between the true and the reported state; the description's by default.
+        threads: Threads of the physics; None for all CPUs.
+
+    Attributes:
+        reported_position: What the host is told, (N, J).
+        reported_velocity: (N, J).
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        space: ParameterSpace,
+        count: int,
+        *,
+        longest_latency_s: float,
+        sensor: SensorModel | None = None,
+        threads: int | None = 1,
+    ) -> None:
+        self.description = description
+        self.count = count
+        self.steps = description.steps_per_control
+        self._step_s = 1.0 / description.device_rate_hz
+        self.batch = ServoBatch(load_model(description, self._step_s), space, count, threads)
+        self._theta = np.repeat(space.nominal[None], count, axis=0)
+        self._sensor = description.sensor if sensor is None else sensor
+        self._window = _window_periods(self._sensor, description)
+        J, A = len(description.joint_names), len(description.actuated)
+        depth = int(np.ceil(longest_latency_s * description.device_rate_hz / self.steps)) + 2
+        self._targets = np.zeros((depth, count, A))
+        self._latency = np.zeros(count, dtype=np.int64)
+        self._setpoint = np.zeros((count, A))
+        self._reports = np.zeros((self._window + 1, count, J))
+        self.reported_position = np.zeros((count, J))
+        self.reported_velocity = np.zeros((count, J))
+
+    @property
+    def position(self) -> FloatArray:
+        """True joint positions, (N, J)."""
+        return self.batch.position
+
+    @property
+    def velocity(self) -> FloatArray:
+        """True joint velocities, (N, J)."""
+        return self.batch.velocity
+
+    def restart(
+        self,
+        where: BoolArray,
+        theta: FloatArray,
+        latency_s: FloatArray,
+        position: FloatArray,
+        velocity: FloatArray,
+        rng: np.random.Generator,
+    ) -> None:
+        """Start M of the members anew: armed, set-point and targets at their own position.
+
+        Args:
+            where: The M members, a mask (N,).
+            theta: Their parameters, (M, K).
+            latency_s: Their total latencies, (M,) [s]; rounded to device periods.
+            position: Their joint positions, (M, J).
+            velocity: Their joint velocities, (M, J).
+            rng: For the noise of the first report.
+
+        Raises:
+            ConfigurationError: A latency is negative or longer than the loop was made for.
+        """
+        ticks = np.rint(latency_s / self._step_s).astype(np.int64)
+        longest = (len(self._targets) - 1) * self.steps
+        if ticks.size and (ticks.min() < 0 or ticks.max() >= longest):
+            raise ConfigurationError(
+                f"latencies must lie in [0, {longest * self._step_s:g}) s, got {latency_s.min():g}..{latency_s.max():g}"
+            )
+        members = np.flatnonzero(where)
+        self._theta[members] = theta
+        self.batch.set_parameters(self._theta, members)
+        self.batch.set_state(position, velocity, members)
+        self._latency[members] = ticks
+        start = position[:, list(self.description.actuated_index)]
+        self._setpoint[members] = start
+        self._targets[:, members] = start
+        period_s = 1.0 / self.description.control_rate_hz
+        for age in range(self._window + 1):
+            # The host watched the robot before the episode, too: reports of the past differ by noise and motion.
+            self._reports[age, members] = self._report(position - age * period_s * velocity, rng)
+        self._publish(members, velocity)
+
+    def step(self, target: FloatArray, rng: np.random.Generator) -> BoolArray:
+        """Send targets and advance by one control period.
+
+        Args:
+            target: Position targets, (N, A) [m or rad].
+            rng: For the noise.
+
+        Returns:
+            Members whose physics diverged, (N,); their reports are the default pose until they are restarted.
+        """
+        self._targets = np.roll(self._targets, 1, axis=0)
+        self._targets[0] = target
+        periods, switch = np.divmod(self._latency, self.steps)
+        members = np.arange(self.count)
+        rate = self.batch.servo_factor("servo_speed_limit") * np.array(self.description.speed_limit) * self._step_s
+        setpoints = delayed_setpoints(
+            self._setpoint, self._targets[periods + 1, members], self._targets[periods, members], switch, rate,
+            self.steps,
+        )  # fmt: skip
+        self._setpoint = setpoints[:, -1]
+        position, velocity = (values[:, -1] for values in self.batch.advance(setpoints))
+        diverged = ~np.isfinite(position).all(axis=1) | ~np.isfinite(velocity).all(axis=1)
+        if diverged.any():
+            position = np.where(diverged[:, None], self.description.default_position, position)
+            velocity = np.where(diverged[:, None], 0.0, velocity)
+        self._reports = np.roll(self._reports, 1, axis=0)
+        self._reports[0] = self._report(position, rng)
+        self._publish(members, velocity)
+        return np.asarray(diverged)
+
+    def _publish(self, members: npt.NDArray[np.intp], velocity: FloatArray) -> None:
+        now, then = self._reports[0, members], self._reports[-1, members]
+        self.reported_position[members] = now
+        if self._window:
+            velocity = (now - then) * (self.description.control_rate_hz / self._window)
+        self.reported_velocity[members] = velocity
+
+    def _report(self, position: FloatArray, rng: np.random.Generator) -> FloatArray:
+        if not self._sensor.noise:
+            return position
+        noisy = position + rng.standard_normal(position.shape) * self._sensor.noise
+        resolution = np.array(self._sensor.resolution)
+        step = np.where(resolution > 0, resolution, 1.0)
+        return np.where(resolution > 0, np.rint(noisy / step) * step, noisy)
+
+
+def _window_periods(sensor: SensorModel, description: RobotDescription) -> int:
+    """Return the velocity window in control periods; 0 for true velocities."""
+    periods = sensor.velocity_window_s * description.control_rate_hz
+    if abs(periods - round(periods)) > 1e-9:
+        raise ConfigurationError(
+            f"velocity_window_s = {sensor.velocity_window_s:g} s must be a whole number of control periods of "
+            f"{1 / description.control_rate_hz:g} s"
+        )
+    return round(periods)

@@ -1,0 +1,133 @@
+"""A vectorised Gymnasium environment of servo-driven robots: every member has its own physics, drawn anew each episode."""
+
+from __future__ import annotations
+
+import abc
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.servo_loop import BoolArray, ServoLoop
+from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
+from deal_hw.types import FloatArray
+
+
+class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
+    """N robots that follow a policy's position targets; a task says where they start, what is rewarded and what ends.
+
+    Members that end are started anew in the same step (Gymnasium's SAME_STEP): what they saw last is in
+    ``info["final_obs"]``. Observations come from the class that the robot uses, so the two cannot drift apart.
+
+    Args:
+        description: The robot.
+        distribution: What each member's parameters and latency are drawn from at each start of an episode.
+        spec: The layout of observation and action.
+        count: Members N.
+        ticks: Control periods after which an episode is cut off.
+        host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s]: the age of the
+            newest state sample when the policy looks, and the way over the wire.
+        sensor: The sensor model; the description's by default.
+        threads: Threads of the physics; None for all CPUs.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        distribution: ParameterDistribution,
+        spec: PolicySpec,
+        count: int,
+        *,
+        ticks: int,
+        host_delay_s: tuple[float, float],
+        sensor: SensorModel | None = None,
+        threads: int | None = 1,
+    ) -> None:
+        self.description, self.distribution, self.spec = description, distribution, spec
+        self.num_envs = count
+        self.ticks = ticks
+        self.host_delay_s = host_delay_s
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        O, A = len(spec.observation), len(spec.actuated)  # noqa: E741
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (O,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, count)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, count)
+        longest = distribution.latency_s[1] + host_delay_s[1]
+        self.loop = ServoLoop(
+            description, distribution.space, count, longest_latency_s=longest, sensor=sensor, threads=threads
+        )
+        self._builder = ObservationBuilder(spec, (count,))
+        self._elapsed = np.zeros(count, dtype=np.int64)
+        self._scale = np.array(spec.action_scale)
+        self._default = np.array(spec.default_position)[list(description.actuated_index)]
+
+    @abc.abstractmethod
+    def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+        """Draw joint positions and velocities at the start of M episodes, (M, J) each."""
+
+    @abc.abstractmethod
+    def reward(self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the reward of one tick, (N,), from the true state after it.
+
+        Args:
+            position: (N, J).
+            velocity: (N, J).
+            action: The action of this tick, (N, A).
+            before: The action of the tick before, (N, A); zero at the start.
+        """
+
+    @abc.abstractmethod
+    def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
+        """Return which members failed, (N,)."""
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start all members anew; a whole-number seed fixes everything that follows."""
+        super().reset(seed=seed if isinstance(seed, int) else None, options=options)
+        self._last_action = np.zeros((self.num_envs, len(self.spec.actuated)))
+        self._restart(np.ones(self.num_envs, dtype=bool))
+        return self._observe(), {}
+
+    def step(self, actions: FloatArray) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Apply actions, (N, A), for one control period.
+
+        Returns:
+            Observations (N, O), rewards (N,), terminated (N,), truncated (N,), and infos: ``final_obs`` (N, O) with
+            the last observations of the members in ``_final_obs`` (N,).
+        """
+        action = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+        self._builder.record_action(action)
+        diverged = self.loop.step(self._default + self._scale * action, self.np_random)
+        position, velocity = self.loop.position, self.loop.velocity
+        terminated = self.ended(position, velocity) | diverged
+        reward = np.where(terminated, 0.0, self.reward(position, velocity, action, self._last_action))
+        self._last_action = action
+        self._elapsed += 1
+        truncated = (self._elapsed >= self.ticks) & ~terminated
+        over = terminated | truncated
+        if not over.any():
+            return self._observe(), reward, terminated, truncated, {}
+        # The members that go on must see this tick once only: what the others saw last is built on a copy.
+        final = copy.deepcopy(self._builder).build(self.loop.reported_position, self.loop.reported_velocity)
+        self._restart(over)
+        return self._observe(), reward, terminated, truncated, {"final_obs": final, "_final_obs": over}
+
+    def _restart(self, where: BoolArray) -> None:
+        rng, count = self.np_random, int(where.sum())
+        latency = self.distribution.sample_latency(rng, count) + rng.uniform(*self.host_delay_s, count)
+        theta = self.distribution.sample(rng, count)
+        position, velocity = self.start_state(rng, count)
+        self.loop.restart(where, theta, latency, position, velocity, rng)
+        self._builder.reset(where)
+        self._elapsed[where] = 0
+        self._last_action[where] = 0.0
+
+    def _observe(self) -> Observation:
+        return self._builder.build(self.loop.reported_position, self.loop.reported_velocity)

@@ -1,0 +1,127 @@
+"""Recordings of known content for the data tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+
+from deal_hw.clock import VirtualClock
+from deal_hw.data.record import CycleRecord
+from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.transport import Message
+from deal_hw.types import Event, JointCommand, RobotState, Status, Trajectory
+
+MakeCycle = Callable[[int], CycleRecord]
+WriteEpisode = Callable[..., Path]
+
+HOST_START_NS = 7_000_000_000_000
+DEVICE_START_NS = 3_000_000_000
+CYCLE_NS = 20_000_000
+
+
+def _cycle(number: int) -> CycleRecord:
+    """Cycle n: four samples 5 ms apart, values linear in their number; asked 0.1 + n mm, sent 0.09 + n mm."""
+    start_ns = HOST_START_NS + number * CYCLE_NS
+
+    def state(sample: int) -> RobotState:
+        return RobotState(
+            position=np.array([1e-3 * sample, 0.01 * (sample % 50)]),
+            velocity=np.array([0.2, -0.2 if sample % 100 < 50 else 0.2]),
+            effort=np.array([0.5 * sample, 0.0]),
+            receive_ns=HOST_START_NS + sample * 5_000_000 + 400_000,
+            device_ns=DEVICE_START_NS + sample * 5_000_000,
+            sequence=sample,
+            command_sequence=number - 1,
+            command_age_ns=1_000_000 + (sample % 4) * 5_000_000 if number else -1,
+            status=Status.ARMED | Status.HOMED,
+        )
+
+    def command(target: float) -> JointCommand:
+        return JointCommand(*(np.array([value]) for value in (target, 0.0, 80.0, 8.0, 0.0, 4.0, 1.0)))
+
+    states = tuple(state(4 * number + i) for i in range(4))
+    return CycleRecord(
+        cycle=number,
+        deadline_ns=start_ns,
+        start_ns=start_ns + 50_000,
+        states=states,
+        action=np.array([0.25 * number]),
+        asked=command(0.1 + 1e-3 * number),
+        sent=command(0.09 + 1e-3 * number),
+        sent_sequence=number,
+        sent_ns=start_ns + 19_000_000,
+        state_age_ns=123_000,
+        safety_state="ACTIVE",
+        flags=2,
+        events=(Event(start_ns, "clipped", "the target was too far", {"joint": "cart"}),)
+        if number == 3
+        else (),
+        wire=(Message("rx", bytes([number % 256]) * 40, start_ns), Message("tx", b"\x01\x02", start_ns + 1)),
+        lost=0,
+    )
+
+
+@pytest.fixture
+def make_cycle() -> MakeCycle:
+    """Return a function that makes the n-th cycle of a recording of known content."""
+    return _cycle
+
+
+@pytest.fixture
+def write_episode(tmp_path: Path) -> WriteEpisode:
+    """Return a function that records cycles in virtual time; ``torn`` leaves it as a kill would."""
+
+    def write(name: str = "episode.mcap", cycles: int = 150, torn: bool = False) -> Path:
+        clock = VirtualClock(HOST_START_NS)
+        recorder = EpisodeRecorder(tmp_path / name, DESCRIPTION.to_json(), {"purpose": "test"}, clock)
+        recorder.open()
+        for number in range(cycles):
+            clock.sleep_until_ns(HOST_START_NS + (number + 1) * CYCLE_NS)
+            recorder.write(_cycle(number))
+        whole = (tmp_path / name).read_bytes()
+        recorder.close()
+        if torn:
+            (tmp_path / name).write_bytes(whole)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.fixture
+def make_trajectory() -> Callable[..., Trajectory]:
+    """Return a function that makes a sound 4 s trajectory at 200 Hz; keywords replace fields."""
+
+    def make(**changes: object) -> Trajectory:
+        samples, commands = 800, 200
+        time_s = np.arange(samples) * 0.005
+        sent_s = np.arange(commands) * 0.02
+        in_force = np.floor((time_s - 0.001) / 0.02).astype(np.int64)
+        target = 0.1 * np.sign(np.sin(2 * np.pi * sent_s))[:, None]
+        fields: dict[str, object] = {
+            "joint_names": ("cart", "pole"),
+            "actuated": ("cart",),
+            "receive_s": time_s + 0.0004,
+            "device_s": time_s,
+            "position": np.stack([0.1 * np.sin(6 * time_s), np.cos(5 * time_s)], axis=1),
+            "velocity": np.stack([0.6 * np.cos(6 * time_s), -5 * np.sin(5 * time_s)], axis=1),
+            "effort": np.zeros((samples, 2)),
+            "status": np.full(samples, int(Status.ARMED)),
+            "command_sequence": in_force,
+            "command_age_s": np.where(in_force >= 0, time_s - 0.02 * in_force - 0.001, np.nan),
+            "sent_s": sent_s,
+            "sent_sequence": np.arange(commands),
+            "asked_position": target,
+            "position_target": target,
+            "stiffness": np.full((commands, 1), 80.0),
+            "damping": np.full((commands, 1), 8.0),
+            "effort_limit": np.full((commands, 1), 4.0),
+            "speed_limit": np.full((commands, 1), 1.0),
+            "metadata": {"description": DESCRIPTION.to_json()},
+        }
+        return Trajectory(**{**fields, **changes})  # type: ignore[arg-type]
+
+    return make

@@ -1,0 +1,212 @@
+"""Writing an episode and reading it back, value for value."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from deal_hw.clock import VirtualClock
+from deal_hw.data.mcap_scan import Found, messages, scan
+from deal_hw.data.reader import read_episode, read_trajectory, read_wire
+from deal_hw.data.record import CycleRecord
+from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.repair import verify
+from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
+
+CYCLES = 150
+MakeCycle = Callable[[int], CycleRecord]
+WriteEpisode = Callable[..., Path]
+
+
+def test_samples_come_back(write_episode: WriteEpisode) -> None:
+    """600 samples: times, kinematics, status and the command in force are those that were recorded."""
+    trajectory = read_trajectory(write_episode(cycles=CYCLES))
+    sample = np.arange(4 * CYCLES)
+    assert trajectory.joint_names == ("cart", "pole")
+    assert trajectory.actuated == ("cart",)
+    np.testing.assert_allclose(trajectory.receive_s, 0.005 * sample, atol=1e-12)
+    np.testing.assert_allclose(trajectory.device_s, 0.005 * sample, atol=1e-12)
+    np.testing.assert_array_equal(
+        trajectory.position, np.stack([1e-3 * sample, 0.01 * (sample % 50)], axis=1)
+    )
+    np.testing.assert_array_equal(trajectory.effort[:, 0], 0.5 * sample)
+    np.testing.assert_array_equal(trajectory.velocity[:, 1], np.where(sample % 100 < 50, -0.2, 0.2))
+    np.testing.assert_array_equal(trajectory.status, np.full(4 * CYCLES, 3))
+    np.testing.assert_array_equal(trajectory.command_sequence, sample // 4 - 1)
+    age = np.where(sample < 4, np.nan, 0.001 + 0.005 * (sample % 4))
+    np.testing.assert_allclose(trajectory.command_age_s, age, atol=1e-12)
+    assert trajectory.position.flags.c_contiguous
+
+
+def test_commands_asked_and_sent_come_back(write_episode: WriteEpisode) -> None:
+    """Asked 0.1 + n mm, sent 0.09 + n mm, 19 ms into each cycle; the first sample came at 0.4 ms."""
+    trajectory = read_trajectory(write_episode(cycles=CYCLES))
+    number = np.arange(CYCLES)
+    np.testing.assert_array_equal(trajectory.sent_sequence, number)
+    np.testing.assert_allclose(trajectory.sent_s, 0.02 * number + 0.019 - 0.0004, atol=1e-12)
+    np.testing.assert_array_equal(trajectory.asked_position[:, 0], 0.1 + 1e-3 * number)
+    np.testing.assert_array_equal(trajectory.position_target[:, 0], 0.09 + 1e-3 * number)
+    for name, value in (("stiffness", 80), ("damping", 8), ("effort_limit", 4), ("speed_limit", 1)):
+        np.testing.assert_array_equal(getattr(trajectory, name), np.full((CYCLES, 1), value), err_msg=name)
+
+
+def test_cycles_events_wire_and_metadata_come_back(write_episode: WriteEpisode) -> None:
+    """The rest of an episode is what was recorded, on the time base of the samples."""
+    path = write_episode(cycles=CYCLES)
+    episode = read_episode(path)
+    cycles = episode.cycles
+    number = np.arange(CYCLES)
+    np.testing.assert_array_equal(cycles.cycle, number)
+    np.testing.assert_allclose(cycles.deadline_s, 0.02 * number - 0.0004, atol=1e-12)
+    np.testing.assert_allclose(cycles.start_s - cycles.deadline_s, 50e-6, atol=1e-12)
+    np.testing.assert_allclose(cycles.state_age_s, 123e-6, atol=1e-12)
+    np.testing.assert_array_equal(cycles.action[:, 0], 0.25 * number)
+    np.testing.assert_array_equal(cycles.flags, np.full(CYCLES, 2))
+    assert cycles.safety_state == ("ACTIVE",) * CYCLES
+    (event,) = episode.trajectory.events
+    assert (event.kind, event.message, event.data) == ("clipped", "the target was too far", {"joint": "cart"})
+    wire = list(read_wire(path))
+    assert [message.payload for message in wire if message.channel == "rx"] == [
+        bytes([n]) * 40 for n in number
+    ]
+    assert sum(message.channel == "tx" for message in wire) == CYCLES
+    assert episode.metadata == {"purpose": "test"}
+    assert episode.trajectory.metadata["lost_frames"] == 0
+    assert episode.trajectory.metadata["hand_over_losses"] == 0
+    assert episode.description == json.loads(json.dumps(DESCRIPTION.to_json()))
+    assert (episode.start_ns, episode.device_start_ns) == (7_000_000_400_000, 3_000_000_000)
+    assert episode.anchor_ns == 7_000_000_000_000
+
+
+def test_mcap_ros2_reads_the_whole_file(write_episode: WriteEpisode) -> None:
+    """An independent reader decodes every message by the schemas in the file."""
+    path = write_episode(cycles=CYCLES)
+    with open(path, "rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        decoded = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
+    # Per cycle: 4 states, asked, sent, cycle, rx, tx; once: the robot and one event.
+    assert len(decoded) == 9 * CYCLES + 2
+    states = [message for topic, message in decoded if topic == "/state"]
+    assert [state.sequence for state in states] == list(range(4 * CYCLES))
+    assert states[10].position == [0.01, 0.1]
+
+
+def test_missing_cycles_and_frames_are_counted(tmp_path: Path, make_cycle: MakeCycle) -> None:
+    """Cycles 5 to 7 never reached the recorder: 3 hand-over losses, and their 12 samples are lost."""
+    path = tmp_path / "holes.mcap"
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {}, VirtualClock()) as recorder:
+        for number in [*range(5), *range(8, 20)]:
+            recorder.write(make_cycle(number))
+    metadata = read_trajectory(path).metadata
+    assert metadata["hand_over_losses"] == 3
+    assert metadata["lost_frames"] == 12
+
+
+def test_dry_run_has_asked_but_no_sent(tmp_path: Path, make_cycle: MakeCycle) -> None:
+    """Where nothing was sent, the trajectory has no command and the cycles keep what was asked."""
+    path = tmp_path / "dry.mcap"
+    record = make_cycle(0)
+    dry = CycleRecord(0, 0, 0, states=record.states, asked=record.asked)
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {}, VirtualClock()) as recorder:
+        recorder.write(dry)
+    episode = read_episode(path)
+    assert episode.trajectory.position_target.shape == (0, 1)
+    np.testing.assert_array_equal(episode.cycles.asked_position, [[0.1]])
+
+
+def test_chunks_close_every_50_ms(write_episode: WriteEpisode) -> None:
+    """At 50 Hz no chunk holds more than four cycles (60 ms), even if the recorder is never idle."""
+    data = write_episode(cycles=CYCLES).read_bytes()
+    chunks = [list(messages(item)) for item in scan(data) if isinstance(item, Found) and item.contents]
+    assert len(chunks) >= CYCLES / 4
+    assert max(len(chunk) for chunk in chunks) <= 4 * 9 + 1
+
+
+def test_nothing_to_flush_means_no_deadline(tmp_path: Path, make_cycle: MakeCycle) -> None:
+    """A record waits at most 50 ms; without one there is nothing to wait for."""
+    clock = VirtualClock()
+    with EpisodeRecorder(tmp_path / "a.mcap", DESCRIPTION.to_json(), {}, clock) as recorder:
+        assert recorder.due_in_s() is None
+        recorder.write(make_cycle(0))
+        clock.advance_ns(30_000_000)
+        assert recorder.due_in_s() == pytest.approx(0.02)
+        clock.advance_ns(25_000_000)
+        recorder.flush_if_due()
+        assert recorder.due_in_s() is None
+
+
+def test_a_recording_is_never_overwritten(write_episode: WriteEpisode) -> None:
+    """A second recording into the same file is refused."""
+    path = write_episode()
+    with pytest.raises(DatasetError, match="exists"):
+        EpisodeRecorder(path, DESCRIPTION.to_json(), {}, VirtualClock()).open()
+
+
+@pytest.mark.parametrize("limit", [4_000, 9_000, 30_000])
+def test_full_disk_keeps_what_was_written(tmp_path: Path, make_cycle: MakeCycle, limit: int) -> None:
+    """Past the limit the recorder gives up with a clear message and leaves a sound file of whole cycles."""
+    path = tmp_path / "full.mcap"
+    clock = VirtualClock()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        with pytest.raises(
+            DatasetError, match=r"stopped after \d+ cycles: File too large.*deal-hw data info"
+        ):
+            recorder = EpisodeRecorder(path, DESCRIPTION.to_json(), {}, clock)
+            recorder.open()
+            for number in range(2000):
+                clock.advance_ns(20_000_000)
+                recorder.write(make_cycle(number))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.stat().st_size <= limit
+    report = verify(path)
+    assert report.sound
+    recorder.close()
+    if limit >= 9_000:
+        trajectory = read_trajectory(path)
+        np.testing.assert_array_equal(trajectory.effort[:, 0], 0.5 * np.arange(trajectory.effort.shape[0]))
+
+
+def test_unwritable_folder_is_said(tmp_path: Path) -> None:
+    """A path below a file cannot be created; the message names it."""
+    (tmp_path / "file").write_text("")
+    path = tmp_path / "file" / "a.mcap"
+    with pytest.raises(DatasetError, match=f"{path} cannot be created"):
+        EpisodeRecorder(path, DESCRIPTION.to_json(), {}, VirtualClock()).open()
+
+
+def test_unusable_files_are_told_apart(tmp_path: Path, write_episode: WriteEpisode) -> None:
+    """Absent, empty, foreign, torn and silent recordings each get their own error."""
+    with pytest.raises(DatasetError, match="No such file"):
+        read_trajectory(tmp_path / "absent.mcap")
+    (tmp_path / "empty.mcap").touch()
+    with pytest.raises(EmptyRecordingError, match="0 bytes"):
+        read_trajectory(tmp_path / "empty.mcap")
+    (tmp_path / "foreign.mcap").write_text("time,position\n0,0\n")
+    with pytest.raises(DatasetError, match="not an MCAP file"):
+        read_trajectory(tmp_path / "foreign.mcap")
+    torn = write_episode("torn.mcap", torn=True)
+    with pytest.raises(TornRecordingError, match=f"deal-hw data repair {torn}"):
+        read_trajectory(torn)
+    with pytest.raises(EmptyRecordingError, match="no state sample"):
+        read_trajectory(write_episode("silent.mcap", cycles=0))
+
+
+def test_recorder_leaves_no_descriptor_open(tmp_path: Path, make_cycle: MakeCycle) -> None:
+    """After close, and after a second close, the process has as many descriptors as before."""
+    before = len(os.listdir("/proc/self/fd"))
+    with EpisodeRecorder(tmp_path / "a.mcap", DESCRIPTION.to_json(), {}, VirtualClock()) as recorder:
+        recorder.write(make_cycle(0))
+    recorder.close()
+    assert len(os.listdir("/proc/self/fd")) == before

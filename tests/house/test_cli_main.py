@@ -1,0 +1,262 @@
+"""The command itself: its help, its table of verbs, its exit codes and what it loads."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import tyro
+
+from deal_hw.cli import main as cli
+from deal_hw.errors import MissingExtraError, PortNotFoundError, UnknownNameError
+
+ROOT = Path(__file__).resolve().parents[2]
+HEAVY = ("numpy", "torch", "mujoco", "rerun", "scipy", "serial", "tyro", "rich")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """Settings of the verb that the tests put into the table."""
+
+    count: int = 1
+    """How often."""
+
+
+@pytest.fixture
+def add_verb(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return a function that puts a verb named `probe` into the table, carried out by the given function."""
+
+    def add(function: Callable[[Settings], object], config: object = Settings, extra: str = "") -> None:
+        module = types.ModuleType("probe_module")
+        module.__dict__.update(Probe=config, probe=function)
+        monkeypatch.setitem(sys.modules, "probe_module", module)
+        verb = cli.Verb(
+            module="probe_module",
+            config="Probe",
+            function="probe",
+            help="probe",
+            example="probe",
+            extra=extra,
+        )
+        monkeypatch.setattr(cli, "VERBS", {**cli.VERBS, "probe": verb})
+
+    return add
+
+
+def test_help_teaches_the_jobs_first(capsys: pytest.CaptureFixture[str]) -> None:
+    """The help names every verb with a line that runs; the five jobs come first, in the order of the loop."""
+    assert cli.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for name, verb in cli.VERBS.items():
+        assert f"  {name} " in text
+        assert f"deal-hw {verb.example}\n" in text
+    places = [text.index(f"\n  {name} ") for name in cli.VERBS]
+    assert places == sorted(places)
+    assert list(cli.JOBS) == ["collect", "calibrate", "train", "deploy", "inspect"]
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_no_arguments_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    """A bare `deal-hw` says what it can do."""
+    assert cli.main([]) == 0
+    assert capsys.readouterr().out == cli.help_text() + "\n"
+
+
+def test_unknown_verb_lists_the_verbs_and_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    """A mistyped verb gives one line with what exists and what was probably meant."""
+    assert cli.main(["calibrat"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == (
+        "deal-hw: error: unknown verb 'calibrat'; known: collect, calibrate, train, deploy, inspect, demo, "
+        "emulate, data, replay, bench; did you mean 'calibrate'?\n"
+    )
+
+
+def test_unlike_verb_suggests_nothing() -> None:
+    """Where no verb is near, none is suggested."""
+    with pytest.raises(UnknownNameError, match=r"bench$"):
+        cli.find("xyzzy")
+
+
+@pytest.mark.parametrize(
+    ("result", "code"),
+    [(None, 0), (3, 3), (0, 0), (True, 0), ({"report": 1}, 0), (types.SimpleNamespace(exit_code=3), 3)],
+)
+def test_exit_code_is_the_verbs_or_zero(add_verb: Callable[..., None], result: object, code: int) -> None:
+    """A verb returns an exit code, or a report that may name one; a report that does not means success."""
+    add_verb(lambda settings: result)
+    assert cli.main(["probe"]) == code
+
+
+def test_settings_reach_the_verb(add_verb: Callable[..., None]) -> None:
+    """The options are parsed into the verb's dataclass."""
+    seen: list[Settings] = []
+    add_verb(seen.append)
+    assert cli.main(["probe", "--count", "7"]) == 0
+    assert seen == [Settings(count=7)]
+
+
+def test_union_of_settings_gives_sub_verbs(add_verb: Callable[..., None]) -> None:
+    """A union of dataclasses becomes sub-verbs named after them."""
+
+    @dataclass(frozen=True)
+    class Info:
+        """Tell."""
+
+        path: tyro.conf.Positional[Path]
+
+    @dataclass(frozen=True)
+    class Repair:
+        """Mend."""
+
+        path: tyro.conf.Positional[Path]
+
+    seen: list[object] = []
+    add_verb(seen.append, config=Info | Repair)
+    assert cli.main(["probe", "repair", "somewhere"]) == 0
+    assert seen == [Repair(path=Path("somewhere"))]
+
+
+def test_bad_option_exits_with_two(add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    """An option that does not parse is refused before the verb runs."""
+    add_verb(lambda settings: pytest.fail("the verb ran"))
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["probe", "--count", "many"])
+    assert caught.value.code == 2
+    assert "count" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (PortNotFoundError("no port /dev/x; plug it in"), "no port /dev/x; plug it in"),
+        (
+            FileNotFoundError(2, "No such file or directory", "a.mcap"),
+            "[Errno 2] No such file or directory: 'a.mcap'",
+        ),
+        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+    ],
+)
+def test_expected_error_is_one_line(
+    add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str], error: Exception, line: str
+) -> None:
+    """What deal-hw raises on purpose, and what the system refuses, ends in one line and exit code 2."""
+
+    def fail(settings: Settings) -> None:
+        raise error
+
+    add_verb(fail)
+    assert cli.main(["probe"]) == 2
+    assert capsys.readouterr().err == f"deal-hw: error: {line}\n"
+
+
+@pytest.mark.parametrize(("arguments", "variable"), [(["--traceback", "probe"], ""), (["probe"], "1")])
+def test_traceback_on_request(
+    add_verb: Callable[..., None], monkeypatch: pytest.MonkeyPatch, arguments: list[str], variable: str
+) -> None:
+    """Both the option and the variable let the error through."""
+
+    def fail(settings: Settings) -> None:
+        raise PortNotFoundError("no port")
+
+    add_verb(fail)
+    monkeypatch.setenv(cli.TRACEBACK_VARIABLE, variable)
+    with pytest.raises(PortNotFoundError):
+        cli.main(arguments)
+
+
+def test_bug_is_not_hidden(add_verb: Callable[..., None]) -> None:
+    """An error that nobody raised on purpose keeps its traceback."""
+
+    def fail(settings: Settings) -> None:
+        raise ZeroDivisionError
+
+    add_verb(fail)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["probe"])
+
+
+def test_interrupt_exits_with_130(add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    """Ctrl-C ends without a traceback and with the code that shells expect."""
+
+    def stop(settings: Settings) -> None:
+        raise KeyboardInterrupt
+
+    add_verb(stop)
+    assert cli.main(["probe"]) == 130
+    assert capsys.readouterr().err == "deal-hw: interrupted\n"
+
+
+def test_missing_package_names_the_extra(add_verb: Callable[..., None]) -> None:
+    """A package that an extra brings is asked for by that extra's name."""
+
+    def load(settings: Settings) -> None:
+        raise ModuleNotFoundError("No module named 'torch.nn'", name="torch.nn")
+
+    add_verb(load, extra="calib")
+    with pytest.raises(MissingExtraError, match=r"torch is not installed.*pip install 'deal-hw\[calib\]'"):
+        cli.run("probe", [])
+
+
+def test_missing_module_of_ours_is_a_bug(add_verb: Callable[..., None]) -> None:
+    """No extra brings a module of deal_hw: its absence is not dressed up as one."""
+
+    def load(settings: Settings) -> None:
+        raise ModuleNotFoundError("No module named 'deal_hw.nothing'", name="deal_hw.nothing")
+
+    add_verb(load)
+    with pytest.raises(ModuleNotFoundError) as caught:
+        cli.run("probe", [])
+    assert not isinstance(caught.value, MissingExtraError)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["nonsense"]])
+def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
+    """Help, version and a mistyped verb load neither numpy nor any verb, and so start at once."""
+    code = (
+        f"import sys, json\nfrom deal_hw.cli.main import main\nmain({arguments!r})\n"
+        f"loaded = [name for name in sys.modules if name in {HEAVY!r} or name.startswith('deal_hw.')]\n"
+        "print(json.dumps(loaded), file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    loaded = json.loads(done.stderr.splitlines()[-1])
+    assert sorted(loaded) == ["deal_hw.cli", "deal_hw.cli.main", "deal_hw.errors"]
+
+
+@pytest.mark.parametrize("name", cli.VERBS)
+def test_example_of_each_verb_parses(name: str) -> None:
+    """Each verb loads, and the line that the help shows for it is accepted."""
+    example = shlex.split(cli.VERBS[name].example)
+    assert example[0] == name
+    _, function = cli.parse(name, example[1:])
+    assert callable(function)
+
+
+def commands_in_docs() -> list[str]:
+    """Return every complete `deal-hw VERB ...` line in the code blocks of the README and the docs."""
+    texts = [
+        path.read_text(encoding="utf-8")
+        for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+    ]
+    lines = [
+        line for text in texts for line in re.findall(r"^(?: {4,}|\$ )(deal-hw [a-z].*)$", text, flags=re.M)
+    ]
+    return sorted({line.partition("#")[0].strip() for line in lines if " | " not in line})
+
+
+@pytest.mark.parametrize("command", commands_in_docs())
+def test_command_in_docs_parses(command: str) -> None:
+    """What the README and the docs tell a reader to type is accepted."""
+    _, name, *arguments = shlex.split(command)
+    cli.parse(name, arguments)

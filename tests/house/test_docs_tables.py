@@ -1,0 +1,46 @@
+"""Tables in the docs name what the code has."""
+
+from __future__ import annotations
+
+import enum
+import re
+from pathlib import Path
+
+import pytest
+
+from deal_hw.cli.main import JOBS
+from deal_hw.data.record import CycleFlag
+from deal_hw.data.schemas import CHANNELS
+from deal_hw.types import Status
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA_FORMAT = (ROOT / "docs" / "data-format.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("topic", CHANNELS)
+def test_topic_is_described_with_its_fields(topic: str) -> None:
+    """Each topic has a row that names exactly its fields, or points to the topic that has the same."""
+    (row,) = [
+        line
+        for line in DATA_FORMAT.splitlines()
+        if line.startswith("| `/") and f"`{topic}`" in line.split("|")[1]
+    ]
+    cell = row.split("|")[3]
+    if cell.strip() == "as `/command`":
+        assert CHANNELS[topic] is CHANNELS["/command"]
+        return
+    named = re.findall(r"`([a-z_]+)`", cell)
+    assert named == [name for _, name in CHANNELS[topic].fields]
+
+
+@pytest.mark.parametrize("flag", [*Status, *CycleFlag])
+def test_bit_is_described(flag: enum.IntFlag) -> None:
+    """Each bit has a row with its value and name."""
+    assert re.search(rf"^\| {flag.value} `{flag.name}` \|", DATA_FORMAT, flags=re.M)
+
+
+def test_readme_shows_each_job() -> None:
+    """The README's lines for the five jobs are those of the help, in its order."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    places = [readme.index(f"    deal-hw {verb.example}\n") for verb in JOBS.values()]
+    assert places == sorted(places)

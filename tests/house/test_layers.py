@@ -1,0 +1,218 @@
+"""The import order, read from the sources: who may know whom, and who may load what."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+LEAVES = ("calib", "drivers", "policies")
+SERVICES = ("control", "data", "sim", "testing", "viz")
+VOCABULARY = ("errors", "types", "clock")
+CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")
+LAYER = {
+    **dict.fromkeys(("deal_hw", *VOCABULARY), 0),
+    **dict.fromkeys(CONTRACTS, 1),
+    **dict.fromkeys(SERVICES, 2),
+    **dict.fromkeys(LEAVES, 3),
+    "cli": 4,
+    "__main__": 5,
+}
+"""Layer of each part; a part may import parts of lower layers and itself."""
+
+CONFINED = {
+    "torch": {"calib", "policies"},
+    "stable_baselines3": {"policies"},
+    "gymnasium": {"policies"},
+    "onnx": {"policies"},
+    "onnxscript": {"policies"},
+    "onnxruntime": {"policies"},
+    "mujoco": {"sim"},
+    "rerun": {"viz"},
+    "mcap": {"data"},
+    "mcap_ros2": {"data"},
+    "serial": {"drivers"},
+    "can": {"drivers"},
+    "cantools": {"drivers"},
+    "cobs": {"drivers"},
+    "cyclonedds": {"drivers"},
+    "dynamixel_sdk": {"drivers"},
+    "zenoh": {"drivers"},
+    "tyro": {"cli"},
+}
+"""Which parts may load a package; packages that are not named here are free."""
+
+MAX_LINES = 600
+MODULE_TEXT = re.compile(r"deal_hw\.(\w+)(?:\.\w+)*(?::\w+)?")
+
+
+def module_of(path: str) -> str:
+    """Return the module name under which a source file of the repository is installed."""
+    parts = list(Path(path).with_suffix("").parts)
+    if parts[0] in LEAVES:
+        parts.insert(0, "deal_hw")
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def part_of(module: str) -> str:
+    """Return the part that a module of deal_hw belongs to: the name after the first dot, or `deal_hw`."""
+    return module.split(".")[1] if "." in module else module
+
+
+def imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and name of all that is imported, at the top or inside functions, also by name as text."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            source = "." * node.level + (node.module or "")
+            # `from deal_hw import drivers` imports a part, not a name of `deal_hw`.
+            whole = [alias.name for alias in node.names if source == "deal_hw" and alias.name in LAYER]
+            yield from ((node.lineno, f"deal_hw.{name}") for name in whole)
+            if len(whole) < len(node.names):
+                yield node.lineno, source
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {
+            "import_module", "importlib.import_module", "__import__",
+        }:  # fmt: skip
+            first = node.args[0] if node.args else None
+            if isinstance(first, ast.Constant) and not str(first.value).startswith("deal_hw."):
+                yield node.lineno, str(first.value)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # A module named as text (a table, `python -m`) is a dependency like any other.
+            named = MODULE_TEXT.fullmatch(node.value)
+            if named and named[1] in LAYER:
+                yield node.lineno, node.value.partition(":")[0]
+
+
+def complaint(importer: str, target: str) -> str | None:
+    """Return why a module must not import another, or None where it may."""
+    root = target.split(".")[0]
+    if target.startswith("."):
+        return f"relative import {target!r}"
+    if root in LEAVES:
+        return f"imports {target!r}; write deal_hw.{target}, or there are two copies of each class"
+    if not importer.startswith("deal_hw"):
+        return None
+    me = part_of(importer)
+    if root in CONFINED and me not in CONFINED[root]:
+        return f"loads {root}, which only {sorted(CONFINED[root])} may"
+    if root != "deal_hw":
+        return None
+    other = part_of(target)
+    if me not in LAYER or other not in LAYER:
+        return f"{importer if me not in LAYER else target} stands in no layer"
+    same_layer = LAYER[me] == LAYER[other] and (me == other or LAYER[me] < 3)
+    return None if LAYER[other] < LAYER[me] or same_layer else f"{me} imports {other}"
+
+
+def violations(sources: Mapping[str, str]) -> list[str]:
+    """Return every breach of the order in sources by path, as `path:line: reason`."""
+    found = []
+    edges: dict[str, set[str]] = {}
+    for path, text in sources.items():
+        tree = ast.parse(text, path)
+        importer = module_of(path)
+        for line, target in imports(tree):
+            if reason := complaint(importer, target):
+                found.append(f"{path}:{line}: {reason}")
+            if target.startswith("deal_hw.") and part_of(target) != part_of(importer):
+                edges.setdefault(part_of(importer), set()).add(part_of(target))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "time.time":
+                found.append(f"{path}:{node.lineno}: time.time() jumps; use deal_hw.clock.Clock")
+        if text.count("\n") > MAX_LINES:
+            found.append(f"{path}: {text.count(chr(10))} lines, more than {MAX_LINES}")
+    services = {part: edges.get(part, set()) & set(SERVICES) for part in SERVICES}
+    while done := [part for part, needs in services.items() if not needs & set(services)]:
+        for part in done:
+            del services[part]
+    if services:
+        found.append(f"services import each other in a circle: {sorted(services)}")
+    return found
+
+
+def repository_sources() -> dict[str, str]:
+    """Return every source file of the repository by its path from the root."""
+    folders = ("deal_hw", *LEAVES, "tests", "tools")
+    paths = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
+    return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in paths}
+
+
+def test_repository_keeps_the_order() -> None:
+    """No file of the repository breaks the import order."""
+    sources = repository_sources()
+    assert len(sources) > 30
+    assert violations(sources) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "reason"),
+    [
+        ("drivers/x.py", "import deal_hw.calib.deal", "drivers imports calib"),
+        ("calib/x.py", "from deal_hw import policies", "calib imports policies"),
+        ("policies/x.py", "def f():\n    import deal_hw.drivers.cartpole", "policies imports drivers"),
+        ("deal_hw/control/x.py", "from deal_hw.drivers import ROBOTS", "control imports drivers"),
+        ("deal_hw/robot.py", "from deal_hw.data.reader import read", "robot imports data"),
+        ("deal_hw/types.py", "from deal_hw.robot import Robot", "types imports robot"),
+        ("drivers/x.py", "from deal_hw.cli import main", "drivers imports cli"),
+        ("deal_hw/cli/x.py", "from calib.deal import Deal", "two copies"),
+        ("tests/test_x.py", "import drivers.cartpole", "two copies"),
+        ("deal_hw/cli/x.py", "from . import main", "relative import"),
+        ("deal_hw/control/x.py", "def f():\n    import torch.nn as nn", "loads torch"),
+        ("deal_hw/cli/x.py", "import importlib\nimportlib.import_module('mujoco')", "loads mujoco"),
+        ("drivers/x.py", "run(['-m', 'deal_hw.cli.demo'])", "drivers imports cli"),
+        ("policies/x.py", "TABLE = {'deal': 'deal_hw.calib.deal:Deal'}", "policies imports calib"),
+        ("drivers/x.py", "import mujoco", "loads mujoco"),
+        ("deal_hw/cli/x.py", "import rerun as rr", "loads rerun"),
+        ("deal_hw/control/x.py", "import serial", "loads serial"),
+        ("deal_hw/utils/x.py", "from deal_hw.types import Status", "deal_hw.utils.x stands in no layer"),
+        ("deal_hw/cli/x.py", "import deal_hw.helpers", "deal_hw.helpers stands in no layer"),
+        ("deal_hw/control/x.py", "import time\nnow = time.time()", "time.time() jumps"),
+        ("calib/x.py", "x = 1\n" * 601, "more than 600"),
+    ],
+)  # fmt: skip
+def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None:
+    """Each kind of breach is found, and found once."""
+    (found,) = violations({path: source})
+    assert found.startswith(path)
+    assert reason in found
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        (
+            "deal_hw/cli/x.py",
+            "import tyro\nfrom deal_hw.calib import deal\nfrom deal_hw.drivers import ROBOTS",
+        ),
+        (
+            "calib/x.py",
+            "import torch\nfrom deal_hw.sim.batch import BatchSimulator\nfrom deal_hw import errors",
+        ),
+        ("drivers/x.py", "import serial\nfrom deal_hw.sim.model import build\nfrom deal_hw.drivers import y"),
+        ("deal_hw/policy.py", "import numpy\nfrom deal_hw.description import RobotDescription"),
+        ("deal_hw/viz/x.py", "import rerun\nfrom deal_hw.sim.model import build"),
+        ("deal_hw/sim/x.py", "NAME = 'deal_hw.speed_limit'"),
+        ("tests/test_x.py", "import mujoco, torch\nfrom deal_hw.calib import deal"),
+    ],
+)
+def test_allowed_imports_pass(path: str, source: str) -> None:
+    """What the order allows is not complained of."""
+    assert violations({path: source}) == []
+
+
+def test_circle_between_services_is_caught() -> None:
+    """Two services that import each other are named, with those that need them."""
+    sources = {
+        "deal_hw/viz/x.py": "import deal_hw.sim.model",
+        "deal_hw/sim/x.py": "import deal_hw.data.reader",
+        "deal_hw/data/x.py": "import deal_hw.sim.model",
+        "deal_hw/control/x.py": "import deal_hw.data.record",
+        "deal_hw/testing/x.py": "import deal_hw.clock",
+    }
+    (found,) = violations(sources)
+    assert found == "services import each other in a circle: ['control', 'data', 'sim', 'viz']"
