@@ -34,7 +34,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[all,dev]'
 	@touch $@
 
-demo: $(STAMP) ## the whole loop on an emulated cart-pole, about ten minutes on two cores
+demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
 test: $(STAMP) ## all tests that need no robot

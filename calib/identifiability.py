@@ -13,13 +13,20 @@ from deal_hw.types import FloatArray
 Z90 = 1.6448536269514722
 """Half width of a 90 % interval in standard deviations."""
 
+KINKS = 1.2
+"""Factor on standard deviations for what linearising leaves out: stick-slip and saturation bend the likelihood. Measured
+on tuning seeds: without it 90 % intervals held 86-89 % of the truths."""
+
 IDENTIFIABLE_STD = 0.15
 """Up to this standard deviation, in ln units or in parts of a linear range, a parameter counts as identified."""
 
 WEAK_SHARE = 0.5
 """Up to this share of the prior's standard deviation the data say something."""
 
-MISMATCH_CHI2 = 1.5
+BLIND_SHARE = 0.9
+"""Beyond this share of the prior's standard deviation the data say nothing."""
+
+MISMATCH_CHI2 = 1.3
 MISMATCH_TIME = 2.0
 _LAGS = 12
 
@@ -79,6 +86,7 @@ def uncertainty(
     residuals: tuple[FloatArray, ...],
     latency_range_s: tuple[float, float],
     fixed_latency: bool = False,
+    timing_std_s: float = 0.0,
 ) -> Uncertainty:
     """Turn normal equations into statements.
 
@@ -91,23 +99,17 @@ def uncertainty(
         residuals: Whitened residuals of windows, (W, H, J) each.
         latency_range_s: Searched latencies [s].
         fixed_latency: The latency was given.
+        timing_std_s: Jitter of the samples' time that the recording shows [s].
     """
     K = len(space)
     tau = correlation_time(residuals)
-    inflation = max(1.0, chi2) * (tau if chi2 > 1 or tau > MISMATCH_TIME else 1.0)
+    inflation = KINKS**2 * max(1.0, chi2) * tau
     prior = np.append(space.width**2, (latency_range_s[1] - latency_range_s[0]) ** 2) / 12.0
     if fixed_latency:
         prior[-1] = 1e-12
     # The range is a flat prior; its variance keeps what the data cannot see as wide as the range.
     covariance = np.linalg.inv(hessian / inflation + np.diag(1.0 / prior))
     std = np.sqrt(np.diag(covariance))
-    center = space.to_scale(theta)
-    low = np.maximum(space.from_scale(center - Z90 * std[:K]), space.low)
-    high = np.minimum(space.from_scale(center + Z90 * std[:K]), space.high)
-    # The estimate of a parameter that the data cannot see is arbitrary: its interval is the range's own 90 %.
-    blind = std[:K] > 0.9 * np.sqrt(prior[:K])
-    low = np.where(blind, space.unnormalize(np.full(K, 0.05)), low)
-    high = np.where(blind, space.unnormalize(np.full(K, 0.95)), high)
     latency = (
         max(latency_s - Z90 * std[K], latency_range_s[0]),
         min(latency_s + Z90 * std[K], latency_range_s[1]),
@@ -117,13 +119,32 @@ def uncertainty(
     verdicts = tuple(_verdict(space, k, float(std[k]), float(np.sqrt(prior[k]))) for k in range(K))
     return Uncertainty(
         covariance=covariance[:K, :K],
-        interval=np.stack([low, high], axis=1),
+        interval=intervals(space, theta, covariance[:K, :K]),
         latency_interval_s=latency,
         verdicts=verdicts,
         null_directions=null_directions(space, hessian[:K, :K] / inflation),
-        alarms=_alarms(space, theta, chi2, tau),
+        alarms=_alarms(space, theta, chi2, tau, timing_std_s),
         inflation=inflation,
     )
+
+
+def intervals(space: ParameterSpace, theta: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return 90 % intervals, (K, 2), inside the range.
+
+    Args:
+        space: The parameters.
+        theta: Estimate, (K,).
+        covariance: In each parameter's own scale, (K, K).
+    """
+    std, center = np.sqrt(np.diag(covariance)), space.to_scale(theta)
+    low = np.maximum(space.from_scale(center - Z90 * std), space.low)
+    high = np.minimum(space.from_scale(center + Z90 * std), space.high)
+    # The estimate of a parameter that the data cannot see is arbitrary: its interval is the range's own 90 %.
+    blind = std > BLIND_SHARE * space.width / np.sqrt(12.0)
+    K = len(space)
+    low = np.where(blind, space.unnormalize(np.full(K, 0.05)), low)
+    high = np.where(blind, space.unnormalize(np.full(K, 0.95)), high)
+    return np.stack([low, high], axis=1)
 
 
 def _verdict(space: ParameterSpace, k: int, std: float, prior_std: float) -> Verdict:
@@ -167,8 +188,15 @@ def null_directions(space: ParameterSpace, hessian: FloatArray) -> tuple[str, ..
     return tuple(words)
 
 
-def _alarms(space: ParameterSpace, theta: FloatArray, chi2: float, tau: float) -> tuple[str, ...]:
+def _alarms(
+    space: ParameterSpace, theta: FloatArray, chi2: float, tau: float, timing_std_s: float
+) -> tuple[str, ...]:
     alarms = []
+    if timing_std_s > 0:
+        alarms.append(
+            f"the state samples' time jitters by {1e3 * timing_std_s:.1f} ms: the model's delay is constant, so where "
+            "commands jitter too the intervals are too narrow"
+        )
     if chi2 > MISMATCH_CHI2:
         alarms.append(
             f"the model does not explain the recording: residuals are {np.sqrt(chi2):.1f} times the sensor noise "

@@ -10,32 +10,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.identifiability import MISMATCH_CHI2, uncertainty
+from deal_hw.calib.identifiability import MISMATCH_CHI2, Z90, Uncertainty, intervals, uncertainty
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import Polished, polish
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.types import FloatArray
 
 RESTARTS = 3
 SAME_CHI2 = 0.02
 SCAN_TICKS = 2
+SCAN_ITERATIONS = 6
+SCAN_MOST = 15
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyScan:
-    """Chi-square by latency, in device ticks.
+    """What the polish finds at whole device ticks of latency.
 
     Attributes:
         ticks: Latencies [device ticks], (L,).
-        chi2: (L,).
+        polished: The polish at each.
     """
 
     ticks: tuple[int, ...]
-    chi2: tuple[float, ...]
+    polished: tuple[Polished, ...]
 
     @property
     def best(self) -> int:
-        """The latency whose chi-square is least [device ticks]."""
-        return self.ticks[int(np.argmin(self.chi2))]
+        """Index of the latency with the least chi-square."""
+        return int(np.argmin([p.normal.cost for p in self.polished]))
+
+    @property
+    def weights(self) -> FloatArray:
+        """How plausible each latency is, (L,); sums to 1."""
+        cost = np.array([p.normal.cost for p in self.polished])
+        scale = max(1.0, self.polished[self.best].chi2)
+        weight = np.exp(-0.5 * (cost - cost.min()) / scale)
+        return np.asarray(weight / weight.sum())
 
 
 class PolishedMethod(CalibrationMethod[Problem]):
@@ -61,27 +72,27 @@ class PolishedMethod(CalibrationMethod[Problem]):
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
         searched, polished, restarts = self._until_explained(problem, budget, rng, progress)
-        fixed = problem.fixed_latency_s is not None
-        scan = None if fixed else scan_latency(problem, polished, progress)
-        known = uncertainty(
-            problem.space, polished.theta, polished.latency_s, polished.normal.hessian, polished.chi2,
-            polished.normal.residual, problem.latency_range_s, fixed,
-        )  # fmt: skip
+        scan = None if problem.fixed_latency_s is not None else scan_latency(problem, polished, progress)
+        if scan is not None:
+            polished = scan.polished[scan.best]
+        known = _uncertainty(problem, polished)
+        if scan is not None:
+            known = _average(problem, scan, known)
         provenance = dict(searched.provenance) | {
             "search": searched.method,
+            "search_seconds": searched.seconds,
+            "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
+            "search_latency_s": searched.latency_s,
             "restarts": restarts,
             "window_s": polished.shooting.length * _period(problem),
-            "noise_std": problem.noise_std.tolist(),
+            "noise_std": problem.noise.position_std.tolist(),
+            "timing_std_s": problem.noise.timing_std_s,
             "inflation": known.inflation,
             "polish_iterations": polished.iterations,
-            "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
         }
         if scan is not None:
-            provenance["latency_scan"] = {
-                "ticks": list(scan.ticks),
-                "chi2": list(scan.chi2),
-                "best": scan.best,
-            }
+            chi2 = [p.chi2 for p in scan.polished]
+            provenance["latency_scan"] = {"ticks": list(scan.ticks), "chi2": chi2, "weights": scan.weights.tolist()}
         return dataclasses.replace(
             searched,
             method=self.name,
@@ -103,7 +114,8 @@ class PolishedMethod(CalibrationMethod[Problem]):
         self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None
     ) -> tuple[CalibrationResult, Polished, int]:
         best: tuple[CalibrationResult, Polished] | None = None
-        for attempt in range(1 + RESTARTS):
+        attempt = 0
+        for attempt in range(1 + RESTARTS):  # noqa: B007
             searched = self.search.run(problem, budget, rng, progress)
             polished = polish_from(problem, searched, progress)
             previous = best[1].chi2 if best is not None else np.inf
@@ -143,16 +155,66 @@ def polish_from(problem: Problem, searched: CalibrationResult, progress: Progres
 
 
 def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallback | None) -> LatencyScan:
-    """Polish again at the whole device ticks around the latency found, and note each one's chi-square."""
+    """Polish again at the whole device ticks around the latency found.
+
+    The device acts on period boundaries, so its latency is a whole number of ticks; knowing that sharpens the other
+    parameters, and the ticks that remain plausible say how much.
+    """
     tick = problem.episodes[0].step_s
     centre = round(polished.latency_s / tick)
     low, high = (round(v / tick) for v in problem.latency_range_s)
-    ticks = [t for t in range(centre - SCAN_TICKS, centre + SCAN_TICKS + 1) if low <= t <= high]
     length_s = polished.shooting.length * _period(problem)
-    chi2 = []
-    for i, t in enumerate(ticks):
-        at = polish(problem, polished.theta, t * tick, (length_s / 2,), iterations=3, fixed_latency=True)
-        chi2.append(at.chi2)
+    states = polished.shooting.states(polished.point)
+    found: dict[int, Polished] = {}
+    waiting = [t for t in range(centre - SCAN_TICKS, centre + SCAN_TICKS + 1) if low <= t <= high]
+    while waiting and len(found) < SCAN_MOST:
+        t = waiting.pop(0)
+        found[t] = polish(
+            problem, polished.theta, t * tick, (length_s,), iterations=SCAN_ITERATIONS, fixed_latency=True, states=states
+        )
         if progress is not None:
-            progress(Progress("latency", i + 1, len(ticks), f"{t} ticks: chi2 {at.chi2:.3g}"))
-    return LatencyScan(tuple(ticks), tuple(chi2))
+            progress(
+                Progress("latency", len(found), len(found) + len(waiting), f"{t} ticks: chi2 {found[t].chi2:.3g}")
+            )
+        best = min(found, key=lambda tick: found[tick].normal.cost)
+        if not waiting:
+            # The least must lie inside what was scanned, or it is not known to be one.
+            waiting = [t for t in (best - 1, best + 1) if low <= t <= high and t not in found]
+    ticks = tuple(sorted(found))
+    return LatencyScan(ticks, tuple(found[t] for t in ticks))
+
+
+def _uncertainty(problem: Problem, polished: Polished) -> Uncertainty:
+    return uncertainty(
+        problem.space,
+        polished.theta,
+        polished.latency_s,
+        polished.normal.hessian,
+        polished.chi2,
+        polished.normal.residual,
+        problem.latency_range_s,
+        fixed_latency=True,
+        timing_std_s=problem.noise.timing_std_s,
+    )
+
+
+def _average(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:
+    """Widen the best latency's statement by what the other plausible latencies would say."""
+    space, tick = problem.space, problem.episodes[0].step_s
+    center = space.to_scale(scan.polished[scan.best].theta)
+    covariance = np.zeros_like(best.covariance)
+    for weight, polished in zip(scan.weights, scan.polished, strict=True):
+        shift = space.to_scale(polished.theta) - center
+        covariance += weight * (best.covariance + np.outer(shift, shift))
+    ticks = np.array(scan.ticks)
+    spread = float(np.sqrt(np.sum(scan.weights * (ticks - ticks[scan.best]) ** 2)))
+    # A tick is decided or not: half a tick is the least that rounding leaves open.
+    half = max(Z90 * spread, 0.5) * tick
+    latency = scan.polished[scan.best].latency_s
+    low, high = problem.latency_range_s
+    return dataclasses.replace(
+        best,
+        covariance=covariance,
+        interval=intervals(space, scan.polished[scan.best].theta, covariance),
+        latency_interval_s=(max(latency - half, low), min(latency + half, high)),
+    )

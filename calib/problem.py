@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.signal import savgol_coeffs
 
-from deal_hw.calib.noise import white_noise_std
+from deal_hw.calib.noise import NoiseModel, noise_model, white_noise_std
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.batch import ServoBatch
@@ -55,6 +55,8 @@ class WindowData:
         start_position: Smoothed positions at the starts, (W, J).
         start_velocity: Smoothed velocities at the starts, (W, J).
         reported_start: Reported positions at the starts, (W, J).
+        std: Standard deviation of the measured positions, (W, H, J).
+        start_std: Standard deviation of the reported start positions, (W, J).
     """
 
     episode: int
@@ -63,6 +65,8 @@ class WindowData:
     start_position: FloatArray
     start_velocity: FloatArray
     reported_start: FloatArray
+    std: FloatArray
+    start_std: FloatArray
 
 
 @dataclass(slots=True)
@@ -76,6 +80,9 @@ class Problem:
         threads: Simulation threads; None for all CPUs.
         latency_range_s: Total latencies that are searched [s].
         fixed_latency_s: A latency that is given; None to search it.
+        noise_std: Noise of positions over all speeds, (J,).
+        noise: Noise at rest and jitter of the samples' time.
+        starts: Smoothed states of each episode.
     """
 
     robot: RobotModel
@@ -85,6 +92,7 @@ class Problem:
     latency_range_s: tuple[float, float] = LATENCY_RANGE_S
     fixed_latency_s: float | None = None
     noise_std: FloatArray = field(init=False)
+    noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
     _batches: dict[int, ServoBatch] = field(init=False, default_factory=dict)
 
@@ -94,6 +102,8 @@ class Problem:
         floor = WIRE_RESOLUTION / np.sqrt(12.0)
         self.noise_std = np.max([white_noise_std(e.position, floor) for e in self.episodes], axis=0)
         self.starts = [smooth_states(e, self.noise_std) for e in self.episodes]
+        positions, velocities = [e.position for e in self.episodes], [s.velocity for s in self.starts]
+        self.noise = noise_model(positions, velocities, float(floor))
 
     @property
     def steps(self) -> int:
@@ -131,6 +141,7 @@ class Problem:
                 problem = str(err)
                 continue
             starts = self.starts[index]
+            std = self.noise.std(starts.velocity)
             found.append(
                 WindowData(
                     episode=index,
@@ -139,6 +150,8 @@ class Problem:
                     start_position=starts.position[windows.start],
                     start_velocity=starts.velocity[windows.start],
                     reported_start=episode.position[windows.start],
+                    std=std[windows.samples()],
+                    start_std=std[windows.start],
                 )
             )
         if not found:

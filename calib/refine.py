@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.problem import Problem
-from deal_hw.calib.residuals import Normal, Point, Shooting
+from deal_hw.calib.residuals import Normal, Point, Shooting, States
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -65,6 +65,7 @@ def polish(
     iterations: int = 12,
     fixed_latency: bool = False,
     notify: Callable[[int, float], None] | None = None,
+    states: States | None = None,
 ) -> Polished:
     """Polish parameters from a start.
 
@@ -76,6 +77,7 @@ def polish(
         iterations: Most iterations a stage.
         fixed_latency: Keep the latency.
         notify: Called with iterations done and chi2.
+        states: Where the first stage's windows start; the smoothed states by default.
 
     Raises:
         InsufficientDataError: Not even the shortest window fits.
@@ -83,7 +85,6 @@ def polish(
     space = problem.space
     theta = np.clip(theta, space.low, space.high)
     result: Polished | None = None
-    states = None
     done = 0
     for seconds in stages_s:
         try:

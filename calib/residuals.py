@@ -75,13 +75,15 @@ class Shooting:
         self.problem = problem
         self.data: Sequence[WindowData] = problem.windows(length, offset=offset)
         self.length = length
-        self._std = problem.noise_std
         J = problem.joints
         prior = np.array(
             [VELOCITY_PRIOR_STD[0] if unit == "m" else VELOCITY_PRIOR_STD[1] for unit in self._units()]
         )
         # Information on a start state from its own reported position, and the weak prior on its velocity.
-        self._start_information = np.concatenate([1 / self._std**2, 1 / prior**2])
+        self._start_information = [
+            np.concatenate([1 / d.start_std**2, np.broadcast_to(1 / prior**2, d.start_std.shape)], axis=1)
+            for d in self.data
+        ]
         self._state_step = np.concatenate([np.full(J, POSITION_STEP), np.full(J, VELOCITY_STEP)])
 
     def _units(self) -> tuple[str, ...]:
@@ -147,21 +149,22 @@ class Shooting:
                 x[K + 2 + j, :, j] += POSITION_STEP
                 v[K + 2 + J + j, :, j] += VELOCITY_STEP
             predicted, _ = self._predict(values, data, x, v)
-            r = (predicted[0] - data.measured) / self._std
-            jac = np.moveaxis((predicted[1:] - predicted[:1]) / self._std, 0, -1) / steps
+            r = (predicted[0] - data.measured) / data.std
+            jac = np.moveaxis((predicted[1:] - predicted[:1]) / data.std, 0, -1) / steps
             W = len(data.windows)
             r_flat, jac = r.reshape(W, -1), jac.reshape(W, -1, len(steps))
             jp, js = jac[..., : K + 1], jac[..., K + 1 :]
             start = np.concatenate([point.position[e] - data.reported_start, point.velocity[e]], axis=1)
             # The prior on velocities is centred on zero and so weak that it only guards the inverse.
-            mss = np.einsum("wri,wrj->wij", js, js) + np.diag(self._start_information)
-            gs = np.einsum("wri,wr->wi", js, r_flat) + self._start_information * start
+            information = self._start_information[e]
+            mss = np.einsum("wri,wrj->wij", js, js) + information[:, :, None] * np.eye(2 * J)
+            gs = np.einsum("wri,wr->wi", js, r_flat) + information * start
             msp = np.einsum("wri,wrj->wij", js, jp)
             solved = np.linalg.solve(mss, np.concatenate([msp, gs[..., None]], axis=2))
             back.append((solved[..., :-1], solved[..., -1]))
             hessian += np.einsum("wri,wrj->ij", jp, jp) - np.einsum("wsi,wsj->ij", msp, solved[..., :-1])
             gradient += np.einsum("wri,wr->i", jp, r_flat) - np.einsum("wsi,ws->i", msp, solved[..., -1])
-            cost += float(np.sum(r_flat**2) + np.sum(self._start_information * start**2))
+            cost += float(np.sum(r_flat**2) + np.sum(information * start**2))
             count += r_flat.size + W * J - W * 2 * J
             residuals.append(r)
         return Normal(cost, count, hessian, gradient, tuple(back), tuple(residuals))
@@ -184,9 +187,9 @@ class Shooting:
             x = np.stack([p.position[e] for p in points])
             v = np.stack([p.velocity[e] for p in points])
             predicted, _ = self._predict(values, data, x, v)
-            r = (predicted - data.measured) / self._std
+            r = (predicted - data.measured) / data.std
             start = np.concatenate([x - data.reported_start, v], axis=2)
-            total += np.sum(r**2, axis=(1, 2, 3)) + np.sum(self._start_information * start**2, axis=(1, 2))
+            total += np.sum(r**2, axis=(1, 2, 3)) + np.sum(self._start_information[e] * start**2, axis=(1, 2))
         return np.where(np.isfinite(total), total, np.inf)
 
     def _predict(

@@ -30,7 +30,6 @@ class WekiSettings:
         widen: Least spread of a coordinate at the start of each further stage, in logits.
         restart_chi2: A residual above this is not explained: the search starts again from the whole range.
         stage_generations: Most generations of one stage.
-        diverged: Whitened size of the residual that counts as infinitely wrong; larger ones are cut to it.
     """
 
     noisy_ticks: tuple[int, ...] = (5, 20)

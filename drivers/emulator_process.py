@@ -36,9 +36,10 @@ class EmulatorProcess:
         Raises:
             TransportError: It did not come up; the message holds what it said.
         """
-        # A session of its own: Ctrl-C in the terminal is the host's to handle, and the host needs the robot for that.
+        # A session of its own: Ctrl-C in the terminal is the host's to handle, and the host needs the robot
+        # for that.
         self._process = subprocess.Popen(
-            self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+            self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, bufsize=0
         )
         if self._process.stdout is None:
             raise TransportError("the emulator has no standard output")

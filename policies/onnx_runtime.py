@@ -66,7 +66,8 @@ class OnnxPolicy:
                 f"{self.path}: observation of shape {np.shape(observation)}, expected ({self._row.shape[1]},)"
             )
         self._row[0] = observation
-        return self.act_batch(self._row)[0]
+        action: FloatArray = self.act_batch(self._row)[0]
+        return action
 
     def act_batch(self, observations: Observation) -> FloatArray:
         """Return the actions, (B, A), for observations, (B, O)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -39,6 +40,7 @@ class SacConfig:
         target_entropy: Entropy of the policy that the temperature is tuned for [nat].
         warmup: Environment steps with random actions before the first update.
         buffer: Transitions kept.
+        lookahead: Rewards that are summed up before the critics are asked (n-step returns).
     """
 
     steps: int = 40_000
@@ -47,12 +49,13 @@ class SacConfig:
     batch: int = 256
     learning_rate: float = 2e-3
     final_learning_rate: float = 2e-4
-    gamma: float = 0.98
-    tau: float = 0.01
+    gamma: float = 0.97
+    tau: float = 0.02
     entropy: float = 0.1
     target_entropy: float = -1.0
     warmup: int = 1_000
     buffer: int = 200_000
+    lookahead: int = 1
 
     def __post_init__(self) -> None:
         for name in ("steps", "gradient_steps", "batch", "learning_rate", "final_learning_rate", "entropy", "buffer"):
@@ -84,7 +87,8 @@ class NetworkPolicy:
 
     def act(self, observation: Observation) -> FloatArray:
         """Return the action, (A,), for an observation, (O,)."""
-        return self.act_batch(observation[None])[0]
+        action: FloatArray = self.act_batch(observation[None])[0]
+        return action
 
     def act_batch(self, observations: Observation) -> FloatArray:
         """Return the actions, (B, A), for observations, (B, O)."""
@@ -149,32 +153,32 @@ def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
         gradient_steps=config.gradient_steps,
         ent_coef=f"auto_{config.entropy:g}",
         target_entropy=config.target_entropy,
-        policy_kwargs={"net_arch": list(config.hidden)},
+        n_steps=config.lookahead,
+        policy_kwargs={"net_arch": list(config.hidden), "optimizer_kwargs": {"fused": True}},
         seed=seed,
         device="cpu",
     )
 
 
 def _spec_of(env: ServoVectorEnv, config: SacConfig, seed: int) -> PolicySpec:
-    import dataclasses
-
     training = {
-        **env.spec.training,
+        **env.layout.training,
         "algorithm": "sac",
         "members": env.num_envs,
         "seed": seed,
         "config": {**asdict(config), "hidden": list(config.hidden)},
         "versions": {"stable_baselines3": stable_baselines3.__version__, "torch": str(torch.__version__)},
     }
-    return dataclasses.replace(env.spec, training=training)
+    return dataclasses.replace(env.layout, training=training)
 
 
 class _Adapter(VecEnv):
     """Shows a Gymnasium vector environment (SAME_STEP autoreset) to stable-baselines3, which predates those."""
 
     def __init__(self, env: ServoVectorEnv, seed: int) -> None:
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        # First, because VecEnv's constructor asks it for its render mode.
         self._env = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._seed = seed
         self._return = np.zeros(env.num_envs)
         self.recent_returns: collections.deque[float] = collections.deque(maxlen=100)

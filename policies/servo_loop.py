@@ -167,14 +167,14 @@ class ServoLoop:
         )  # fmt: skip
         self._setpoint = setpoints[:, -1]
         position, velocity = (values[:, -1] for values in self.batch.advance(setpoints))
-        diverged = ~np.isfinite(position).all(axis=1) | ~np.isfinite(velocity).all(axis=1)
+        diverged: BoolArray = ~np.isfinite(np.concatenate([position, velocity], axis=1)).all(axis=1)
         if diverged.any():
             position = np.where(diverged[:, None], self.description.default_position, position)
             velocity = np.where(diverged[:, None], 0.0, velocity)
         self._reports = np.roll(self._reports, 1, axis=0)
         self._reports[0] = self._report(position, rng)
         self._publish(members, velocity)
-        return np.asarray(diverged)
+        return diverged
 
     def _publish(self, members: npt.NDArray[np.intp], velocity: FloatArray) -> None:
         now, then = self._reports[0, members], self._reports[-1, members]

@@ -27,20 +27,26 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
     Args:
         description: The robot.
         distribution: What each member's parameters and latency are drawn from at each start of an episode.
-        spec: The layout of observation and action.
+        layout: What is observed and what an action means.
         count: Members N.
         ticks: Control periods after which an episode is cut off.
         host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s]: the age of the
             newest state sample when the policy looks, and the way over the wire.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+
+    Attributes:
+        layout: What is observed and what an action means.
+        failure_reward: The reward of the tick in which a member fails.
     """
+
+    failure_reward: float = 0.0
 
     def __init__(
         self,
         description: RobotDescription,
         distribution: ParameterDistribution,
-        spec: PolicySpec,
+        layout: PolicySpec,
         count: int,
         *,
         ticks: int,
@@ -48,12 +54,12 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         sensor: SensorModel | None = None,
         threads: int | None = 1,
     ) -> None:
-        self.description, self.distribution, self.spec = description, distribution, spec
+        self.description, self.distribution, self.layout = description, distribution, layout
         self.num_envs = count
         self.ticks = ticks
         self.host_delay_s = host_delay_s
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        O, A = len(spec.observation), len(spec.actuated)  # noqa: E741
+        O, A = len(layout.observation), len(layout.actuated)  # noqa: E741
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (O,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, count)
@@ -62,10 +68,10 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self.loop = ServoLoop(
             description, distribution.space, count, longest_latency_s=longest, sensor=sensor, threads=threads
         )
-        self._builder = ObservationBuilder(spec, (count,))
+        self._builder = ObservationBuilder(layout, (count,))
         self._elapsed = np.zeros(count, dtype=np.int64)
-        self._scale = np.array(spec.action_scale)
-        self._default = np.array(spec.default_position)[list(description.actuated_index)]
+        self._scale = np.array(layout.action_scale)
+        self._default = np.array(layout.default_position)[list(description.actuated_index)]
 
     @abc.abstractmethod
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
@@ -91,7 +97,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start all members anew; a whole-number seed fixes everything that follows."""
         super().reset(seed=seed if isinstance(seed, int) else None, options=options)
-        self._last_action = np.zeros((self.num_envs, len(self.spec.actuated)))
+        self._last_action = np.zeros((self.num_envs, len(self.layout.actuated)))
         self._restart(np.ones(self.num_envs, dtype=bool))
         return self._observe(), {}
 
@@ -107,7 +113,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         diverged = self.loop.step(self._default + self._scale * action, self.np_random)
         position, velocity = self.loop.position, self.loop.velocity
         terminated = self.ended(position, velocity) | diverged
-        reward = np.where(terminated, 0.0, self.reward(position, velocity, action, self._last_action))
+        reward = np.where(terminated, self.failure_reward, self.reward(position, velocity, action, self._last_action))
         self._last_action = action
         self._elapsed += 1
         truncated = (self._elapsed >= self.ticks) & ~terminated

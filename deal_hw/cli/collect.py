@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +10,7 @@ import tyro
 
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
+from deal_hw.control.excitation import RichConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +33,8 @@ class Collect:
     """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
 
     profile: Literal["rich", "chirp", "balance", "hold"] = "rich"
-    """rich: balance, then random set-points; chirp: a sine sweep (for held-out data); balance: the policy all the
-    time; hold: the start pose."""
+    """rich: balance, then random set-points; chirp: a sine sweep (for held-out data); balance: the policy all
+    the time; hold: the start pose."""
 
     policy: Path | None = None
     """Policy that balances (.onnx); by default the one shipped for the robot."""
@@ -46,6 +47,9 @@ class Collect:
 
     seed: int = 0
     """Fixes the random set-points; episode k uses SEED + k."""
+
+    rich: tyro.conf.Suppress[RichConfig] = field(default_factory=RichConfig)
+    """Settings of the profile `rich`; its length is SECONDS."""
 
     quiet: bool = False
     """Print nothing but errors."""
@@ -65,6 +69,7 @@ def collect(config: Collect) -> RunReport:
         policy=str(policy or ""),
         seconds=config.seconds,
         seed=config.seed,
+        rich=config.rich,
     )
     return run_episodes(
         plan,

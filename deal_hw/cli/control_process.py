@@ -1,8 +1,8 @@
 """The control process: the one place where robot, behaviour, safety and loop come together in real time.
 
-Started by the supervisor as ``python -m deal_hw.cli.control_process`` with its orders as JSON on standard input and
-with the open port, the recorder's socket and the status socket as inherited descriptors. It writes neither to disk nor
-to the terminal, and imports neither torch, mujoco nor scipy.
+Started by the supervisor as ``python -m deal_hw.cli.control_process`` with its orders as JSON on standard
+input and with the open port, the recorder's socket and the status socket as inherited descriptors. It writes
+neither to disk nor to the terminal, and imports neither torch, mujoco nor scipy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ORPHAN_S = 2.0
 
 
 class _Stopper:
-    """Turns signals into a stop of whatever runs: an exit before there is a loop, its passive route afterwards."""
+    """Turns signals into a stop: an exit before there is a loop, its passive route afterwards."""
 
     def __init__(self, parent_pid: int) -> None:
         self._parent_pid = parent_pid
@@ -54,7 +54,14 @@ def main() -> int:
         status.beat(clock.now_ns(), "loading", _START_SILENCE_S)
         status.result(_run(orders, status, clock, stopper))
     except KeyboardInterrupt:
-        status.result({"outcome": "stopped", "reason": "stopped by the operator", "error": "", "passive_confirmed": True})
+        status.result(
+            {
+                "outcome": "stopped",
+                "reason": "stopped by the operator",
+                "error": "",
+                "passive_confirmed": True,
+            }
+        )
     except Exception as err:
         # Nothing was armed yet: the loop itself reports its errors instead of raising them.
         status.result(
@@ -63,7 +70,9 @@ def main() -> int:
     return 0
 
 
-def _run(orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper) -> dict[str, Any]:
+def _run(
+    orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper
+) -> dict[str, Any]:
     # Imported here, so that a stop during these imports is answered, too.
     from deal_hw.cli.run_plan import RunPlan, make_behaviour
     from deal_hw.control.loop import ControlLoop, LoopConfig

@@ -208,4 +208,3 @@ def _print_episode(console: Console, episode: EpisodeInfo) -> None:
 def _plain(value: Any) -> str:
     values = value if isinstance(value, (tuple, list)) else [value]
     return ", ".join(f"{number:.4g}" for number in values)
-

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 ROBOTS = ("cartpole",)
 TRANSPORTS = ("serial",)
 _PARENT_CHECK_STEPS = 100
+_FIFO_PRIORITY = 40
+"""Below that of a control process: the host must not wait for the emulator."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +39,8 @@ class Emulate:
     """The wire to speak on; "serial" makes a pseudo-terminal."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
-    """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter, Stribeck friction,
-    backlash and dropped frames."""
+    """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
+    Stribeck friction, backlash and dropped frames."""
 
     seed: int = 0
     """Decides the hidden parameters, the noise and the start angles."""
@@ -94,7 +98,7 @@ class Emulate:
 
 
 def emulate(config: Emulate) -> int:
-    """Run the emulator until Ctrl-C, SIGTERM, the time given, or until the port vanished; return the exit status.
+    """Run the emulator until a signal, the time given, or until the port vanished; return the exit status.
 
     The first line on standard output is ``port PATH``.
     """
@@ -111,8 +115,12 @@ def emulate(config: Emulate) -> int:
     emulator = CartpoleEmulator(CartpoleDevice(truth), link=config.link, hazards=_hazards(config))
     try:
         print(f"port {emulator.open()}", flush=True)
-        print(f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused; Ctrl-C ends", flush=True)
-        _run(emulator, config, stop)
+        print(
+            f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused; Ctrl-C ends",
+            flush=True,
+        )
+        with _realtime_priority():
+            _run(emulator, config, stop)
     finally:
         emulator.close()
         _reveal(config, truth)
@@ -134,6 +142,19 @@ def _run(emulator: CartpoleEmulator, config: Emulate, stop: threading.Event) -> 
             return
 
 
+@contextlib.contextmanager
+def _realtime_priority() -> Iterator[None]:
+    """Run ahead of ordinary processes where permitted: a real robot does not share the host's processor."""
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, *before)
+
+
 def _stop_on_signals(stop: threading.Event) -> None:
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -141,7 +162,6 @@ def _stop_on_signals(stop: threading.Event) -> None:
 
 
 def _truth(config: Emulate) -> Truth:
-    from deal_hw.drivers.cartpole.oracle import draw_truth
     from deal_hw.drivers.cartpole.oracle import draw_truth
     from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 
@@ -162,7 +182,9 @@ def _hazards(config: Emulate) -> Hazards:
     return Hazards(
         freeze_after_s=config.freeze_after_s,
         vanish_after_s=config.vanish_after_s,
-        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA])) if rates != FaultRates() else None,
+        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]))
+        if rates != FaultRates()
+        else None,
     )
 
 

@@ -47,9 +47,9 @@ class Verb:
     extra: str = ""
 
 
-def _verb(name: str, *, help: str, example: str, extra: str = "") -> Verb:
+def _verb(name: str, *, help: str, example: str, extra: str = "", module: str = "") -> Verb:
     return Verb(
-        module=f"deal_hw.cli.{name}",
+        module=f"deal_hw.cli.{module or name}",
         config=name.capitalize(),
         function=name,
         help=help,
@@ -68,7 +68,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         "calibrate": _verb(
             "calibrate",
             help="find the simulator parameters that explain a recording",
-            example="calibrate runs/first/dataset --out runs/first",
+            example="calibrate runs/first/dataset",
             extra="calib",
         ),
         "train": _verb(
@@ -80,12 +80,13 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         "deploy": _verb(
             "deploy",
             help="run a policy on the robot behind the safety filter",
-            example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/calibrated.onnx",
+            example="deploy cartpole --port /dev/ttyUSB0 --policy runs/first/policies/policy.onnx",
         ),
         "inspect": _verb(
             "inspect",
+            module="inspect_",
             help="see the real, the nominal and the calibrated motion on one screen",
-            example="inspect runs/first/dataset/episodes/000000.mcap",
+            example="inspect runs/first/dataset/episodes/000000.mcap --calibration runs/first/calibration",
             extra="sim,viz",
         ),
     }

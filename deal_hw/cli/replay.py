@@ -16,7 +16,7 @@ from deal_hw.drivers import robot_description
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Send the commands that a recording asked for again, through the safety filter, and record what happens."""
+    """Send a recording's commands again, through the safety filter, and record what happens."""
 
     episode: tyro.conf.Positional[Path]
     """The recording (.mcap)."""

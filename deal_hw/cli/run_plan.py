@@ -54,7 +54,9 @@ class RunPlan:
         if self.profile not in get_args(Profile):
             raise UnknownNameError("profile", self.profile, get_args(Profile))
         if not 0 < self.seconds < float("inf"):
-            raise ConfigurationError(f"--seconds {self.seconds!r}: a run lasts longer than 0 s and not for ever")
+            raise ConfigurationError(
+                f"--seconds {self.seconds!r}: a run lasts longer than 0 s and not for ever"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -102,8 +104,8 @@ def make_behaviour(plan: RunPlan, description: RobotDescription) -> Behaviour:
 def _policy(plan: RunPlan, description: RobotDescription) -> Behaviour:
     if not plan.policy:
         raise PolicyError(
-            f"profile {plan.profile!r} needs a policy, and none is shipped for robot {plan.robot!r}; give --policy FILE, "
-            "or use --profile chirp or hold"
+            f"profile {plan.profile!r} needs a policy, and none is shipped for robot {plan.robot!r}; "
+            "give --policy FILE, or use --profile chirp or hold"
         )
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 

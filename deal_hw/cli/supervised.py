@@ -1,4 +1,4 @@
-"""What collect, deploy and replay share: they are one run under a supervisor, with another behaviour and purpose."""
+"""What collect, deploy and replay share: one run under a supervisor, with another behaviour."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class EpisodeReport:
         return {
             "outcome": self.outcome.value, "reason": self.reason, "passive_confirmed": self.passive_confirmed,
             "cadence": self.cadence.to_json() if self.cadence is not None else None, "clipped": self.clipped,
-            "cycles_sent": self.cycles_sent, "states_recorded": self.states_recorded, "warnings": list(self.warnings),
-            "error": self.error,
+            "cycles_sent": self.cycles_sent, "states_recorded": self.states_recorded,
+            "warnings": list(self.warnings), "error": self.error,
         }  # fmt: skip
 
     def raise_error(self) -> None:
@@ -75,7 +75,10 @@ class EpisodeReport:
         if self.outcome is not Outcome.FAILED:
             return
         kind = getattr(errors, self.error, errors.DealHwError)
-        if not issubclass(kind, errors.DealHwError) or kind in (errors.UnknownNameError, errors.MissingExtraError):
+        if not issubclass(kind, errors.DealHwError) or kind in (
+            errors.UnknownNameError,
+            errors.MissingExtraError,
+        ):
             kind = errors.DealHwError
         raise kind(self.reason)
 
@@ -99,12 +102,20 @@ class RunReport:
 
     @property
     def exit_code(self) -> int:
-        """For the shell: 0 finished, 2 failed, 3 tripped by the safety module, 130 stopped by the operator."""
+        """For the shell: 0 finished, 2 failed, 3 tripped by the safety module, 130 stopped."""
         return _EXIT_CODES[self.outcome]
 
 
 def _ignore(beat: Beat) -> None:
     return
+
+
+def _both(first: Callable[[Beat], None], second: Callable[[Beat], None]) -> Callable[[Beat], None]:
+    def on_beat(beat: Beat) -> None:
+        first(beat)
+        second(beat)
+
+    return on_beat
 
 
 def dataset_folder(out: Path | None, dataset: Path | None, *, required: bool = True) -> Path | None:
@@ -153,14 +164,16 @@ def run_episodes(
     make_behaviour(plan, description)
     robot = make_robot(plan.robot, plan.transport, port, MonotonicClock())
     reports: list[EpisodeReport] = []
-    # The supervisor greets the robot itself, so that a wrong port is known before any process is started. From then on
-    # it only keeps the port, until the control process is dead.
+    # The supervisor greets the robot itself, so that a wrong port is known before any process is started.
+    # From then on it only keeps the port, until the control process is dead.
     with robot, _open_dataset(dataset, robot.description) as store:
         for number in range(episodes):
-            run = _Episode(dataclasses.replace(plan, seed=plan.seed + number), robot, port, store, purpose, task)
+            run = _Episode(
+                dataclasses.replace(plan, seed=plan.seed + number), robot, port, store, purpose, task
+            )
             title = f"{purpose} {plan.robot} {number + 1}/{episodes}"
             with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.seconds) as show:
-                reports.append(run.run(lambda beat, show=show: (show(beat), on_beat(beat))))
+                reports.append(run.run(_both(show, on_beat)))
             if not quiet:
                 print_report(reports[-1])
             if reports[-1].outcome is not Outcome.FINISHED:
@@ -246,14 +259,15 @@ def account(end: ChildEnd, path: Path | None) -> EpisodeReport:
     warnings = list(result.get("warnings", ()))
     if not end.passive_confirmed:
         warnings.append(
-            "the robot did not confirm that it is passive: switch it off by hand. Where the cable is cut, only the "
-            "device's own watchdog can stop its motors"
+            "the robot did not confirm that it is passive: switch it off by hand. Where the cable is cut, "
+            "only the device's own watchdog can stop its motors"
         )
     cadence = CadenceReport.from_json(result["cadence"]) if result.get("cadence") else None
     if cadence is not None and cadence.link_errors > _LINK_WARNING * max(cadence.states, 1):
         share = cadence.link_errors / (cadence.states + cadence.link_errors)
         warnings.append(
-            f"{cadence.link_errors} link errors, {share:.0%} of the state frames: check cable, connectors and grounding"
+            f"{cadence.link_errors} link errors, {share:.0%} of the state frames: "
+            "check cable, connectors and grounding"
         )
     if end.recorder is not None and not end.recorder.complete:
         why = "; ".join(end.recorder.errors) or "for an unknown reason"

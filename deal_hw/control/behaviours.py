@@ -1,4 +1,4 @@
-"""Behaviours: what a run asks of the robot, cycle by cycle. numpy only; the safety filter judges all of it."""
+"""What a run asks of the robot, cycle by cycle; numpy only, and the safety filter judges all of it."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class PolicyBehaviour:
         self._default = np.array(spec.default_position)[list(description.actuated_index)]
         zeros = np.zeros(len(spec.actuated))
         self._template = JointCommand(
-            zeros, zeros, np.array(spec.stiffness), np.array(spec.damping), zeros, np.array(spec.effort_limit),
-            np.array(spec.speed_limit),
+            zeros, zeros, np.array(spec.stiffness), np.array(spec.damping), zeros,
+            np.array(spec.effort_limit), np.array(spec.speed_limit),
         )  # fmt: skip
         self.action: FloatArray | None = None
 
@@ -92,7 +92,9 @@ class PolicyBehaviour:
         observation = self._observations.build(state.position, state.velocity)
         action = np.asarray(self._policy.act(observation), dtype=float)
         if action.shape != self._scale.shape:
-            raise PolicyError(f"the policy returned an action of shape {action.shape}, expected {self._scale.shape}")
+            raise PolicyError(
+                f"the policy returned an action of shape {action.shape}, expected {self._scale.shape}"
+            )
         self.action = np.clip(action, -1.0, 1.0)
         self._observations.record_action(self.action)
         return dataclasses.replace(self._template, position_target=self._default + self._scale * self.action)
@@ -132,14 +134,15 @@ class ReplayBehaviour:
     def __init__(self, trajectory: Trajectory, description: RobotDescription) -> None:
         if trajectory.actuated != description.actuated or trajectory.joint_names != description.joint_names:
             raise ConfigurationError(
-                f"the recording is of joints {trajectory.joint_names} with actuated {trajectory.actuated}; robot "
-                f"{description.name!r} has {description.joint_names} with actuated {description.actuated}"
+                f"the recording is of joints {trajectory.joint_names}, actuated {trajectory.actuated}; "
+                f"robot {description.name!r} has {description.joint_names}, actuated {description.actuated}"
             )
         if not trajectory.sent_s.size:
             raise DatasetError("the recording holds no command to replay")
         self._trajectory = trajectory
         self._time_s = trajectory.sent_s - trajectory.sent_s[0]
-        # Commands go out on a grid of periods: half a period of slack keeps send jitter from shifting them by one.
+        # Commands go out on a grid of periods: half a period of slack keeps send jitter from shifting them by
+        # one.
         self._slack_s = 0.5 / description.control_rate_hz
 
     @property
@@ -156,5 +159,11 @@ class ReplayBehaviour:
         t = self._trajectory
         zeros = np.zeros(len(t.actuated))
         return JointCommand(
-            t.asked_position[i], zeros, t.stiffness[i], t.damping[i], zeros, t.effort_limit[i], t.speed_limit[i]
+            t.asked_position[i],
+            zeros,
+            t.stiffness[i],
+            t.damping[i],
+            zeros,
+            t.effort_limit[i],
+            t.speed_limit[i],
         )

@@ -101,13 +101,14 @@ class CadenceReport:
             f"lateness    {ms(self.lateness)}",
             f"overruns    {self.overruns}, beyond one period {self.overruns_beyond_period}",
             f"state age   {ms(self.state_age)}",
-            f"states      {self.states}, cycles without {self.cycles_without_state}, link errors {self.link_errors}",
+            f"states      {self.states}, cycles without {self.cycles_without_state}",
+            f"link        {self.link_errors} errors",
             f"losses      {self.losses} hand-overs to the recorder refused",
         ]
 
 
 class Cadence:
-    """Paces a loop on absolute deadlines: lateness never adds up, and periods that are over are skipped, not caught up.
+    """Paces a loop on absolute deadlines: lateness never adds up, lost periods are skipped.
 
     Call :meth:`begin` once a cycle, after :attr:`deadline_ns`; the first call sets the grid of deadlines.
     """

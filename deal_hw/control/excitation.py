@@ -28,10 +28,14 @@ class Segment:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.start < self.stop <= 1.0:
-            raise ConfigurationError(f"segment {self.start!r}..{self.stop!r}: fractions of the run, 0 <= start < stop <= 1")
+            raise ConfigurationError(
+                f"segment {self.start!r}..{self.stop!r}: fractions of the run, 0 <= start < stop <= 1"
+            )
         for name in ("stiffness", "damping", "effort_limit", "speed_limit"):
             if not getattr(self, name) > 0:
-                raise ConfigurationError(f"segment factor {name} is {getattr(self, name)!r}; it must be above 0")
+                raise ConfigurationError(
+                    f"segment factor {name} is {getattr(self, name)!r}; it must be above 0"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +98,9 @@ class RichBehaviour:
         self.action = None
         # Half a millisecond of slack: times are multiples of the control period, not exact in binary.
         if time_s + 5e-4 >= self._until_s:
-            self._target = self._default + self._rng.uniform(-1.0, 1.0, self._default.shape) * self._config.amplitude
+            self._target = (
+                self._default + self._rng.uniform(-1.0, 1.0, self._default.shape) * self._config.amplitude
+            )
             self._until_s = time_s + self._rng.uniform(*self._config.hold_s)
         return self._scaled(self._target, time_s)
 

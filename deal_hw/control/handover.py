@@ -1,7 +1,7 @@
 """Channels out of the control process: cycles to the recorder, heartbeats and the report to the supervisor.
 
-Both are Unix sockets of whole datagrams (SOCK_SEQPACKET). The control process never waits on them: what the peer does
-not take at once is refused and counted.
+Both are Unix sockets of whole datagrams (SOCK_SEQPACKET). The control process never waits on them: what the
+peer does not take at once is refused and counted.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from deal_hw.data.record import CycleRecord, encode
 from deal_hw.errors import ConfigurationError, DatasetError
 
 BUFFER_BYTES = 1 << 20
-"""Asked of the kernel for the recorder's socket; it grants up to net.core.wmem_max, twice 208 kB by default."""
+"""Asked of the kernel for the recorder's socket; it grants up to net.core.wmem_max, twice 208 kB by
+default."""
 _MOST_REFUSED = 50
 """So many refusals in a row (one second at 50 Hz) mean that nobody records: the run ends."""
 _BEAT = struct.Struct("<cqdI")
@@ -49,11 +50,14 @@ class RecordSender:
             self._refused_in_a_row += 1
             if self._refused_in_a_row >= _MOST_REFUSED:
                 raise DatasetError(
-                    f"the recorder has refused the last {self._refused_in_a_row} cycles: the disk is too slow or hangs"
+                    f"the recorder has refused the last {self._refused_in_a_row} cycles: "
+                    "the disk is too slow or hangs"
                 ) from None
             return False
         except OSError as err:
-            raise DatasetError(f"the recorder is gone ({err.strerror}); what it had written is whole") from err
+            raise DatasetError(
+                f"the recorder is gone ({err.strerror}); what it had written is whole"
+            ) from err
         self._refused_in_a_row = 0
         return True
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,21 +10,26 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.cadence import Cadence, CadenceReport
-from deal_hw.control.passive import ATTEMPTS, CONFIRM_S, make_passive
+from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
+from deal_hw.control.passive import make_passive
 from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
 from deal_hw.data.record import CycleFlag, CycleRecord
-from deal_hw.errors import ConfigurationError, DealHwError, TransportError, TransportTimeoutError
+from deal_hw.errors import DealHwError, TransportError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.types import Event, JointCommand, RobotState
 
+__all__ = ["RUNNING", "ControlLoop", "LoopConfig", "LoopReport", "OperatorStop", "Outcome", "Sink"]
+
 Sink = Callable[[CycleRecord], bool]
-"""Takes a record and never waits; False: refused. Raises a DealHwError where nobody will ever take one again."""
+"""Takes a record and never waits; False: refused. Raises a DealHwError where nobody will ever take one
+again."""
 
 
 RUNNING = "running"
 """Name of the phase in which cycles run."""
 RUNNING_SILENCE_S = 0.3
-"""A loop without a heartbeat for this long is stalled: the cart-pole's own watchdog has stopped its motor by then [s]."""
+"""A loop without a heartbeat for this long is stalled: the cart-pole's own watchdog has stopped its motor by
+then [s]."""
 
 _MOST_WIRE = 512
 """Raw messages in one record; a cycle has about 5."""
@@ -36,87 +39,8 @@ class OperatorStop(BaseException):
     """The operator asked to stop while the loop waited for the robot; no error, so not an Exception."""
 
 
-class Outcome(enum.Enum):
-    """How a run ended."""
-
-    FINISHED = "finished"
-    STOPPED = "stopped"
-    """By the operator."""
-    TRIPPED = "tripped"
-    """By the safety module."""
-    FAILED = "failed"
-    """By an error."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopConfig:
-    """Settings of one run."""
-
-    duration_s: float
-    """Length of the run, counted in control periods [s]."""
-    dry_run: bool = False
-    """Compute everything and send nothing: the robot is neither homed nor armed."""
-    home: bool = True
-    """Bring the robot to its start pose first."""
-    home_timeout_s: float = 20.0
-    arm_timeout_s: float = 1.0
-    state_timeout_s: float = 1.0
-    """How long to wait for the first state sample [s]."""
-    passive_attempts: int = ATTEMPTS
-    """How often the passive command is sent before giving up on a confirmation."""
-    passive_confirm_s: float = CONFIRM_S
-    """How long to wait for the confirmation of each [s]."""
-    record_wire: bool = True
-    """Hand the raw bytes to the recorder, too."""
-
-    def __post_init__(self) -> None:
-        if not self.duration_s > 0:
-            raise ConfigurationError(f"a run must last longer than 0 s, not {self.duration_s!r}")
-        if self.passive_attempts < 1:
-            raise ConfigurationError("passive_attempts must be at least 1: a run never ends without the passive command")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopReport:
-    """What came out of one run.
-
-    Attributes:
-        outcome: How it ended.
-        reason: In words, for the operator.
-        passive_confirmed: Whether the robot itself said that its motors no longer follow commands; also True where it
-            was never commanded.
-        cadence: How regular it was.
-        clipped: Cycles in which each limit changed the command, by limit.
-        cycles_sent: Commands sent.
-        error: Name of the error's class where it failed.
-    """
-
-    outcome: Outcome
-    reason: str
-    passive_confirmed: bool
-    cadence: CadenceReport
-    clipped: dict[str, int]
-    cycles_sent: int
-    error: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {
-            "outcome": self.outcome.value, "reason": self.reason, "passive_confirmed": self.passive_confirmed,
-            "cadence": self.cadence.to_json(), "clipped": self.clipped, "cycles_sent": self.cycles_sent,
-            "error": self.error,
-        }  # fmt: skip
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> LoopReport:
-        """Return the report that :meth:`to_json` wrote."""
-        return cls(
-            **{**values, "outcome": Outcome(values["outcome"]), "cadence": CadenceReport.from_json(values["cadence"])}
-        )
-
-
 class ControlLoop:
-    """Connects, homes, arms, runs cycles on absolute deadlines, and leaves the robot passive whatever happens.
+    """Connects, homes, arms, runs cycles on absolute deadlines and always leaves the robot passive.
 
     Args:
         robot: The robot; the loop connects and disconnects it.
@@ -185,8 +109,8 @@ class ControlLoop:
             confirmed = self._make_passive()
             self._close(reason)
         return LoopReport(
-            outcome=outcome, reason=reason, passive_confirmed=confirmed, cadence=self._report(), clipped=self._clipped,
-            cycles_sent=self._sent, error=error,
+            outcome=outcome, reason=reason, passive_confirmed=confirmed, cadence=self._report(),
+            clipped=self._clipped, cycles_sent=self._sent, error=error,
         )  # fmt: skip
 
     def _prepare(self) -> None:
@@ -201,13 +125,14 @@ class ControlLoop:
         self._phase("arming", c.arm_timeout_s + c.state_timeout_s + 2.0)
         self._await_state()
         if not c.dry_run:
-            self._safety.arm(self._input(operator_stop=False))
+            self._safety.arm(self._input())
             self._robot.arm(c.arm_timeout_s)
             self.note("armed", "the motors follow commands")
             # What waited in buffers meanwhile is old: the first cycle takes what comes from now on.
             self._drain()
             self._await_state()
-        # The recording starts with the sample that the first command answers, not with hands that set up the robot.
+        # The recording starts with the sample that the first command answers, not with hands that set up the
+        # robot.
         self._pending = self._pending[-1:]
 
     def _await_state(self) -> None:
@@ -244,7 +169,9 @@ class ControlLoop:
             self._blind += 1
             flags |= CycleFlag.NO_STATE
         # A policy must not see numbers that are not: its memory would carry them on.
-        if state is not None and bool(np.isfinite(state.position).all() and np.isfinite(state.velocity).all()):
+        if state is not None and bool(
+            np.isfinite(state.position).all() and np.isfinite(state.velocity).all()
+        ):
             with self._cadence.section("behaviour"):
                 wanted = self._behaviour.command(state, index * self._cadence.period_ns * 1e-9)
         computed_ns = self._clock.now_ns()
@@ -252,7 +179,7 @@ class ControlLoop:
         if age_ns >= 0:
             self._cadence.note_state_age(age_ns)
         with self._cadence.section("safety"):
-            cycle = self._input(operator_stop=bool(self._stop_reason), action_age_ns=computed_ns - start_ns)
+            cycle = self._input(computed_ns - start_ns)
             verdict = self._safety.step(cycle, wanted)
         flags |= self._note_verdict(verdict)
         sent, sent_ns = None, -1
@@ -265,7 +192,14 @@ class ControlLoop:
             self._robot.passive()
         with self._cadence.section("record"):
             self._hand_over(
-                index, deadline_ns, start_ns, asked=wanted, sent=sent, sent_ns=sent_ns, state_age_ns=age_ns, flags=flags
+                index,
+                deadline_ns,
+                start_ns,
+                asked=wanted,
+                sent=sent,
+                sent_ns=sent_ns,
+                state_age_ns=age_ns,
+                flags=flags,
             )
         return verdict
 
@@ -345,10 +279,10 @@ class ControlLoop:
         self._pending.append(state)
         self._states += 1
 
-    def _input(self, *, operator_stop: bool, action_age_ns: int = 0) -> CycleInput:
+    def _input(self, action_age_ns: int = 0) -> CycleInput:
         return CycleInput(
             now_ns=self._clock.now_ns(), state=self._state, action_age_ns=action_age_ns,
-            link_errors=self._robot.link_errors, operator_stop=operator_stop,
+            link_errors=self._robot.link_errors, stop_reason=self._stop_reason,
         )  # fmt: skip
 
     def _make_passive(self) -> bool:
@@ -359,7 +293,9 @@ class ControlLoop:
         if self._config.dry_run or not self._connected:
             return True
         # What it reads is not recorded: nobody knows which of the samples the passive command found.
-        return make_passive(self._robot, self._clock, self._config.passive_attempts, self._config.passive_confirm_s)
+        return make_passive(
+            self._robot, self._clock, self._config.passive_attempts, self._config.passive_confirm_s
+        )
 
     def _close(self, reason: str) -> None:
         """Hand over what is left, then disconnect."""

@@ -27,12 +27,22 @@ def make_passive(robot: Robot, clock: Clock, attempts: int = ATTEMPTS, confirm_s
     """
     for _ in range(attempts):
         try:
+            # A sample that waited since before the run also says "not armed": only what comes now counts.
+            _drain(robot)
             robot.passive()
             if _confirmed(robot, clock, confirm_s):
                 return True
         except Exception:  # Even a bug in a driver must not keep the next attempt from being made.
             continue
     return False
+
+
+def _drain(robot: Robot) -> None:
+    try:
+        while True:
+            robot.read_state(0.0)
+    except TransportTimeoutError:
+        return
 
 
 def _confirmed(robot: Robot, clock: Clock, confirm_s: float) -> bool:

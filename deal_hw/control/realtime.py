@@ -1,4 +1,4 @@
-"""What a process with a deadline asks of the operating system: priority, memory that stays, and to die with its parent."""
+"""What a process with a deadline asks of the operating system."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ def become_realtime() -> Granted:
     except OSError as err:
         words.append("default")
         warnings.append(
-            f"SCHED_FIFO was refused ({err.strerror}); expect late cycles under load. Remedy: an rtprio line for this "
-            "user in /etc/security/limits.conf, or CAP_SYS_NICE"
+            f"SCHED_FIFO was refused ({err.strerror}); expect late cycles under load. "
+            "Remedy: an rtprio line for this user in /etc/security/limits.conf, or CAP_SYS_NICE"
         )
     if (reason := _lock_memory()) is None:
         words.append("mlockall")
     else:
         warnings.append(
-            f"mlockall was refused ({reason}); a page fault may delay a cycle. Remedy: a memlock line for this user in "
-            "/etc/security/limits.conf, or CAP_IPC_LOCK"
+            f"mlockall was refused ({reason}); a page fault may delay a cycle. "
+            "Remedy: a memlock line for this user in /etc/security/limits.conf, or CAP_IPC_LOCK"
         )
     gc.collect()
     gc.freeze()
@@ -57,8 +57,8 @@ def become_realtime() -> Granted:
 
 def _lock_memory() -> str | None:
     """Lock the process's memory; return why not."""
-    # With MCL_FUTURE under a finite limit, a later allocation beyond it fails and kills the loop in the middle of a
-    # run; so future pages are locked only where there is no limit.
+    # With MCL_FUTURE under a finite limit, a later allocation beyond it fails and kills the loop in the
+    # middle of a run; so future pages are locked only where there is no limit.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or os.geteuid() == 0
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT | (_MCL_FUTURE if unlimited else 0)) == 0:
@@ -84,7 +84,7 @@ def die_with_parent(parent_pid: int) -> None:
 
 
 def kill_self_after(seconds: float) -> None:
-    """Have the kernel kill this process after a time [s] unless it has ended by itself: the last resort of an orphan."""
+    """Have the kernel kill this process after a time [s]: the last resort of an orphan."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -1,11 +1,13 @@
 """Safety between policy and motors: checks each cycle, clips what can be clipped, trips on the rest.
 
-Pure: no I/O, no torch, and time is an argument. Limits are data of the robot (``description.limits``). Clipping changes
+Pure: no I/O, no torch, and time is an argument. Limits are data of the robot (``description.limits``).
+    Clipping changes
 a command and says so; a trip sends nothing more, latches and gives its reason in words.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from dataclasses import dataclass
 
@@ -32,7 +34,8 @@ class SafetyConfig:
     link_window_s: float = 1.0
     """Time over which link errors are counted [s]."""
     link_error_share: float = 0.3
-    """Errors in the window over state frames due in it that trip; a corrupt frame counts twice (itself, its gap)."""
+    """Errors in the window over state frames due in it that trip; a corrupt frame counts twice (itself, its
+    gap)."""
     confirm_s: float = 0.2
     """The device must report itself armed within this time after arming [s]."""
 
@@ -51,14 +54,14 @@ class CycleInput:
         state: The newest state; None before the first.
         action_age_ns: How long the policy took [ns].
         link_errors: Link errors since the connection, as the robot counts them.
-        operator_stop: Whether the operator asked to stop.
+        stop_reason: Why the operator, or somebody for them, asked to stop; "" where nobody did.
     """
 
     now_ns: int
     state: RobotState | None
     action_age_ns: int = 0
     link_errors: int = 0
-    operator_stop: bool = False
+    stop_reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +97,9 @@ class Safety:
         self._filter = SafetyFilter(description)
         self._machine = SafetyMachine(round(description.limits.ease_in_s * 1e9))
         self._index = list(description.actuated_index)
-        self._errors_due = self._config.link_error_share * self._config.link_window_s * description.state_rate_hz
+        self._errors_due = (
+            self._config.link_error_share * self._config.link_window_s * description.state_rate_hz
+        )
         self.reason = ""
         """Why it is passive, in words."""
         self._reset(0)
@@ -167,10 +172,7 @@ class Safety:
         share = self._machine.authority(now_ns)
         if share < 1.0:
             eased = start + share * (wanted.position_target - start)
-            wanted = JointCommand(
-                eased, wanted.velocity_target, wanted.stiffness, wanted.damping, wanted.effort, wanted.effort_limit,
-                wanted.speed_limit,
-            )  # fmt: skip
+            wanted = dataclasses.replace(wanted, position_target=eased)
         command, clipped = self._filter.clip(wanted, previous, measured)
         self._previous = command.position_target
         return command, clipped
@@ -179,8 +181,8 @@ class Safety:
         """Return flag name -> reason in words for all that is wrong."""
         found: dict[str, str] = {}
         limits = self._description.limits
-        if cycle.operator_stop:
-            found["operator_stop"] = "stopped by the operator"
+        if cycle.stop_reason:
+            found["operator_stop"] = cycle.stop_reason
         if cycle.state is None:
             found["no_state"] = "no state sample has arrived"
         else:
@@ -196,8 +198,8 @@ class Safety:
         return found
 
     def _check_age(self, now_ns: int, state: RobotState, found: dict[str, str]) -> None:
-        # Data that waited in a buffer carry a fresh receive stamp: only the device's clock gives them away. So the age
-        # counts from the least transit time seen, which may creep up by the clocks' drift.
+        # Data that waited in a buffer carry a fresh receive stamp: only the device's clock gives them away.
+        # So the age counts from the least transit time seen, which may creep up by the clocks' drift.
         offset = state.receive_ns - state.device_ns
         if self._offset_ns is None:
             self._offset_ns, self._offset_at_ns = offset, state.receive_ns
@@ -252,5 +254,5 @@ class Safety:
         count = errors - window[0][1]
         if count > self._errors_due:
             found["link_errors"] = (
-                f"{count} link errors in the last {self._config.link_window_s:g} s: check cable and connectors"
+                f"{count} link errors in {self._config.link_window_s:g} s: check cable and connectors"
             )

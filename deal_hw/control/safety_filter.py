@@ -13,14 +13,14 @@ def is_finite(command: JointCommand) -> bool:
     return all(
         bool(np.isfinite(part).all())
         for part in (
-            command.position_target, command.velocity_target, command.stiffness, command.damping, command.effort,
-            command.effort_limit, command.speed_limit,
+            command.position_target, command.velocity_target, command.stiffness, command.damping,
+            command.effort, command.effort_limit, command.speed_limit,
         )
     )  # fmt: skip
 
 
 class SafetyFilter:
-    """Clips commands. Limits come from ``description.limits``; arrays are (A,) in the order of the actuated joints."""
+    """Clips commands to ``description.limits``; arrays are (A,), in the order of the actuated joints."""
 
     def __init__(self, description: RobotDescription) -> None:
         limits = description.limits
@@ -59,7 +59,8 @@ class SafetyFilter:
         target = bound("target_distance", target, measured - self._distance, measured + self._distance)
         target = bound("target", target, self._low, self._high)
         parts = {
-            name: bound(name, getattr(wanted, name), np.zeros_like(high), high) for name, high in self._maxima.items()
+            name: bound(name, getattr(wanted, name), np.zeros_like(high), high)
+            for name, high in self._maxima.items()
         }
         speed, effort = self._maxima["speed_limit"], self._maxima["effort_limit"]
         velocity = bound("velocity_target", wanted.velocity_target, -speed, speed)

@@ -4,7 +4,8 @@
                           |                  |
                           +--- any flag -----+--> PASSIVE (latched) --rearm--> DISARMED
 
-Nothing leaves PASSIVE but an explicit re-arm, and a re-arm leads to DISARMED only: arming is a second decision.
+Nothing leaves PASSIVE but an explicit re-arm, and a re-arm leads to DISARMED only: arming is a second
+decision.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class SafetyState(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyFlags:
-    """What can be wrong in one cycle; False means no failure. The order is the order in which reasons are named.
+    """What can be wrong in one cycle; False means no failure. Reasons are named in this order.
 
     Attributes:
         operator_stop: The operator asked to stop.

@@ -1,8 +1,8 @@
 """The supervisor: starts the control process, watches it, and makes the robot passive where it no longer can.
 
-It owns the port for as long as it lives, so that nobody else takes the robot, and so that the passive command can
-still be sent once the control process is dead. It never sends while the control process lives: two writers on one port
-would tear each other's frames.
+It owns the port for as long as it lives, so that nobody else takes the robot, and so that the passive command
+can still be sent once the control process is dead. It never sends while the control process lives: two
+writers on one port would tear each other's frames.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Supervisor:
         module: The control process's module, run with ``python -m``.
         plan: Its orders, as plain JSON values; it reads them from its standard input.
         port_fd: The open port, which it inherits.
-        passive: Sends the passive command through the port and returns whether the robot confirmed it. Called only
-            once the control process is dead.
+        passive: Sends the passive command through the port and returns whether the robot confirmed it. Called
+            only once the control process is dead.
         recorder: The recorder, ready; None to record nothing.
         on_beat: Called with each heartbeat.
         clock: For heartbeats; the machine's monotonic clock by default.
@@ -117,16 +117,25 @@ class Supervisor:
     def _start(self) -> StatusReceiver:
         sender, receiver = socket_pair()
         inherited = [self._port_fd, sender.fileno()]
-        plan = {**self._plan, "port_fd": self._port_fd, "status_fd": sender.fileno(), "parent_pid": os.getpid()}
+        plan = {
+            **self._plan,
+            "port_fd": self._port_fd,
+            "status_fd": sender.fileno(),
+            "parent_pid": os.getpid(),
+        }
         if self._recorder is not None:
             record = self._recorder.control_socket
             record.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
             inherited.append(record.fileno())
             plan["record_fd"] = record.fileno()
         with sender:
-            # A process group of its own: Ctrl-C in the terminal reaches the supervisor alone, which passes it on.
+            # A process group of its own: Ctrl-C in the terminal reaches the supervisor alone, which passes it
+            # on.
             child = subprocess.Popen(
-                [sys.executable, "-m", self._module], pass_fds=inherited, stdin=subprocess.PIPE, process_group=0
+                [sys.executable, "-m", self._module],
+                pass_fds=inherited,
+                stdin=subprocess.PIPE,
+                process_group=0,
             )
         self._child = child
         if self._recorder is not None:
@@ -145,7 +154,8 @@ class Supervisor:
             if select.select([status], [], [], _POLL_S)[0]:
                 while (message := status.receive()) is not None:
                     self._take(message)
-            # Only after a wait that brought nothing: a supervisor that was itself held up finds old beats first.
+            # Only after a wait that brought nothing: a supervisor that was itself held up finds old beats
+            # first.
             elif self._clock.now_ns() > self._stale_ns:
                 self._kill(f"it gave no sign of life while {self._phase}")
                 return
@@ -166,7 +176,7 @@ class Supervisor:
             self._child.kill()
 
     def _reap(self) -> int:
-        """Return the exit code of the control process once it is dead; it has said its last word or never will."""
+        """Return the exit code of the control process, which has said its last word or never will."""
         child = self._child
         if child is None:
             return 0

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import zstandard
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
@@ -23,9 +23,18 @@ _PREFIX = struct.Struct("<BQ")
 _CHUNK_MARK = struct.pack("<I", 4) + b"zstd"
 _CHUNK_MARK_OFFSET = _PREFIX.size + 8 + 8 + 8 + 4
 """From a chunk record's first byte to its compression name: prefix, start, end, uncompressed size, CRC."""
-# A flipped bit in a compressed frame's head can announce any size, hence MemoryError.
-_PARSE_ERRORS = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, MemoryError)
-_OPCODES = frozenset(int(opcode) for opcode in Opcode)
+# A flipped bit in a compressed frame's head can announce any size, hence the last two.
+_PARSE_ERRORS = (
+    McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, MemoryError, OverflowError,
+)  # fmt: skip
+_SUMMARY_ONLY = {
+    Opcode.STATISTICS,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+    Opcode.FOOTER,
+}
 _TYPES: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
@@ -76,6 +85,7 @@ def scan(data: bytes) -> Iterator[Found | Lost]:
     records). Records of other kinds (message indexes, summary) are passed over: a writer makes them anew.
     """
     offset = len(MCAP0_MAGIC)
+    in_data_section = True
     while True:
         if offset + _PREFIX.size > len(data):
             yield Lost(offset, len(data) - offset, "the file ends without a footer", torn=True)
@@ -83,20 +93,21 @@ def scan(data: bytes) -> Iterator[Found | Lost]:
         opcode, size = _PREFIX.unpack_from(data, offset)
         end = offset + _PREFIX.size + size
         result = _parse(opcode, data[offset + _PREFIX.size : end], offset) if end <= len(data) else None
+        if not in_data_section and result is None:
+            yield Lost(offset, len(data) - offset, "the index is cut off", torn=True)
+            return
+        if opcode in _SUMMARY_ONLY and in_data_section:
+            result = "a record out of place"
         if isinstance(result, str) or result is None:
-            # The length may be what is wrong, so the next readable chunk decides where to go on.
-            resumed = _next_chunk(data, offset + 1)
-            torn = result is None and resumed is None
-            if isinstance(result, str) and (resumed is None or resumed > end):
-                resumed = end
-            stop = len(data) if resumed is None else resumed
-            yield Lost(offset, stop - offset, result or "a record that is cut off", torn)
-            if resumed is None:
+            lost = _skip(data, offset, None if result is None else end, result)
+            yield lost
+            if lost.torn:
                 return
-            offset = resumed
+            offset += lost.size
             continue
         if isinstance(result, Found):
             yield result
+            in_data_section = in_data_section and not isinstance(result.record, DataEnd)
             if isinstance(result.record, Footer):
                 if data[end:] != MCAP0_MAGIC:
                     yield Lost(end, len(data) - end, "the file does not end after its footer", torn=True)
@@ -104,18 +115,34 @@ def scan(data: bytes) -> Iterator[Found | Lost]:
         offset = end
 
 
+def _skip(data: bytes, offset: int, end: int | None, reason: str | None) -> Lost:
+    """Return what to pass over from an unusable record on; its end is None where that lies outside the file.
+
+    The length may be what is wrong: the next readable chunk decides where to go on if it comes earlier.
+    """
+    chunk = _next_chunk(data, offset + 1)
+    stops = [stop for stop in (chunk, end) if stop is not None]
+    stop = min(stops, default=len(data))
+    return Lost(offset, stop - offset, reason or "a record that is cut off", torn=not stops)
+
+
 def _parse(opcode: int, body: bytes, offset: int) -> Found | str | bool:
     """Return the record, why it is unusable, or True for a kind that is passed over."""
     kind = _TYPES.get(opcode)
     if kind is None:
-        sound = opcode in _OPCODES and (opcode != Opcode.MESSAGE_INDEX or _is_message_index(body))
+        sound = _is_message_index(body) if opcode == Opcode.MESSAGE_INDEX else opcode in _SUMMARY_ONLY
         return sound or "a record that makes no sense"
     try:
         record: McapRecord = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
-        contents = tuple(breakup_chunk(record, validate_crc=True)) if isinstance(record, Chunk) else ()
+        if isinstance(record, Chunk):
+            return Found(offset, record, tuple(breakup_chunk(record, validate_crc=True)))
+        builder = RecordBuilder()
+        record.write(builder)
+        # The library reads past the end of a record without complaint; only the way back shows it.
+        same = builder.end()[_PREFIX.size :] == body  # type: ignore[no-untyped-call]
     except _PARSE_ERRORS as error:
         return f"a damaged {kind.__name__.lower()} ({str(error) or type(error).__name__})"
-    return Found(offset, record, contents)
+    return Found(offset, record) if same else f"a damaged {kind.__name__.lower()}"
 
 
 def _is_message_index(body: bytes) -> bool:

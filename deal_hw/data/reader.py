@@ -104,10 +104,8 @@ def read_episode(path: Path) -> Episode:
 
 def read_wire(path: Path) -> Iterator[Message]:
     """Yield the raw messages of an episode in order; channels as the robot named them."""
-    for channel, row in _decoded(Path(path)):
-        if channel.topic.startswith("/wire/"):
-            stamp_ns, payload = row
-            yield Message(channel.topic.removeprefix("/wire/"), payload, stamp_ns)
+    for channel, (stamp_ns, payload) in _wire_rows(Path(path)):
+        yield Message(channel, payload, stamp_ns)
 
 
 def _load(path: Path) -> bytes:
@@ -133,21 +131,26 @@ def _records(path: Path) -> Iterator[Found]:
         yield item
 
 
-def _decoded(path: Path) -> Iterator[tuple[Channel, tuple[Any, ...]]]:
+def _wire_rows(path: Path) -> Iterator[tuple[str, tuple[Any, ...]]]:
     channels: dict[int, Channel] = {}
     for found in _records(path):
         for record in found.contents:
             if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, McapMessage):
-                yield _decode(channels, record)
+                channel = _channel(channels, record)
+                if channel.topic.startswith("/wire/"):
+                    yield (
+                        channel.topic.removeprefix("/wire/"),
+                        message_type(channel.topic).decode(record.data),
+                    )
 
 
-def _decode(channels: Mapping[int, Channel], message: McapMessage) -> tuple[Channel, tuple[Any, ...]]:
+def _channel(channels: Mapping[int, Channel], message: McapMessage) -> Channel:
     channel = channels.get(message.channel_id)
     if channel is None:
         raise DatasetError(f"a message on channel {message.channel_id}, which the file does not name")
-    return channel, message_type(channel.topic).decode(message.data)
+    return channel
 
 
 def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]]]]:
@@ -159,9 +162,9 @@ def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]
             preamble = found.record.metadata
         channels.update({record.id: record for record in found.contents if isinstance(record, Channel)})
         for message in messages(found):
-            topic = channels[message.channel_id].topic if message.channel_id in channels else ""
-            if not topic.startswith("/wire/"):
-                rows[topic].append(_decode(channels, message)[1])
+            channel = _channel(channels, message)
+            if channel.topic in rows and not channel.topic.startswith("/wire/"):
+                rows[channel.topic].append(message_type(channel.topic).decode(message.data))
     if preamble is None:
         raise DatasetError(
             f"{path} does not say what it holds (no metadata {METADATA_NAME!r}): not by deal-hw"

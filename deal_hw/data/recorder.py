@@ -94,6 +94,8 @@ class EpisodeRecorder:
         Raises:
             DatasetError: The disk is full or gone; what was flushed before is kept and closed properly.
         """
+        # Counted from the cycle's own stamp: after a stall a queue is taken at once, and is old already.
+        self._wait_since(record.start_ns)
         for message in record.wire:
             self._add(
                 f"/wire/{message.channel}", message.stamp_ns, WIRE.encode(message.stamp_ns, message.payload)
@@ -174,6 +176,10 @@ class EpisodeRecorder:
             "written before is kept. Free some space, then look at it with: deal-hw data info"
         )
 
+    def _wait_since(self, stamp_ns: int) -> None:
+        if self._oldest_ns < 0:
+            self._oldest_ns = min(max(stamp_ns, 0), self._clock.now_ns())
+
     def _preamble(self) -> dict[str, str]:
         host_ns = self._clock.now_ns()
         wall = datetime.datetime.now(datetime.UTC)
@@ -208,8 +214,7 @@ class EpisodeRecorder:
         if topic not in self._channels:
             kind = message_type(topic)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind.name])
-        if self._oldest_ns < 0:
-            self._oldest_ns = self._clock.now_ns()
+        self._wait_since(self._clock.now_ns())
         stamp_ns = max(stamp_ns, 0)
         self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
 

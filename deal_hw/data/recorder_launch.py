@@ -88,6 +88,7 @@ class RecorderHandle:
         if not self._ended:
             self._errors.append(f"the recorder did not end within {timeout_s} s and was killed")
             self.process.kill()
+            self._ended = True
         code = self.process.wait()
         if self._status >= 0:
             os.close(self._status)

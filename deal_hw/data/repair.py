@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from mcap.records import Channel, DataEnd, Header, Message, Metadata, Schema
+from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from deal_hw.data.mcap_scan import Found, Lost, messages, scan
@@ -158,7 +158,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
     first_ns = last_ns = None
     chunks = count = 0
     hole = False
-    checksum: str | None = None
+    mismatches: list[str] = []
     for item in scan(data):
         if isinstance(item, Lost):
             losses.append(item)
@@ -167,12 +167,17 @@ def _inspect(path: Path, data: bytes) -> _Findings:
         if isinstance(item.record, Header):
             header = item.record
         elif isinstance(item.record, DataEnd):
-            checksum = _checksum(data, item.offset, item.record)
-        for record in (item.record, *item.contents):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
+            if item.record.data_section_crc not in (0, zlib.crc32(data[: item.offset])):
+                mismatches.append("the checksum over the whole recording does not match")
+        elif isinstance(item.record, Footer) and _is_index_damaged(data, item.offset, item.record):
+            mismatches.append("the checksum of the index does not match")
+        # Chunks have checksums of their own; the index only fills in what nothing else knows.
+        if isinstance(item.record, Schema):
+            schemas.setdefault(item.record.id, item.record)
+        elif isinstance(item.record, Channel):
+            channels.setdefault(item.record.id, item.record)
+        schemas.update({record.id: record for record in item.contents if isinstance(record, Schema)})
+        channels.update({record.id: record for record in item.contents if isinstance(record, Channel)})
         stamps = [message.log_time for message in messages(item)]
         if stamps:
             chunks, count = chunks + 1, count + len(stamps)
@@ -185,7 +190,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
             f"{path} was written by {header.library!r}; only recordings of deal-hw can be mended"
         )
     damaged = [f"{loss.reason} at byte {loss.offset}" for loss in losses if not loss.torn]
-    damaged += [checksum] if checksum and not damaged else []
+    damaged = damaged or mismatches
     report = RepairReport(
         path=path, repaired=False, torn=any(loss.torn for loss in losses), messages=count, chunks=chunks,
         damaged=tuple(damaged), lost_bytes=sum(loss.size for loss in losses), lost_spans_s=tuple(spans),
@@ -193,10 +198,10 @@ def _inspect(path: Path, data: bytes) -> _Findings:
     return _Findings(report, header, schemas, channels)
 
 
-def _checksum(data: bytes, offset: int, end: DataEnd) -> str | None:
-    if end.data_section_crc in (0, zlib.crc32(data[:offset])):
-        return None
-    return "the checksum over the whole recording does not match"
+def _is_index_damaged(data: bytes, offset: int, footer: Footer) -> bool:
+    # The checksum covers the summary and the footer up to the checksum itself: prefix and two offsets.
+    covered = data[footer.summary_start or offset : offset + 9 + 16]
+    return footer.summary_crc not in (0, zlib.crc32(covered))
 
 
 def _known() -> tuple[dict[int, Schema], dict[int, Channel]]:

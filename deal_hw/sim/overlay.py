@@ -1,8 +1,8 @@
 """Simulation beside a recording: open-loop predictions that restart from the measured state every window.
 
-A replay of the whole recording says little: an unstable robot's leaves it within a second, whatever the model. Over
-a window of a fraction of a second the error is the model's. It is meant to be looked at, so nothing is fitted here:
-each window starts from measured positions, smoothed over a few samples around its start.
+A replay of the whole recording says little: an unstable robot's leaves it within a second, whatever the
+model. Over a window of a fraction of a second the error is the model's. It is meant to be looked at, so
+nothing is fitted here: each window starts from measured positions, smoothed over a few samples around it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
 DEFAULT_WINDOW_S = 0.2
 DEFAULT_SMOOTHING_S = 0.04
-"""Between 0.03 s and 0.06 s the true parameters of simulated noisy cart-poles predict best; far more bends the truth."""
+"""Between 0.03 s and 0.06 s the true parameters of simulated noisy cart-poles predict best."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,8 @@ class Prediction:
     Attributes:
         theta: The parameters, (K,).
         latency_s: Total latency [s].
-        position: Positions at each window's start and its H samples, (W, H + 1, J); NaN where the simulation diverged.
+        position: Positions at each window's start and its H samples, (W, H + 1, J); NaN where the simulation
+            diverged.
         velocity: Velocities, as the robot would report them, (W, H + 1, J).
         window_rmse: Root mean square position error of each window, (W, J).
         position_nrmse: Root mean square position error over the range of the signal, (J,).
@@ -55,7 +56,8 @@ class Overlay:
 
     Attributes:
         joint_names: The J joints.
-        sample: Index into the recording of each point, (W, H + 1); a window's last is often the next one's first.
+        sample: Index into the recording of each point, (W, H + 1); a window's last is often the
+            next one's first.
         device_s: Device time of each point, (W, H + 1) [s].
         receive_s: Host time of each point, (W, H + 1) [s].
         position: Measured positions, (W, H + 1, J).
@@ -81,6 +83,13 @@ class Overlay:
         """Return predicted minus measured velocities, (W, H + 1, J)."""
         return self.predictions[name].velocity - self.velocity
 
+    def worst_moment_s(self, name: str) -> float:
+        """Return the device time at which a set's positions are farthest off [s], joints by their range."""
+        spread = np.ptp(self.position.reshape(-1, self.position.shape[2]), axis=0)
+        share = np.abs(self.position_error(name)[:, 1:]) / np.where(spread > 0, spread, np.inf)
+        far = np.nan_to_num(share).sum(axis=2)
+        return float(self.device_s[:, 1:].flat[int(np.argmax(far))])
+
     @staticmethod
     def broken(values: FloatArray) -> FloatArray:
         """Join windows, (W, H + 1, J), to one trace with a NaN row after each, (W * (H + 2), J)."""
@@ -89,7 +98,7 @@ class Overlay:
 
     @staticmethod
     def broken_time(time_s: FloatArray) -> FloatArray:
-        """Return the times that belong to :meth:`broken`, (W * (H + 2),); breaks stand at their window's end."""
+        """Return the times that belong to :meth:`broken`, (W * (H + 2),); breaks stand at windows' ends."""
         return np.concatenate([time_s, time_s[:, -1:]], axis=1).ravel()
 
 
@@ -115,7 +124,8 @@ def compute_overlay(
         smoothing_s: Half width of the fit around each start [s]; 0 takes the reported state as it is.
 
     Raises:
-        ConfigurationError: A window shorter than a sample, a negative time, or values that do not fit the space.
+        ConfigurationError: A window shorter than a sample, a negative time, or values that do not fit the
+            space.
         InsufficientDataError: Nowhere are there enough armed samples in a row.
     """
     length = _window_samples(window_s, description)
@@ -162,7 +172,7 @@ def compute_overlay(
 def reported_velocity_window(trajectory: Trajectory, description: RobotDescription) -> float:
     """Return over which time the robot differences positions to report velocities [s]; 0 where it does not.
 
-    Such velocities are late by half that time, so a prediction must be reported the same way before they are compared.
+    Such velocities are late by half that time, so predictions must be reported the same way to be compared.
     """
     window_s = description.sensor.velocity_window_s
     lag = round(window_s * description.state_rate_hz)
@@ -186,13 +196,18 @@ def _window_samples(window_s: float, description: RobotDescription) -> int:
     return length
 
 
-def _check(space: ParameterSpace, sets: Mapping[str, FloatArray], latency_s: float, smoothing_s: float) -> None:
+def _check(
+    space: ParameterSpace, sets: Mapping[str, FloatArray], latency_s: float, smoothing_s: float
+) -> None:
     if not sets:
-        raise ConfigurationError("an overlay needs at least one parameter set, such as {'nominal': space.nominal}")
+        raise ConfigurationError(
+            "an overlay needs at least one parameter set, such as {'nominal': space.nominal}"
+        )
     for name, theta in sets.items():
         if np.shape(theta) != (len(space),):
             raise ConfigurationError(
-                f"parameter set {name!r} has shape {np.shape(theta)}; the space has {len(space)} free parameters"
+                f"parameter set {name!r} has shape {np.shape(theta)}; the space has {len(space)} free "
+                "parameters"
             )
     for what, value in (("latency", latency_s), ("smoothing time", smoothing_s)):
         if not (np.isfinite(value) and value >= 0):
@@ -208,12 +223,14 @@ def _first_row(trajectory: Trajectory) -> int:
 
 
 def _smoothed_starts(trajectory: Trajectory, rows: IntArray, half_width_s: float) -> FloatArray:
-    """Return position, velocity and acceleration at each row, (W, 3, J): a parabola fitted over +-half_width_s."""
+    """Return position, velocity, acceleration at each row, (W, 3, J): a parabola over +-half_width_s."""
     out = np.zeros((len(rows), 3, len(trajectory.joint_names)))
     for w, row in enumerate(rows):
         out[w, 0], out[w, 1] = trajectory.position[row], trajectory.velocity[row]
         now = trajectory.device_s[row]
-        low, high = np.searchsorted(trajectory.device_s, (now - half_width_s - 1e-9, now + half_width_s + 1e-9))
+        low, high = np.searchsorted(
+            trajectory.device_s, (now - half_width_s - 1e-9, now + half_width_s + 1e-9)
+        )
         near = low + np.flatnonzero(np.isfinite(trajectory.position[low:high]).all(axis=1))
         # Four points leave a parabola one degree of freedom to smooth with.
         if half_width_s > 0 and len(near) >= 4:
@@ -227,7 +244,7 @@ def _smoothed_starts(trajectory: Trajectory, rows: IntArray, half_width_s: float
 def _as_reported(
     position: FloatArray, start: FloatArray, windows: Windows, step_s: float, velocity_window_s: float
 ) -> FloatArray:
-    """Return velocities as differences of positions (W, H + 1, J); before a start its parabola stands in for them."""
+    """Return velocities as differences of positions, (W, H + 1, J); a parabola stands in before a start."""
     sample_s = windows.stride * step_s
     lag = max(round(velocity_window_s / sample_s), 1)
     before = -sample_s * np.arange(lag, 0, -1)[:, None]

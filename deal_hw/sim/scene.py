@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes of its MuJoCo model and where its bodies are, as plain arrays for a viewer."""
+"""What a robot looks like: the shapes of its model and where its bodies are, as plain arrays for a viewer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ class Shape:
         name: Unique name.
         body: Index of the body it is fixed to; 0 is the world.
         kind: What it is.
-        size: Half extents (box, ellipsoid), or radius and half length along z (sphere, capsule, cylinder), (3,) [m].
+        size: Half extents (box, ellipsoid), or radius and half length along z (sphere, capsule, cylinder),
+            (3,) [m].
         position: Of the centre, in the body's frame, (3,) [m].
         quaternion: In the body's frame, w x y z, (4,).
         color: Red, green, blue, alpha from 0 to 1, (4,).
@@ -107,8 +108,8 @@ def body_poses(robot: RobotModel, position: FloatArray) -> tuple[FloatArray, Flo
         position: Joint positions, (T, J) [m or rad].
 
     Returns:
-        Positions (T, B, 3) [m] and quaternions w x y z (T, B, 4) of the B bodies in the world; NaN where a joint
-        position is not finite.
+        Positions (T, B, 3) [m] and quaternions w x y z (T, B, 4) of the B bodies in the world; NaN where a
+        joint position is not finite.
     """
     model = robot.model
     data = mujoco.MjData(model)

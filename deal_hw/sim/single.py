@@ -22,7 +22,9 @@ class SingleSimulation:
     def __init__(self, mjcf: Path) -> None:
         self._model = mujoco.MjModel.from_xml_path(str(mjcf))
         if self._model.nq != self._model.nv:
-            raise ConfigurationError(f"{mjcf}: only slide and hinge joints are supported (nq {self._model.nq}, nv {self._model.nv})")
+            raise ConfigurationError(
+                f"{mjcf}: only slide and hinge joints (got nq {self._model.nq}, nv {self._model.nv})"
+            )
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
         self._data = mujoco.MjData(self._model)
         self._qpos, self._qvel = self._data.qpos, self._data.qvel
@@ -42,9 +44,14 @@ class SingleSimulation:
         self._refresh()
 
     def set_dof(
-        self, joint: str, *, damping: float | None = None, frictionloss: float | None = None, armature: float | None = None
+        self,
+        joint: str,
+        *,
+        damping: float | None = None,
+        frictionloss: float | None = None,
+        armature: float | None = None,
     ) -> None:
-        """Set what resists a joint: damping [N*s/m or N*m*s/rad], frictionloss [N or N*m], armature [kg or kg*m^2]."""
+        """Set what resists a joint; SI units of sliding or turning joints."""
         index = self._id(mujoco.mjtObj.mjOBJ_JOINT, "joint", joint)
         if damping is not None:
             self._model.dof_damping[index] = damping
@@ -83,11 +90,14 @@ class SingleSimulation:
         index = int(mujoco.mj_name2id(self._model, kind, name))
         if index < 0:
             count = self._model.nbody if kind == mujoco.mjtObj.mjOBJ_BODY else self._model.njnt
-            raise UnknownNameError(what, name, (mujoco.mj_id2name(self._model, kind, i) or "" for i in range(count)))
+            raise UnknownNameError(
+                what, name, (mujoco.mj_id2name(self._model, kind, i) or "" for i in range(count))
+            )
         return index
 
     def _refresh(self) -> None:
-        # Constraint regularisation depends on inverse weights that only mj_setConst derives; it overwrites qpos.
+        # Constraint regularisation depends on inverse weights that only mj_setConst derives; it overwrites
+        # qpos.
         position, velocity = self.position(), self.velocity()
         mujoco.mj_setConst(self._model, self._data)
         self.set_state(position, velocity)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deal_hw.clock import Clock
 from deal_hw.errors import ConfigurationError, TransportLostError
 from deal_hw.transport import Message, Transport
 
@@ -44,7 +45,9 @@ class FrameFaults:
         delimiter: End of a frame; None: every call is one frame.
     """
 
-    def __init__(self, rates: FaultRates, rng: np.random.Generator, delimiter: bytes | None = b"\x00") -> None:
+    def __init__(
+        self, rates: FaultRates, rng: np.random.Generator, delimiter: bytes | None = b"\x00"
+    ) -> None:
         self.corrupted = self.dropped = self.duplicated = 0
         self._rates = rates
         self._rng = rng
@@ -59,7 +62,11 @@ class FrameFaults:
         return out + frames[-1]
 
     def _frame(self, frame: bytes) -> bytes:
-        corrupt, drop, duplicate = self._rng.random(3) < (self._rates.corrupt, self._rates.drop, self._rates.duplicate)
+        corrupt, drop, duplicate = self._rng.random(3) < (
+            self._rates.corrupt,
+            self._rates.drop,
+            self._rates.duplicate,
+        )
         if drop:
             self.dropped += 1
             return b""
@@ -81,14 +88,20 @@ class FaultyTransport(Transport):
         inner: The transport that works.
         received: What happens to messages from the device.
         sent: What happens to messages to the device.
+        clock: Measures waiting across lost messages; without it each lost message starts the wait again.
     """
 
     def __init__(
-        self, inner: Transport, received: FrameFaults | None = None, sent: FrameFaults | None = None
+        self,
+        inner: Transport,
+        received: FrameFaults | None = None,
+        sent: FrameFaults | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self.inner = inner
         self._received = received
         self._sent = sent
+        self._clock = clock
         self._unplugged = False
 
     def unplug(self) -> None:
@@ -112,10 +125,14 @@ class FaultyTransport(Transport):
             self.inner.send(Message(message.channel, payload, message.stamp_ns))
 
     def receive(self, timeout_s: float) -> Message:
-        """Receive what is left of a message; a lost one is skipped and the wait starts again."""
+        """Receive what is left of a message; a lost one is as if it had never come."""
+        start_ns = self._clock.now_ns() if self._clock else 0
+        left_s = timeout_s
         while True:
             self._check()
-            message = self.inner.receive(timeout_s)
+            message = self.inner.receive(left_s)
+            if self._clock:
+                left_s = max(0.0, timeout_s - (self._clock.now_ns() - start_ns) / 1e9)
             payload = message.payload if self._received is None else self._received.apply(message.payload)
             if payload:
                 return Message(message.channel, payload, message.stamp_ns)

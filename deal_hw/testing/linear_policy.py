@@ -1,4 +1,4 @@
-"""A policy without a network: state feedback. For tests of what runs policies, and as a reference for trained ones."""
+"""A policy without a network: state feedback, for tests of what runs policies."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ def feedback_spec(description: RobotDescription, action_scale: float = 0.25) -> 
         robot=description.name,
         joint_names=description.joint_names,
         actuated=description.actuated,
-        observation=tuple(ObservationTerm(q, name, 1.0) for q in quantities for name in description.joint_names),
+        observation=tuple(
+            ObservationTerm(q, name, 1.0) for q in quantities for name in description.joint_names
+        ),
         action_scale=(action_scale,) * len(description.actuated),
         default_position=description.default_position,
         stiffness=description.stiffness,
@@ -38,7 +40,7 @@ class LinearPolicy:
     Args:
         spec: What it observes.
         gains: Target per observed quantity, (O,) [m or rad per unit].
-        disturb: Called with the number of the call, from 0, and the action; returns the action to give instead.
+        disturb: Called with the number of the call, from 0, and the action; returns what to give instead.
     """
 
     def __init__(

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from deal_hw.errors import SafetyError, TransportError, TransportLostError, VersionMismatchError, WrongDeviceError
+from deal_hw.errors import (
+    SafetyError,
+    TransportError,
+    TransportLostError,
+    VersionMismatchError,
+    WrongDeviceError,
+)
 from deal_hw.robot import Robot
 from deal_hw.types import JointCommand, RobotState, Status
 
@@ -84,7 +91,7 @@ class RobotSuite:
             bench.foreign.connect()
 
     def test_another_version_is_refused(self, bench: RobotBench) -> None:
-        """A device with another protocol version raises VersionMismatchError, whose text says what to update."""
+        """Another protocol version raises VersionMismatchError, whose text says what to update."""
         with pytest.raises(VersionMismatchError, match="update"):
             bench.newer.connect()
 
@@ -104,7 +111,7 @@ class RobotSuite:
                 assert values.shape == (joints,)
                 assert np.isfinite(values).all()
             assert (state.command_sequence, state.command_age_ns) == (-1, -1)
-        for earlier, later in zip(states, states[1:], strict=False):
+        for earlier, later in itertools.pairwise(states):
             assert later.sequence > earlier.sequence
             assert later.device_ns > earlier.device_ns
             assert later.receive_ns >= earlier.receive_ns
@@ -118,7 +125,7 @@ class RobotSuite:
         assert not state.status & (Status.WATCHDOG | Status.FAULT | Status.HOMING)
 
     def test_a_command_returns_what_was_sent(self, armed: Robot) -> None:
-        """The rounded command is close to the wish, and sending it again changes nothing: it is on the wire's grid."""
+        """The rounded command is close to the wish, and sending it again changes nothing."""
         sent = armed.send_command(default_command(armed, target=0.012345678))
         again = armed.send_command(sent)
         np.testing.assert_allclose(sent.position_target, 0.012345678, atol=1e-3)

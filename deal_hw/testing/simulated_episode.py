@@ -1,6 +1,6 @@
-"""A cart-pole's recording without a robot: balanced in simulation, exactly as the device would act and report.
+"""A cart-pole's recording without a robot: balanced in simulation, as the device would act and report.
 
-For tests of what reads recordings. There is no wire in it: the emulator is the thing for tests of drivers and control.
+For tests of what reads recordings. There is no wire in it: for drivers and control there is the emulator.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from deal_hw.sim.model import load_model
 from deal_hw.types import Event, FloatArray, Status, Trajectory
 
 BALANCE_GAINS = (1.65, 1.04, 0.475, 0.171)
-"""Linear-quadratic regulator of the nominal cart-pole at 50 Hz: target per cart position, angle and their rates."""
+"""Linear-quadratic regulator of the nominal cart-pole at 50 Hz: per cart position, angle and their rates."""
 RECEIVED_AFTER_S = 0.4e-3
 """A command arrives this long after the device sent the sample that it answers."""
 
@@ -44,7 +44,11 @@ def simulated_episode(
     batch = ServoBatch(load_model(description), space, 1, threads=1)
     batch.set_parameters(np.asarray(theta, dtype=float)[None])
     batch.set_state(np.array([0.02, 0.05]), np.zeros(2))
-    rate = float(batch.servo_factor("servo_speed_limit")[0, 0]) * description.speed_limit[0] / description.device_rate_hz
+    rate = (
+        float(batch.servo_factor("servo_speed_limit")[0, 0])
+        * description.speed_limit[0]
+        / description.device_rate_hz
+    )
     stride = round(description.device_rate_hz / description.state_rate_hz)
     control_every = description.steps_per_control
     ticks = round(seconds * description.device_rate_hz) // stride * stride
@@ -62,7 +66,9 @@ def simulated_episode(
             wish = 0.02 if k < 5 * control_every else _balance(true_x[i], true_v[i], goals[k])
             targets.append(float(np.clip(wish, *description.limits.target[0])))
         for tick in range(k, k + stride):
-            index = (tick - 1) // control_every  # Received during the tick at which it was sent: acts from the next.
+            index = (
+                tick - 1
+            ) // control_every  # Received during the tick at which it was sent: acts from the next.
             goal = targets[index] if index >= 0 else 0.02
             before = setpoint[tick + latency_ticks - 1] if tick + latency_ticks else 0.02
             setpoint[tick + latency_ticks] = before + np.clip(goal - before, -rate, rate)
@@ -99,7 +105,9 @@ def _report(
     in_force = np.ceil(device_s * description.control_rate_hz - 1e-9).astype(np.int64) - 1
     age = np.where(in_force >= 0, device_s - sent_s[np.maximum(in_force, 0)], np.nan)
     clamped = np.abs(effort[:, 0]) >= description.effort_limit[0]
-    status = np.where(clamped, int(Status.ARMED | Status.HOMED | Status.EFFORT_CLAMPED), int(Status.ARMED | Status.HOMED))
+    status = np.where(
+        clamped, int(Status.ARMED | Status.HOMED | Status.EFFORT_CLAMPED), int(Status.ARMED | Status.HOMED)
+    )
     as_column = np.ones((cycles, 1))
     return Trajectory(
         joint_names=description.joint_names,
@@ -120,6 +128,9 @@ def _report(
         damping=as_column * description.damping,
         effort_limit=as_column * description.effort_limit,
         speed_limit=as_column * description.speed_limit,
-        events=(Event(0, "armed", "The motors follow commands."), Event(int(count * 4e6), "clipped", "One target was clipped.")),
-        metadata={"robot": description.name, "purpose": "collect"},
+        events=(
+            Event(300_000, "armed", "The motors follow commands."),
+            Event(int(count * 4e6), "clipped", "One target was clipped."),
+        ),
+        metadata={"robot": description.name, "purpose": "collect", "start_ns": 0},
     )

@@ -94,7 +94,7 @@ class TransportSuite:
             pair.near.close()
 
     def test_unplugging_in_flight_is_reported(self, pair: TransportPair) -> None:
-        """Once the peer vanished, receiving fails with TransportLostError instead of waiting, and sending fails too."""
+        """Once the peer vanished, receiving fails with TransportLostError, and sending fails too."""
         with pair.near as near:
             pair.write(b"last words")
             pair.unplug()

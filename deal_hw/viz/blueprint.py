@@ -33,14 +33,14 @@ def inspect_blueprint(trajectory: Trajectory, description: RobotDescription, set
     left = rrb.Vertical(
         _robot(trajectory, description),
         rrb.TextDocumentView(origin="/summary", name="Summary"),
-        row_shares=[3, 4],
+        row_shares=[4, 7],
     )
     bottom = rrb.Horizontal(
         rrb.TextLogView(origin="/events", name="Events"),
         rrb.StateTimelineView(origin="/status", name="Status"),
     )
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(left, right, column_shares=[2, 3]), bottom, row_shares=[5, 1]),
+        rrb.Vertical(rrb.Horizontal(left, right, column_shares=[2, 3]), bottom, row_shares=[9, 2]),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=DEVICE_TIMELINE, play_state="paused", loop_mode="all"),
@@ -78,7 +78,9 @@ def _velocities(trajectory: Trajectory, description: RobotDescription, sets: tup
     for joint, unit in zip(trajectory.joint_names, description.position_units, strict=True):
         plots.append(_plot(f"/joints/{joint}/velocity", f"{joint} velocity [{unit}/s]"))
         if sets:
-            plots.append(_plot(f"/joints/{joint}/velocity_error", f"{joint}: predicted minus real [{unit}/s]"))
+            plots.append(
+                _plot(f"/joints/{joint}/velocity_error", f"{joint}: predicted minus real [{unit}/s]")
+            )
     return _stack("Velocity", plots, len(trajectory.joint_names))
 
 
@@ -86,7 +88,7 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
     plots = []
     for joint in trajectory.actuated:
         unit = description.position_units[description.joint_names.index(joint)]
-        shown = [f"/commands/{joint}/**", f"/joints/{joint}/position/real"]
+        shown = [f"/commands/{joint}/**", f"/joints/{joint}/position/measured"]
         plots.append(_plot("/", f"{joint}: target asked, target sent, position [{unit}]", shown))
         plots.append(_plot(f"/joints/{joint}/effort", f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]"))
     return _stack("Commands", plots, len(trajectory.actuated))
@@ -95,14 +97,15 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
 def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
     """Return the 3D view, looking along +y from far enough to see what sliding joints cover."""
     slides = [
-        high for (_, high), unit in zip(description.limits.trip_position, description.position_units, strict=True)
+        high
+        for (_, high), unit in zip(description.limits.trip_position, description.position_units, strict=True)
         if unit == "m" and np.isfinite(high)
     ]
     reach = max([0.4, *slides])
     eye = rrb.EyeControls3D(
         kind=rrb.components.Eye3DKind.Orbital,
-        position=(0.35 * reach, -2.6 * reach, 0.9 * reach),
-        look_target=(0.0, 0.0, 0.3 * reach),
+        position=(0.12 * reach, -1.75 * reach, 0.6 * reach),
+        look_target=(0.0, 0.0, 0.27 * reach),
         eye_up=(0.0, 0.0, 1.0),
     )
     return rrb.Spatial3DView(
@@ -110,6 +113,5 @@ def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
         name="Robot: real solid, predictions as ghosts",
         eye_controls=eye,
         line_grid=rrb.LineGrid3D(visible=False),
-        background=rrb.components.BackgroundKind.GradientDark,
+        background=rrb.Background(kind=rrb.components.BackgroundKind.SolidColor, color=(24, 26, 30)),
     )
-

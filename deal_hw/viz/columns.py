@@ -25,11 +25,13 @@ def nanoseconds(time_s: FloatArray) -> npt.NDArray[np.int64]:
 def indexes(device_s: FloatArray, host_s: FloatArray) -> list[Any]:
     """Return the two time columns of T rows."""
     clocks = ((DEVICE_TIMELINE, device_s), (HOST_TIMELINE, host_s))
-    return [rr.TimeColumn(name, duration=nanoseconds(time_s).astype("timedelta64[ns]")) for name, time_s in clocks]
+    return [
+        rr.TimeColumn(name, duration=nanoseconds(time_s).astype("timedelta64[ns]")) for name, time_s in clocks
+    ]
 
 
 def host_to_device(trajectory: Trajectory, host_s: FloatArray) -> FloatArray:
-    """Return host times on the device's clock, by the offset between the clocks at the samples around them."""
+    """Return host times on the device's clock, by the clocks' offset at the samples around them."""
     if not trajectory.receive_s.size:
         return np.array(host_s, dtype=float)
     offset = trajectory.device_s - trajectory.receive_s
@@ -81,12 +83,19 @@ class Log:
             self.stream.send_columns(path, indexes(device_s, host_s), rr.Scalars.columns(scalars=values))
 
     def poses(
-        self, path: str, device_s: FloatArray, host_s: FloatArray, position: FloatArray, quaternion: FloatArray
+        self,
+        path: str,
+        device_s: FloatArray,
+        host_s: FloatArray,
+        position: FloatArray,
+        quaternion: FloatArray,
     ) -> None:
-        """Write T poses, (T, 3) and w x y z (T, 4)."""
-        xyzw = np.roll(quaternion, -1, axis=1)
-        columns = rr.Transform3D.columns(translation=position, quaternion=xyzw)
-        self.stream.send_columns(path, indexes(device_s, host_s), columns)
+        """Write T poses, (T, 3) and w x y z (T, 4); those that are not finite are left out."""
+        # Rerun draws what has a NaN pose at the origin.
+        known = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
+        xyzw = np.roll(quaternion[known], -1, axis=1)
+        columns = rr.Transform3D.columns(translation=position[known], quaternion=xyzw)
+        self.stream.send_columns(path, indexes(device_s[known], host_s[known]), columns)
 
     def texts(
         self, path: str, device_s: FloatArray, host_s: FloatArray, texts: Iterable[str], levels: Iterable[str]

@@ -2,15 +2,19 @@
 
 Entities, J joints and any number of parameter sets (``nominal``, ``calibrated``)::
 
-    /joints/<joint>/position/{real,<set>}      m or rad; also /velocity
-    /joints/<joint>/error/{<set>}              predicted minus measured position; also /velocity_error
+    /joints/<joint>/position/measured          m or rad; also /velocity
+    /joints/<joint>/position/predicted/<set>   also /velocity
+    /joints/<joint>/error/<set>                predicted minus measured position; also /velocity_error
     /joints/<joint>/effort                     N or N·m, the device's own estimate
     /commands/<joint>/{asked,sent}             position targets, when the device received them
     /status/<bit>                              what the robot says of itself
-    /cadence/{command_period,state_period,state_age}    ms
+    /status/safety                             state of the safety filter
+    /cadence/{command_period,state_period,state_age,lateness}    ms
     /events                                    text log
     /summary                                   markdown
     /world/{surroundings,real,<set>}/...       3D
+
+Rerun draws traces in the order of their paths: "measured" comes before "predicted", so that it stays below.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from deal_hw.calibration import CalibrationResult
+from deal_hw.data.reader import CycleTable
 from deal_hw.description import RobotDescription
 from deal_hw.sim.model import load_model
 from deal_hw.sim.overlay import Overlay
@@ -34,7 +39,7 @@ from deal_hw.viz.summary import summary_markdown
 
 APPLICATION = "deal-hw inspect"
 _BREAK_S = 1e-6
-"""Offset of a break from the end of its window; a window's first point stands one further on than the last one's end."""
+"""Offset of a break from its window's end, and of the next window's first point from the break."""
 _ALARMING = ("passive", "trip", "fault", "watchdog", "overrun", "stop", "lost", "error")
 
 
@@ -43,6 +48,7 @@ def write_episode(
     trajectory: Trajectory,
     description: RobotDescription,
     *,
+    cycles: CycleTable | None = None,
     overlay: Overlay | None = None,
     result: CalibrationResult | None = None,
     name: str = "",
@@ -54,6 +60,7 @@ def write_episode(
         path: File to write.
         trajectory: The recording.
         description: The robot.
+        cycles: The control cycles, for cadence and safety states.
         overlay: Predictions to show beside it.
         result: The calibration whose parameters are listed.
         name: Name of the recording in the viewer.
@@ -62,15 +69,19 @@ def write_episode(
     sets = () if overlay is None else tuple(overlay.predictions)
     with rr.RecordingStream(APPLICATION, send_properties=False) as stream:
         stream.save(path)
-        stream.send_blueprint(inspect_blueprint(trajectory, description, sets), make_active=True, make_default=True)
+        stream.send_blueprint(
+            inspect_blueprint(trajectory, description, sets), make_active=True, make_default=True
+        )
         stream.send_recording_name(name or str(trajectory.metadata.get("purpose", "episode")))
         log = Log(stream)
         log_samples(log, trajectory, description)
         log_commands(log, trajectory)
+        if cycles is not None:
+            log_cycles(log, trajectory, cycles)
         log_status(log, trajectory)
         log_events(log, trajectory)
         if overlay is not None:
-            log_overlay(log, overlay)
+            log_overlay(log, trajectory, overlay)
         log_scene(log, trajectory, description, overlay)
         text = summary_markdown(trajectory, description, overlay, result, note)
         stream.log("/summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
@@ -82,7 +93,7 @@ def log_samples(log: Log, trajectory: Trajectory, description: RobotDescription)
     clocks = trajectory.device_s, trajectory.receive_s
     for j, joint in enumerate(trajectory.joint_names):
         for quantity, values in (("position", trajectory.position), ("velocity", trajectory.velocity)):
-            path = f"/joints/{joint}/{quantity}/real"
+            path = f"/joints/{joint}/{quantity}/measured"
             log.line(path, "real", palette.REAL, width=3.0)
             log.scalars(path, *clocks, values[:, j])
         if joint in trajectory.actuated:
@@ -104,26 +115,54 @@ def log_commands(log: Log, trajectory: Trajectory) -> None:
             log.scalars(f"/commands/{joint}/{what}", device_s, sent_s, values[:, a])
     log.line("/cadence/command_period", "between commands [ms]", palette.NOMINAL, step=True)
     log.scalars("/cadence/command_period", device_s[1:], sent_s[1:], 1e3 * np.diff(sent_s))
-    newest = np.searchsorted(trajectory.receive_s, sent_s, side="right") - 1
-    known = newest >= 0
-    age_ms = 1e3 * (sent_s[known] - trajectory.receive_s[newest[known]])
-    log.line("/cadence/state_age", "age of the state that a command answers [ms]", palette.CALIBRATED, step=True)
-    log.scalars("/cadence/state_age", device_s[known], sent_s[known], age_ms)
+
+
+def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
+    """Write how punctual the control loop was, and what its safety filter thought."""
+    host_s = cycles.start_s
+    device_s = host_to_device(trajectory, host_s)
+    for name, label, values, color in (
+        ("lateness", "start of a cycle after its deadline [ms]", host_s - cycles.deadline_s, palette.SENT),
+        (
+            "state_age",
+            "age of the state when a command was computed [ms]",
+            cycles.state_age_s,
+            palette.CALIBRATED,
+        ),
+    ):
+        log.line(f"/cadence/{name}", label, color, step=True)
+        log.scalars(f"/cadence/{name}", device_s, host_s, 1e3 * values)
+    change = [
+        i for i, state in enumerate(cycles.safety_state) if i == 0 or state != cycles.safety_state[i - 1]
+    ]
+    names = sorted({cycles.safety_state[i] for i in change})
+    if names:
+        colors = [palette.ALARM if name.lower() == "passive" else palette.REAL for name in names]
+        log.stream.log(
+            "/status/safety", rr.StateConfiguration(values=names, labels=names, colors=colors), static=True
+        )
+        log.states(
+            "/status/safety", device_s[change], host_s[change], [cycles.safety_state[i] for i in change]
+        )
 
 
 def log_status(log: Log, trajectory: Trajectory) -> None:
-    """Write each status bit that was ever set, at the samples where it changes."""
+    """Write each status bit that tells something, at the samples where it changes."""
     for bit in Status:
         values = (trajectory.status & int(bit)) != 0
-        if not values.any():
+        usual = bit in Status.ARMED | Status.HOMED
+        if not values.any() or (usual and values.all()):
             continue
         change = np.flatnonzero(np.diff(values, prepend=~values[:1]))
         label = str(bit.name).lower().replace("_", " ")
-        color = palette.REAL if bit in Status.ARMED | Status.HOMED | Status.HOMING else palette.ALARM
         path = f"/status/{label.replace(' ', '_')}"
-        log.stream.log(path, rr.StateConfiguration(
-            values=["on", "off"], labels=[label, ""], colors=[color, (45, 45, 45)]
-        ), static=True)
+        style = rr.StateConfiguration(
+            values=["on", "off"],
+            labels=[label, "off"],
+            colors=[palette.REAL if usual else palette.ALARM, palette.ASKED],
+            visible=[True, False],
+        )
+        log.stream.log(path, style, static=True)
         states = ["on" if values[i] else "off" for i in change]
         log.states(path, trajectory.device_s[change], trajectory.receive_s[change], states)
 
@@ -132,37 +171,44 @@ def log_events(log: Log, trajectory: Trajectory) -> None:
     """Write the events as a text log."""
     if not trajectory.events:
         return
-    origin_ns = int(trajectory.metadata.get("first_receive_ns", 0))
+    origin_ns = int(trajectory.metadata.get("start_ns", 0))
     host_s = np.array([(event.stamp_ns - origin_ns) * 1e-9 for event in trajectory.events])
     texts = [f"{event.kind}: {event.message}" for event in trajectory.events]
-    levels = ["WARN" if any(word in event.kind for word in _ALARMING) else "INFO" for event in trajectory.events]
+    levels = [
+        "WARN" if any(word in event.kind for word in _ALARMING) else "INFO" for event in trajectory.events
+    ]
     log.texts("/events", host_to_device(trajectory, host_s), host_s, texts, levels)
 
 
-def log_overlay(log: Log, overlay: Overlay) -> None:
+def log_overlay(log: Log, trajectory: Trajectory, overlay: Overlay) -> None:
     """Write the predictions and their errors, broken between windows."""
-    times = []
-    for time_s in (overlay.device_s, overlay.receive_s):
-        points = time_s.copy()
-        points[:, 0] += 2 * _BREAK_S
-        flat = overlay.broken_time(points).reshape(len(points), -1)
-        flat[:, -1] += _BREAK_S
-        times.append(flat.ravel())
-    others = 0
+    device_s = _broken_times(overlay.device_s, trajectory.device_s)
+    receive_s = _broken_times(overlay.receive_s, trajectory.receive_s)
     for name, prediction in overlay.predictions.items():
-        color = palette.color_of(name, others)
-        others += name not in {"nominal", "calibrated"}
+        color = palette.color_of(name, list(overlay.predictions))
         for quantity, values in (
-            ("position", prediction.position),
-            ("velocity", prediction.velocity),
+            ("position/predicted", prediction.position),
+            ("velocity/predicted", prediction.velocity),
             ("error", overlay.position_error(name)),
             ("velocity_error", overlay.velocity_error(name)),
         ):
-            traces = overlay.broken(values)
+            traces = np.pad(overlay.broken(values), ((1, 1), (0, 0)), constant_values=np.nan)
             for j, joint in enumerate(overlay.joint_names):
                 path = f"/joints/{joint}/{quantity}/{name}"
                 log.line(path, name, color)
-                log.scalars(path, times[0], times[1], traces[:, j])
+                log.scalars(path, device_s, receive_s, traces[:, j])
+
+
+def _broken_times(window_s: FloatArray, recording_s: FloatArray) -> FloatArray:
+    """Return the times of windows joined to one trace, from the recording's first sample to its last.
+
+    Linked plots open with the same span only where their traces have it.
+    """
+    points = window_s.copy()
+    points[:, 0] += 2 * _BREAK_S
+    flat = Overlay.broken_time(points).reshape(len(points), -1)
+    flat[:, -1] += _BREAK_S
+    return np.concatenate([recording_s[:1], flat.ravel(), recording_s[-1:] + 3 * _BREAK_S])
 
 
 def log_scene(
@@ -174,18 +220,18 @@ def log_scene(
     clocks = trajectory.device_s, trajectory.receive_s
     log_surroundings(log, scene)
     log_robot(log, scene, "real", palette.REAL, body_poses(robot, trajectory.position), clocks, ghost=False)
-    others = 0
-    for name in () if overlay is None else overlay.predictions:
-        poses = body_poses(robot, _at_samples(overlay, name, trajectory.position.shape))
-        log_robot(log, scene, name, palette.color_of(name, others), poses, clocks, ghost=True)
-        others += name not in {"nominal", "calibrated"}
+    if overlay is None:
+        return
+    for name in overlay.predictions:
+        color = palette.color_of(name, list(overlay.predictions))
+        poses = body_poses(robot, _at_samples(overlay, name, trajectory.position))
+        log_robot(log, scene, name, color, poses, clocks, ghost=True)
 
 
-def _at_samples(overlay: Overlay | None, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """Return a prediction at the recording's samples, (T, J): at a seam the end of a window; NaN outside windows."""
-    out = np.full(shape, np.nan)
-    if overlay is not None:
-        position = overlay.predictions[name].position
-        out[overlay.sample[:, 0]] = position[:, 0]
-        out[overlay.sample[:, 1:]] = position[:, 1:]
+def _at_samples(overlay: Overlay, name: str, measured: FloatArray) -> FloatArray:
+    """Return a prediction at the samples, (T, J): at a seam the end of a window; measured outside windows."""
+    out = measured.copy()
+    position = overlay.predictions[name].position
+    out[overlay.sample[:, 0]] = position[:, 0]
+    out[overlay.sample[:, 1:]] = position[:, 1:]
     return out

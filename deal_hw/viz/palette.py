@@ -1,6 +1,8 @@
-"""The one set of colours, from Okabe and Ito (2008): told apart with any kind of colour vision, on dark and on white."""
+"""The one set of colours, from Okabe and Ito (2008): told apart with any kind of colour vision."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 Color = tuple[int, int, int]
 
@@ -17,7 +19,12 @@ OTHERS: tuple[Color, ...] = ((204, 121, 167), (148, 103, 189), (230, 230, 230))
 """For parameter sets of other names."""
 
 
-def color_of(name: str, others_before: int = 0) -> Color:
-    """Return the colour of a trace: ``"real"``, ``"nominal"``, ``"calibrated"`` or another parameter set."""
-    known = {"real": REAL, "nominal": NOMINAL, "calibrated": CALIBRATED}
-    return known.get(name, OTHERS[others_before % len(OTHERS)])
+_KNOWN = {"real": REAL, "nominal": NOMINAL, "calibrated": CALIBRATED}
+
+
+def color_of(name: str, names: Sequence[str] = ()) -> Color:
+    """Return the colour of ``"real"``, ``"nominal"``, ``"calibrated"``, or another one of ``names``."""
+    if name in _KNOWN:
+        return _KNOWN[name]
+    others = [other for other in names if other not in _KNOWN]
+    return OTHERS[others.index(name) % len(OTHERS)] if name in others else OTHERS[0]

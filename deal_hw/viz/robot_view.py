@@ -21,8 +21,10 @@ def log_surroundings(log: Log, scene: Scene) -> None:
     log.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in scene.shapes:
         if shape.body == 0:
-            color = tuple(int(round(255 * c)) for c in shape.color)
-            log.stream.log(f"{WORLD}/surroundings/{shape.name}", *draw(shape, color, ghost=False), static=True)
+            color = tuple(round(255 * c) for c in shape.color)
+            log.stream.log(
+                f"{WORLD}/surroundings/{shape.name}", *draw(shape, color, ghost=False), static=True
+            )
 
 
 def log_robot(
@@ -42,7 +44,7 @@ def log_robot(
         scene: Its shapes.
         name: ``"real"`` or the name of a parameter set.
         color: Of all its shapes; two robots in the same place are told apart by nothing else.
-        poses: Positions (T, B, 3) and quaternions w x y z (T, B, 4) of the bodies; NaN hides the robot.
+        poses: Positions (T, B, 3) and quaternions w x y z (T, B, 4) of the bodies.
         time_s: Device and host times, (T,) each.
         ghost: Whether to draw it see-through.
     """
@@ -65,14 +67,20 @@ def draw(shape: Shape, color: Iterable[int], *, ghost: bool) -> list[Any]:
     radius, half_length = float(shape.size[0]), float(shape.size[1])
     match shape.kind:
         case "box":
-            return [rr.Boxes3D(half_sizes=[shape.size], centers=[shape.position], quaternions=turned, **style)]
+            return [
+                rr.Boxes3D(half_sizes=[shape.size], centers=[shape.position], quaternions=turned, **style)
+            ]
         case "ellipsoid" | "sphere":
             half = [shape.size if shape.kind == "ellipsoid" else np.full(3, radius)]
             return [rr.Ellipsoids3D(half_sizes=half, centers=[shape.position], quaternions=turned, **style)]
         case "cylinder":
             return [
                 rr.Cylinders3D(
-                    lengths=[2 * half_length], radii=[radius], centers=[shape.position], quaternions=turned, **style
+                    lengths=[2 * half_length],
+                    radii=[radius],
+                    centers=[shape.position],
+                    quaternions=turned,
+                    **style,
                 )
             ]
         case "capsule":
@@ -86,7 +94,9 @@ def draw(shape: Shape, color: Iterable[int], *, ghost: bool) -> list[Any]:
         case "mesh":
             factor = (red, green, blue, 110 if ghost else 255)
             pose = rr.InstancePoses3D(translations=[shape.position], quaternions=turned)
-            mesh = rr.Mesh3D(vertex_positions=shape.vertices, triangle_indices=shape.faces, albedo_factor=factor)
+            mesh = rr.Mesh3D(
+                vertex_positions=shape.vertices, triangle_indices=shape.faces, albedo_factor=factor
+            )
             return [mesh, pose]
 
 

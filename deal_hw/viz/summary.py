@@ -37,16 +37,15 @@ def summary_markdown(
 def _recording(trajectory: Trajectory, description: RobotDescription) -> str:
     purpose = trajectory.metadata.get("purpose", "recording")
     return (
-        f"# {description.name}: {purpose}\n\n{trajectory.duration_s:.2f} s, {len(trajectory.device_s)} samples, "
-        f"{len(trajectory.sent_s)} commands, {len(trajectory.events)} events"
+        f"**{description.name}, {purpose}:** {trajectory.duration_s:.2f} s, "
+        f"{len(trajectory.device_s)} samples, {len(trajectory.sent_s)} commands, "
+        f"{len(trajectory.events)} events"
     )
 
 
 def _errors(overlay: Overlay, description: RobotDescription) -> str:
     lines = [
-        f"## Prediction over {overlay.window_s:.2f} s windows",
-        "",
-        "Open loop, restarted from the measured state. RMSE, and in brackets its share of the measured range.",
+        f"**Open-loop prediction, restarted every {overlay.window_s:.2f} s.** RMSE (share of the range):",
         "",
         "| set | " + " | ".join(overlay.joint_names) + " | latency |",
         "|---" * (len(overlay.joint_names) + 2) + "|",
@@ -55,15 +54,21 @@ def _errors(overlay: Overlay, description: RobotDescription) -> str:
         rmse = (prediction.window_rmse**2).mean(axis=0) ** 0.5
         cells = [
             f"{1e3 * value:.3g} m{unit} ({100 * share:.2g} %)"
-            for value, unit, share in zip(rmse, description.position_units, prediction.position_nrmse, strict=True)
+            for value, unit, share in zip(
+                rmse, description.position_units, prediction.position_nrmse, strict=True
+            )
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {1e3 * prediction.latency_s:.1f} ms |")
     return "\n".join(lines)
 
 
 def _parameters(result: CalibrationResult) -> str:
+    low_ms, high_ms = (1e3 * value for value in result.latency_interval_s)
+    known = [f"{name} {value:.4g} {result.space[name].unit}" for name, value in result.space.known.items()]
+    facts = [f"latency {1e3 * result.latency_s:.1f} ms ({low_ms:.1f} to {high_ms:.1f})"]
+    facts += [f"known: {', '.join(known)}"] if known else []
     lines = [
-        f"## Parameters ({result.method})",
+        f"**Parameters by {result.method}.** {'; '.join(facts)}",
         "",
         "| parameter | nominal | estimate | 90 % interval | unit | |",
         "|---|---|---|---|---|---|",
@@ -75,10 +80,6 @@ def _parameters(result: CalibrationResult) -> str:
             f"| {p.name} | {p.nominal:.4g} | {result.estimate[k]:.4g} | {low:.4g} to {high:.4g} | {p.unit} | "
             f"{'' if verdict == 'identifiable' else verdict} |"
         )
-    for name, value in result.space.known.items():
-        lines.append(f"| {name} | {value:.4g} | | measured | {result.space[name].unit} | |")
-    low_ms, high_ms = (1e3 * value for value in result.latency_interval_s)
-    lines.append(f"| latency | | {1e3 * result.latency_s:.1f} | {low_ms:.1f} to {high_ms:.1f} | ms | |")
     return "\n".join(lines)
 
 

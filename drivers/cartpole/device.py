@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+from array import array
 from collections import deque
 from dataclasses import dataclass
 
@@ -58,13 +59,13 @@ class TrueTrajectory:
 class CartpoleDevice:
     """Firmware and mechanics of an emulated cart-pole.
 
-    Control tick k, at device time k ms: (1) handle what was received, let due commands act; (2) slew the set-point;
-    (3) force from the state at the start of the tick; (4) one physics step with that force. A state frame at tick k
-    reports the state before step (4). Tick k runs when :meth:`advance_to` passes k ms, so bytes that come at k ms sharp
-    are handled in tick k + 1.
+    Control tick k, at device time k ms: (1) handle what was received, let due commands act; (2) slew the
+    set-point; (3) force from the state at the start of the tick; (4) one physics step with that force. A
+    state frame at tick k reports the state before step (4). Tick k runs when :meth:`advance_to` passes k ms,
+    so bytes that come at k ms sharp are handled in tick k + 1.
 
-    Until armed the motor is off: the pole hangs, or is held upright by a hand after homing. Between arming and the
-    first target the force is zero, because gains come only with targets.
+    Until armed the motor is off: the pole hangs, or is held upright by a hand after homing. Between arming
+    and the first target the force is zero, because gains come only with targets.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
@@ -72,14 +73,18 @@ class CartpoleDevice:
         start_angle_rad: Where the hand sets the pole when homing [rad]; None: within +-0.03 rad, by the seed.
     """
 
-    def __init__(self, truth: Truth, *, keep_truth: bool = False, start_angle_rad: float | None = None) -> None:
+    def __init__(
+        self, truth: Truth, *, keep_truth: bool = False, start_angle_rad: float | None = None
+    ) -> None:
         self._truth = truth
         self._profile = find_profile(truth.profile)
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0xCA47]).spawn(4)]
         self._hand_rng, sensor_rng, self._jitter_rng, self._drop_rng = streams
         self._sim = build_simulation(truth.parameters)
         self._servo = Servo(truth.parameters, self._sim.timestep_s)
-        self._sensor = Sensor(self._profile, truth.sensing_ticks, round(DESCRIPTION.state_rate_hz), sensor_rng)
+        self._sensor = Sensor(
+            self._profile, truth.sensing_ticks, round(DESCRIPTION.state_rate_hz), sensor_rng
+        )
         self._friction_n = truth.parameters["cart.frictionloss"]
         self._start_angle_rad = start_angle_rad
         self._motor_m = 0.0
@@ -96,7 +101,7 @@ class CartpoleDevice:
         self._commands: deque[tuple[int, protocol.Target]] = deque()
         self._command_sequence = protocol.NO_COMMAND
         self._command_tick = self._alive_tick = 0
-        self._kept: list[tuple[float, ...]] | None = [] if keep_truth else None
+        self._kept: array[float] | None = array("d") if keep_truth else None
         self._sim.set_state((self._hand_rng.uniform(-0.1, 0.1), math.pi), (0.0, 0.0))
 
     @property
@@ -147,7 +152,7 @@ class CartpoleDevice:
         force = self._servo.update(motor, cart_velocity) if armed else 0.0
         self._sensor.observe(Sample(motor, cart_velocity, pole, pole_velocity, self._servo.setpoint))
         if self._kept is not None:
-            self._kept.append((tick, cart, pole, cart_velocity, pole_velocity, force, self._servo.setpoint))
+            self._kept.extend((tick, cart, pole, cart_velocity, pole_velocity, force, self._servo.setpoint))
         if tick % TICKS_PER_STATE == 0:
             out += self._state_frame(cart)
         self._move(cart_velocity, force)
@@ -158,7 +163,7 @@ class CartpoleDevice:
         """Return the true states of all ticks so far."""
         if self._kept is None:
             raise ValueError("the device was made with keep_truth=False")
-        rows = np.array(self._kept, dtype=float).reshape(-1, 7)
+        rows = np.array(self._kept).reshape(-1, 7)
         return TrueTrajectory(rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3:5], rows[:, 5], rows[:, 6])
 
     # What the host asks for.
@@ -201,7 +206,8 @@ class CartpoleDevice:
         return protocol.encode(
             protocol.Info(
                 request=hello.request, kind=protocol.DEVICE_KIND, firmware=FIRMWARE,
-                device_rate_hz=round(DESCRIPTION.device_rate_hz), state_rate_hz=round(DESCRIPTION.state_rate_hz),
+                device_rate_hz=round(DESCRIPTION.device_rate_hz),
+                state_rate_hz=round(DESCRIPTION.state_rate_hz),
                 unique_id=0xE000_0000 + self._truth.seed % 2**28,
             )
         )  # fmt: skip
@@ -268,7 +274,9 @@ class CartpoleDevice:
                 self._move_home()
                 return
         if self._profile.stribeck_ratio:
-            excess = self._profile.stribeck_ratio * math.exp(-((cart_velocity / self._profile.stribeck_speed_m_s) ** 2))
+            excess = self._profile.stribeck_ratio * math.exp(
+                -((cart_velocity / self._profile.stribeck_speed_m_s) ** 2)
+            )
             self._sim.set_frictionloss(_CART, self._friction_n * (1.0 + excess))
         self._sim.step((force, 0.0))
 
@@ -286,7 +294,9 @@ class CartpoleDevice:
     def _state_frame(self, cart: float) -> bytes:
         reading = self._sensor.read()
         armed = self._mode is _Mode.ARMED
-        effort, clamped = self._servo.estimate(reading.setpoint, reading.cart_um / 1e6, reading.cart_um_s / 1e6)
+        effort, clamped = self._servo.estimate(
+            reading.setpoint, reading.cart_um / 1e6, reading.cart_um_s / 1e6
+        )
         status = Status.NONE
         if armed:
             status |= Status.ARMED
@@ -303,7 +313,8 @@ class CartpoleDevice:
         known = self._command_sequence != protocol.NO_COMMAND
         return protocol.encode(
             protocol.State(
-                sequence=sequence, device_us=self._tick * 1000, cart_um=reading.cart_um, cart_um_s=reading.cart_um_s,
+                sequence=sequence, device_us=self._tick * 1000,
+                cart_um=reading.cart_um, cart_um_s=reading.cart_um_s,
                 pole_urad=reading.pole_urad, pole_urad_s=reading.pole_urad_s,
                 effort_mn=max(-32767, min(32767, round(effort * 1e3))) if armed else 0, status=int(status),
                 command_sequence=self._command_sequence,

@@ -50,7 +50,11 @@ class CartpoleEmulator:
     """
 
     def __init__(
-        self, device: CartpoleDevice, link: Path | None = None, hazards: Hazards | None = None, clock: Clock | None = None
+        self,
+        device: CartpoleDevice,
+        link: Path | None = None,
+        hazards: Hazards | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self.slips = 0
         self.dropped = 0
@@ -75,7 +79,9 @@ class CartpoleEmulator:
                 self._link.unlink()
             elif self._link.exists():
                 self.close()
-                raise ConfigurationError(f"{self._link} exists and is not a symbolic link; choose another --link")
+                raise ConfigurationError(
+                    f"{self._link} exists and is not a symbolic link; choose another --link"
+                )
             self._link.symlink_to(port)
         self._origin_ns = self._clock.now_ns() - self._device.device_ns
         return port if self._link is None else str(self._link)

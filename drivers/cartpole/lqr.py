@@ -1,7 +1,8 @@
 """A linear-quadratic balancer for known parameters: the oracle of the emulator and a reference for policies.
 
-It reads positions only. A steady-state Kalman filter on the same linear model supplies the velocities, and past targets
-that have not acted yet are part of the state, so that latency is planned for instead of suffered.
+It reads positions only. A steady-state Kalman filter on the same linear model supplies the velocities, and
+past targets that have not acted yet are part of the state, so that latency is planned for instead of
+suffered.
 """
 
 from __future__ import annotations
@@ -95,9 +96,11 @@ def design_lqr(parameters: Mapping[str, float], latency_ticks: int, sensor: Sens
 
 
 def _filter_gain(model: LinearModel, parameters: Mapping[str, float], sensor: SensorModel) -> FloatArray:
-    # What the linear model leaves out is mostly friction, so that is the size of the filter's process noise; the floor
-    # stands for the slewing set-point and the effort limit, which it leaves out too.
-    friction = np.maximum((parameters["cart.frictionloss"], parameters["pole.frictionloss"]), _DISTURBANCE_FLOOR)
+    # What the linear model leaves out is mostly friction, so that is the size of the filter's process noise;
+    # the floor stands for the slewing set-point and the effort limit, which it leaves out too.
+    friction = np.maximum(
+        (parameters["cart.frictionloss"], parameters["pole.frictionloss"]), _DISTURBANCE_FLOOR
+    )
     W = model.G @ np.diag(friction**2) @ model.G.T + 1e-12 * np.eye(len(model.A))
     V = np.diag(np.maximum(sensor.position_std, _POSITION_FLOOR) ** 2)
     C = np.eye(2, len(model.A))
@@ -107,8 +110,9 @@ def _filter_gain(model: LinearModel, parameters: Mapping[str, float], sensor: Se
 
 
 def _riccati(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    # Plain value iteration: scipy's solve_discrete_are gives up on some of these, because past targets are pure delays
-    # (eigenvalues 0) beside stiff mechanics. Slow, but the slowest closed-loop mode here settles in some hundred steps.
+    # Plain value iteration: scipy's solve_discrete_are gives up on some of these, because past targets are
+    # pure delays (eigenvalues 0) beside stiff mechanics. Slow, but the slowest closed-loop mode here settles
+    # in some hundred steps.
     X = Q.copy()
     for _ in range(_MAX_ITERATIONS):
         XB = X @ B
@@ -122,8 +126,9 @@ def _riccati(A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray) -> Floa
 def linearise(parameters: Mapping[str, float], latency_ticks: int) -> LinearModel:
     """Return the linear model of one control period, by central differences over the true mechanics.
 
-    Dry friction and the limits have no linear part and are left out. The state is the one that a frame reports; a target
-    computed from it acts ``latency_ticks`` + 1 ticks later (the device handles what came at a tick in the next one).
+    Dry friction and the limits have no linear part and are left out. The state is the one that a frame
+    reports; a target computed from it acts ``latency_ticks`` + 1 ticks later (the device handles what came at
+    a tick in the next one).
     """
     ticks = DESCRIPTION.steps_per_control
     whole, part = divmod(latency_ticks + 1, ticks)
@@ -145,7 +150,7 @@ def linearise(parameters: Mapping[str, float], latency_ticks: int) -> LinearMode
 
 
 class _Period:
-    """The mechanics over one control period: inputs are state (4), earlier target, later target, force, torque."""
+    """One control period; inputs are state (4), earlier target, later target, force, torque."""
 
     def __init__(self, parameters: Mapping[str, float], part: int, ticks: int) -> None:
         self._sim = build_simulation({**parameters, "cart.frictionloss": 0.0, "pole.frictionloss": 0.0})
@@ -171,5 +176,6 @@ class _Period:
 def _target(position: float) -> Target:
     return Target(
         sequence=0, position_um=round(position * 1e6), stiffness_mn_m=round(STIFFNESS_N_M * 1e3),
-        damping_mns_m=round(DAMPING_NS_M * 1e3), effort_limit_mn=round(EFFORT_LIMIT_N * 1e3), speed_limit_um_s=10**9,
+        damping_mns_m=round(DAMPING_NS_M * 1e3), effort_limit_mn=round(EFFORT_LIMIT_N * 1e3),
+        speed_limit_um_s=10**9,
     )  # fmt: skip

@@ -21,7 +21,7 @@ MAX_DRAWS = 200
 
 
 def draw_truth(profile: str, seed: int, *, xi: float = 5.0) -> Truth:
-    """Return the hidden truth of a seed: the first draw that the oracle balances; ``refused`` counts those before.
+    """Return the hidden truth of a seed: the first draw that the oracle balances.
 
     Args:
         profile: Name of the profile.
@@ -41,7 +41,8 @@ def draw_truth(profile: str, seed: int, *, xi: float = 5.0) -> Truth:
         if oracle_balances(truth):
             return truth
     raise ConfigurationError(
-        f"none of {MAX_DRAWS} draws of seed {seed} with xi={xi:g} can be balanced in profile {profile!r}; use a smaller xi"
+        f"none of {MAX_DRAWS} draws of seed {seed} with xi={xi:g} can be balanced in profile {profile!r}; "
+        "use a smaller xi"
     )
 
 
@@ -55,8 +56,10 @@ def oracle_balances(truth: Truth) -> bool:
     return all(balances(truth, controller, angle) for angle in (START_ANGLE_RAD, -START_ANGLE_RAD))
 
 
-def balances(truth: Truth, controller: LqrController, start_angle_rad: float, duration_s: float = BALANCE_S) -> bool:
-    """Return whether a controller holds |angle| < 0.3 rad and the cart within the target range, over the real wire."""
+def balances(
+    truth: Truth, controller: LqrController, start_angle_rad: float, duration_s: float = BALANCE_S
+) -> bool:
+    """Return whether |angle| stays below 0.3 rad and the cart in the target range, over the real wire."""
     clock = VirtualClock()
     device = CartpoleDevice(truth, start_angle_rad=start_angle_rad)
     robot = CartpoleRobot(VirtualTransport(device, clock), clock)

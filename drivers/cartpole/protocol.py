@@ -1,10 +1,13 @@
-"""Serial protocol of the cart-pole, version 1: bytes <-> messages of integers. docs/protocol-cartpole-serial.md is its text.
+"""Serial protocol of the cart-pole, version 1: bytes <-> messages of integers.
 
-A frame on the wire is ``COBS(version, type, body, CRC-16) 00``: version and type are one byte each, all numbers are
-little-endian, the CRC is CRC-16/IBM-3740 (poly 0x1021, init 0xFFFF) over version, type and body. The zero byte occurs
-nowhere else, so a receiver that lost its place finds it again at the next zero.
+docs/protocol-cartpole-serial.md is its text.
 
-Payloads are integers (um, urad, um/s, urad/s, mN, mN/m, mN*s/m, us), so that a microcontroller can be bit-equal.
+A frame on the wire is ``COBS(version, type, body, CRC-16) 00``: version and type are one byte each, all
+numbers are little-endian, the CRC is CRC-16/IBM-3740 (poly 0x1021, init 0xFFFF) over version, type and body.
+The zero byte occurs nowhere else, so a receiver that lost its place finds it again at the next zero.
+
+Payloads are integers (um, urad, um/s, urad/s, mN, mN/m, mN*s/m, us), so that a microcontroller can be
+bit-equal.
 """
 
 from __future__ import annotations
@@ -62,7 +65,9 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """Device: the answer to hello. Its layout never changes, so that any two versions can tell each other apart.
+    """Device: the answer to hello.
+
+    Its layout never changes, so that any two versions can tell each other apart.
 
     Attributes:
         request: Number of the hello that is answered.
@@ -211,9 +216,9 @@ def _encode_payload(message: AnyMessage) -> bytes:
     match message:
         case State():
             return _STATE.pack(
-                VERSION, MessageType.STATE, message.sequence, message.device_us, message.cart_um, message.cart_um_s,
-                message.pole_urad, message.pole_urad_s, message.effort_mn, message.status, message.command_sequence,
-                message.command_age_us,
+                VERSION, MessageType.STATE, message.sequence, message.device_us,
+                message.cart_um, message.cart_um_s, message.pole_urad, message.pole_urad_s,
+                message.effort_mn, message.status, message.command_sequence, message.command_age_us,
             )  # fmt: skip
         case Target():
             return _TARGET.pack(
@@ -225,7 +230,12 @@ def _encode_payload(message: AnyMessage) -> bytes:
             if len(kind) > 16:
                 raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
             body = _STRUCTS[MessageType.INFO].pack(
-                message.request, kind, *message.firmware, message.device_rate_hz, message.state_rate_hz, message.unique_id
+                message.request,
+                kind,
+                *message.firmware,
+                message.device_rate_hz,
+                message.state_rate_hz,
+                message.unique_id,
             )
             return bytes((message.version, MessageType.INFO)) + body
         case Ack():
@@ -249,7 +259,9 @@ def decode(payload: bytes) -> AnyMessage:
     if version != VERSION and number not in _TIMELESS:
         raise VersionMismatchError(f"got a message of protocol version {version}; this side speaks {VERSION}")
     if (kind := _BY_TYPE.get(number)) is None:
-        raise FrameError(f"unknown message type 0x{number:02x}; known: {', '.join(t.name for t in MessageType)}")
+        raise FrameError(
+            f"unknown message type 0x{number:02x}; known: {', '.join(t.name for t in MessageType)}"
+        )
     layout = _STRUCTS[number]
     if len(payload) != 2 + layout.size:
         raise FrameError(f"{kind.__name__}: the payload has {len(payload)} bytes, expected {2 + layout.size}")
@@ -263,7 +275,9 @@ def decode(payload: bytes) -> AnyMessage:
     try:
         if kind is Info:
             name = values[1].rstrip(b"\0").decode("ascii")
-            return Info(values[0], name, (values[2], values[3], values[4]), values[5], values[6], values[7], version)
+            return Info(
+                values[0], name, (values[2], values[3], values[4]), values[5], values[6], values[7], version
+            )
         if kind is Ack:
             return Ack(values[0], MessageType(values[1]), Result(values[2]))
     except ValueError as error:
@@ -277,8 +291,8 @@ class FrameDecoder:
     """Cuts a byte stream into payloads and survives whatever else is in it.
 
     Attributes:
-        errors: Corrupt frames so far. What comes before the first delimiter is not counted: whoever opens a running
-            stream starts in the middle of a frame.
+        errors: Corrupt frames so far. What comes before the first delimiter is not counted: whoever opens a
+            running stream starts in the middle of a frame.
     """
 
     def __init__(self) -> None:

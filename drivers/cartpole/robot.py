@@ -36,8 +36,8 @@ _REFUSALS = {
 class CartpoleRobot(Robot):
     """A cart-pole that speaks the serial protocol of docs/protocol-cartpole-serial.md.
 
-    ``connect`` greets the device, which switches its motor off; on an inherited port a child process connects again,
-    with a transport that adopted the descriptor, and so starts from the passive state.
+    ``connect`` greets the device, which switches its motor off; on an inherited port a child process connects
+    again, with a transport that adopted the descriptor, and so starts from the passive state.
 
     Attributes:
         info: What the device said of itself; None before ``connect``.
@@ -85,12 +85,14 @@ class CartpoleRobot(Robot):
         self._decoder = protocol.FrameDecoder()
 
     def home(self, timeout_s: float) -> None:
-        """Bring the cart to the middle and wait until somebody (or the emulator's hand) has set the pole upright."""
+        """Bring the cart to the middle and wait until the pole has been set upright."""
         self._ask(protocol.Home(self._next_request()), timeout_s, reached=Status.HOMED, without=Status.HOMING)
 
     def arm(self, timeout_s: float) -> None:
         """Let the motor follow commands; the device's watchdog expects one every 200 ms from now on."""
-        self._ask(protocol.Arm(self._next_request()), timeout_s, reached=Status.ARMED, without=Status.WATCHDOG)
+        self._ask(
+            protocol.Arm(self._next_request()), timeout_s, reached=Status.ARMED, without=Status.WATCHDOG
+        )
 
     def read_state(self, timeout_s: float) -> RobotState:
         """Return the next state sample in order of arrival."""
@@ -106,7 +108,7 @@ class CartpoleRobot(Robot):
         return self._states.popleft()
 
     def send_command(self, command: JointCommand) -> JointCommand:
-        """Send a position target; velocity target and feed-forward effort do not exist on this wire and return as 0.
+        """Send a position target; velocity target and feed-forward effort are not on this wire.
 
         Raises:
             SafetyError: A value is not finite.
@@ -118,7 +120,11 @@ class CartpoleRobot(Robot):
         return from_target(target)
 
     def passive(self) -> None:
-        """Switch the motor off; sent once, never waits, works on a port that another process was using."""
+        """Switch the motor off; sent once, never waits, works on a port that another process was using.
+
+        States that were received before are forgotten, so that none of them passes for a confirmation.
+        """
+        self._states.clear()
         self._torn = True
         self._send(protocol.encode(protocol.Stop(self._next_request())))
 
@@ -140,7 +146,7 @@ class CartpoleRobot(Robot):
         return int(fileno())
 
     def take_wire(self) -> list[Message]:
-        """Return and forget the raw messages since the last call; the oldest go first when nobody takes them."""
+        """Return and forget the raw messages since the last call; if many, only the newest."""
         wire = list(self._wire)
         self._wire.clear()
         return wire
@@ -163,11 +169,12 @@ class CartpoleRobot(Robot):
                     return info
         if received:
             raise WrongDeviceError(
-                f"{self._where}: {received} bytes came but no answer to hello; is another device on this port, or does "
-                f"it use another baud rate than {protocol.BAUD_RATE}?"
+                f"{self._where}: {received} bytes came but no answer to hello; is another device on it, "
+                f"or does it use another baud rate than {protocol.BAUD_RATE}?"
             )
         raise TransportTimeoutError(
-            f"{self._where}: no answer to hello within {HELLO_TIMEOUT_S:g} s; is the device powered and is this its port?"
+            f"{self._where}: no answer to hello within {HELLO_TIMEOUT_S:g} s; is the device powered "
+            "and is this its port?"
         )
 
     def _hear_info(self, timeout_s: float) -> tuple[protocol.Info | None, int]:
@@ -193,16 +200,19 @@ class CartpoleRobot(Robot):
     def _check_info(self, info: protocol.Info) -> None:
         if info.kind != protocol.DEVICE_KIND:
             raise WrongDeviceError(
-                f"{self._where}: the device says it is {info.kind!r}, not {protocol.DEVICE_KIND!r}; choose another port"
+                f"{self._where}: the device says it is {info.kind!r}, not {protocol.DEVICE_KIND!r}; "
+                "choose another port"
             )
         if info.version != protocol.VERSION:
             older = "the device's firmware" if info.version < protocol.VERSION else "deal-hw"
             raise VersionMismatchError(
-                f"{self._where}: the device (firmware {'.'.join(map(str, info.firmware))}) speaks protocol version "
-                f"{info.version}, deal-hw speaks {protocol.VERSION}; update {older}"
+                f"{self._where}: the device (firmware {'.'.join(map(str, info.firmware))}) speaks protocol "
+                f"version {info.version}, deal-hw speaks {protocol.VERSION}; update {older}"
             )
 
-    def _ask(self, request: protocol.Arm | protocol.Home, timeout_s: float, reached: Status, without: Status) -> None:
+    def _ask(
+        self, request: protocol.Arm | protocol.Home, timeout_s: float, reached: Status, without: Status
+    ) -> None:
         what = request.TYPE.name.lower()
         frame = protocol.encode(request)
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)

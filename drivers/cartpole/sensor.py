@@ -9,7 +9,6 @@ import numpy as np
 
 from deal_hw.drivers.cartpole.profiles import Profile
 
-
 _I32 = 0x7FFF_FFFF
 
 
@@ -43,7 +42,9 @@ class Sensor:
         rng: Source of noise and jitter.
     """
 
-    def __init__(self, profile: Profile, delay_ticks: int, state_rate_hz: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, profile: Profile, delay_ticks: int, state_rate_hz: int, rng: np.random.Generator
+    ) -> None:
         self._noise = profile.sensor.noise
         self._resolution = profile.sensor.resolution
         self._delay = delay_ticks
@@ -87,7 +88,9 @@ class Sensor:
         (old_cart, old_pole), (cart, pole) = self._reported[0], self._reported[-1]
         # Right after a start the window is not full yet; then the difference runs over what there is.
         count = max(1, len(self._reported) - 1)
-        return _fit((cart - old_cart) * self._rate_hz / count), _fit((pole - old_pole) * self._rate_hz / count)
+        return _fit((cart - old_cart) * self._rate_hz / count), _fit(
+            (pole - old_pole) * self._rate_hz / count
+        )
 
 
 def _fit(value: float) -> int:

@@ -54,7 +54,11 @@ class Servo:
     def update(self, position: float, velocity: float) -> float:
         """Run one period from the state at its start; return the force on the cart [N]."""
         error = self._target - self.setpoint
-        self.setpoint = self._target if abs(error) <= self._step else self.setpoint + (self._step if error > 0 else -self._step)
+        self.setpoint = (
+            self._target
+            if abs(error) <= self._step
+            else self.setpoint + (self._step if error > 0 else -self._step)
+        )
         force = self._stiffness * (self.setpoint - position) - self._damping * velocity
         return min(max(force, -self._limit), self._limit)
 

@@ -1,4 +1,4 @@
-"""The hidden truth of an emulated cart-pole. Only the emulator and benches import this; never a calibrator."""
+"""The hidden truth of an emulated cart-pole; for emulator and benches, never for a calibrator."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ class Truth:
                 refused=int(values["refused"]),
             )
         except (KeyError, TypeError) as error:
-            raise ConfigurationError(f"not the truth of a cart-pole: {error!r}; --reveal-to writes one") from error
+            raise ConfigurationError(
+                f"not the truth of a cart-pole: {error!r}; --reveal-to writes one"
+            ) from error
 
 
 def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:
@@ -78,7 +80,7 @@ def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Trut
 
 
 def candidate_truth(profile: str, rng: np.random.Generator, *, seed: int, xi: float, refused: int) -> Truth:
-    """Draw the free parameters log-uniformly in the 10-90 % part of [nominal / xi, nominal * xi], and a latency."""
+    """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency."""
     space = k9_space().with_ratio(xi).with_known(k9_space().known)
     values = space.unnormalize(rng.uniform(0.1, 0.9, len(space)))
     low, high = find_profile(profile).latency_ticks

@@ -58,7 +58,9 @@ def to_robot_state(state: protocol.State, receive_ns: int) -> RobotState:
     )
 
 
-def _integer(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], scale: float, low: int, high: int, name: str) -> int:
+def _integer(
+    values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], scale: float, low: int, high: int, name: str
+) -> int:
     value = float(values[0])
     if not math.isfinite(value):
         raise SafetyError(f"cartpole: {name} is {value}; nothing was sent")

@@ -29,9 +29,9 @@ _READ_SIZE = 4096
 class SerialTransport(Transport):
     """A serial port, opened exclusively; the channel of its messages is "".
 
-    pyserial opens and sets up the port. Reading and writing go straight to the file descriptor: that is faster, and a
-    child process can go on with a descriptor that it inherited (:meth:`from_fd`). The lock belongs to the open file,
-    so it holds until the last process closes it.
+    pyserial opens and sets up the port. Reading and writing go straight to the file descriptor: that is
+    faster, and a child process can go on with a descriptor that it inherited (:meth:`from_fd`). The lock
+    belongs to the open file, so it holds until the last process closes it.
 
     Args:
         port: Path of the port, such as ``/dev/ttyACM0``.
@@ -85,7 +85,8 @@ class SerialTransport(Transport):
             raise self._lost(error) from error
         if written < len(message.payload):
             raise TransportTimeoutError(
-                f"{self.port}: took {written} of {len(message.payload)} bytes; the device does not drain its input"
+                f"{self.port}: took {written} of {len(message.payload)} bytes; "
+                "the device does not drain its input"
             )
 
     def receive(self, timeout_s: float) -> Message:
@@ -140,11 +141,13 @@ class SerialTransport(Transport):
         text = str(error)
         if code in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in text:
             return PortBusyError(
-                f"{self.port} is held by another process; close the other collector or monitor (see `fuser {self.port}`)"
+                f"{self.port} is held by another process; close the other collector or monitor "
+                f"(see `fuser {self.port}`)"
             )
         if code == errno.EACCES:
             return PortNotFoundError(
-                f"{self.port} may not be opened by this user; add yourself to the group that owns it (often `dialout`)"
+                f"{self.port} may not be opened by this user; add yourself to the group that owns it "
+                "(often `dialout`)"
             )
         if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
             known = ", ".join(sorted(entry.device for entry in list_ports.comports())) or "none"

@@ -31,9 +31,9 @@ class DeviceCore(Protocol):
 class VirtualTransport(Transport):
     """Couples a device core to a virtual clock.
 
-    The device lives on while nobody looks: whatever moves the clock, the next call lets the device catch up. Waiting in
-    :meth:`receive` moves the clock, one device tick after the other, until bytes come out or the time has passed.
-    Messages carry the time at which the device sent them.
+    The device lives on while nobody looks: whatever moves the clock, the next call lets the device catch up.
+    Waiting in :meth:`receive` moves the clock, one device tick after the other, until bytes come out or the
+    time has passed. Messages carry the time at which the device sent them.
 
     Args:
         device: The device; its time 0 is the clock's time now.

@@ -8,11 +8,11 @@ import pytest
 
 from deal_hw.clock import VirtualClock
 from deal_hw.data.record import CycleRecord
-from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+
 
 class VirtualRig:
     """A nominal cart-pole on a virtual wire, with what came out of it."""

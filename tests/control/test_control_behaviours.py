@@ -27,7 +27,9 @@ def at(cart: float, pole: float = 0.0) -> RobotState:
 
 def targets(behaviour: Any, seconds: float = 4.0) -> FloatArray:
     """Return the targets of a run at 50 Hz, (T,)."""
-    return np.array([behaviour.command(NOWHERE, k / 50).position_target[0] for k in range(round(seconds * 50))])
+    return np.array(
+        [behaviour.command(NOWHERE, k / 50).position_target[0] for k in range(round(seconds * 50))]
+    )
 
 
 def test_policy_target_is_default_plus_scaled_action() -> None:
@@ -43,7 +45,9 @@ def test_policy_target_is_default_plus_scaled_action() -> None:
 
 def test_actions_are_clipped_and_nan_passes_through() -> None:
     """3 becomes 1, that is 0.25 m; NaN stays NaN for the safety filter to see."""
-    behaviour = PolicyBehaviour(LinearPolicy(SPEC, disturb=lambda k, a: np.array([(3.0, math.nan)[k]])), DESCRIPTION)
+    behaviour = PolicyBehaviour(
+        LinearPolicy(SPEC, disturb=lambda k, a: np.array([(3.0, math.nan)[k]])), DESCRIPTION
+    )
     assert behaviour.command(NOWHERE, 0.0).position_target[0] == 0.25
     assert math.isnan(behaviour.command(NOWHERE, 0.02).position_target[0])
 
@@ -65,13 +69,15 @@ def test_policy_with_an_action_of_another_shape_is_refused() -> None:
 def test_policy_reset_forgets_past_actions() -> None:
     """After a reset, an observed last action is 0 again."""
     term = dataclasses.replace(SPEC.observation[0], quantity="action", delay=1)
-    # Observed: cart position, its velocity, the pole's velocity, the last action in the place of the pole's angle.
+    # Observed: cart position, its velocity, the pole's velocity, the last action in the place of the pole's
+    # angle.
     spec = dataclasses.replace(SPEC, observation=(SPEC.observation[0], term, *SPEC.observation[2:]))
     behaviour = PolicyBehaviour(LinearPolicy(spec), DESCRIPTION)
     first = behaviour.command(at(0.1), 0.0).position_target[0]
     second = behaviour.command(at(0.1), 0.02).position_target[0]
     behaviour.reset()
-    # The first target is 1.65 * 0.1 = 0.165, an action of 0.66: observed, it adds 1.04 * 0.66 * 0.25 ... clipped at 0.25.
+    # The first target is 1.65 * 0.1 = 0.165, an action of 0.66: observed, it adds 1.04 * 0.66 * 0.25 ...
+    # clipped at 0.25.
     assert first == pytest.approx(0.165, abs=1e-6)
     assert second == 0.25
     assert behaviour.command(at(0.1), 0.0).position_target[0] == first
@@ -79,7 +85,9 @@ def test_policy_reset_forgets_past_actions() -> None:
 
 def test_rich_balances_first_then_holds_random_set_points() -> None:
     """1.6 s of the policy, then steps within 0.12 m, each held for 0.1 to 0.3 s rounded up to cycles."""
-    behaviour = RichBehaviour(DESCRIPTION, PolicyBehaviour(LinearPolicy(SPEC), DESCRIPTION), RichConfig(), seed=7)
+    behaviour = RichBehaviour(
+        DESCRIPTION, PolicyBehaviour(LinearPolicy(SPEC), DESCRIPTION), RichConfig(), seed=7
+    )
     states = [at(0.05)] * 80
     balancing = [behaviour.command(s, k / 50).position_target[0] for k, s in enumerate(states)]
     assert balancing == pytest.approx([1.65 * 0.05] * 80, abs=1e-6)
@@ -105,12 +113,22 @@ def test_rich_repeats_itself_by_seed() -> None:
 
 
 def test_rich_segments_scale_gains_and_limits() -> None:
-    """The second half of 4 s sends half the stiffness (40), twice the damping (16), 0.5 of effort (2) and speed (0.5)."""
+    """Half the stiffness (40) and limits (2, 0.5) and twice the damping (16) in the second half."""
     half = Segment(start=0.5, stop=1.0, stiffness=0.5, damping=2.0, effort_limit=0.5, speed_limit=0.5)
     behaviour = RichBehaviour(DESCRIPTION, None, RichConfig(balance_s=0.0, segments=(half,)), seed=0)
     before, after = behaviour.command(NOWHERE, 1.98), behaviour.command(NOWHERE, 2.0)
-    assert (before.stiffness[0], before.damping[0], before.effort_limit[0], before.speed_limit[0]) == (80, 8, 4, 1)
-    assert (after.stiffness[0], after.damping[0], after.effort_limit[0], after.speed_limit[0]) == (40, 16, 2, 0.5)
+    assert (before.stiffness[0], before.damping[0], before.effort_limit[0], before.speed_limit[0]) == (
+        80,
+        8,
+        4,
+        1,
+    )
+    assert (after.stiffness[0], after.damping[0], after.effort_limit[0], after.speed_limit[0]) == (
+        40,
+        16,
+        2,
+        0.5,
+    )
 
 
 def test_chirp_follows_the_integral_of_its_frequency() -> None:
@@ -138,8 +156,9 @@ def recording(**changes: Any) -> Trajectory:
         "joint_names": ("cart", "pole"), "actuated": ("cart",), "receive_s": empty, "device_s": empty,
         "position": empty, "velocity": empty, "effort": empty, "status": empty, "command_sequence": empty,
         "command_age_s": empty, "sent_s": np.array([5.0, 5.024, 5.036]), "sent_sequence": np.arange(3),
-        "asked_position": np.array([[0.1], [0.2], [0.3]]), "position_target": column * 0.0, "stiffness": column * 70,
-        "damping": column * 7, "effort_limit": column * 3, "speed_limit": column * 0.9,
+        "asked_position": np.array([[0.1], [0.2], [0.3]]), "position_target": column * 0.0,
+        "stiffness": column * 70, "damping": column * 7, "effort_limit": column * 3,
+        "speed_limit": column * 0.9,
     }  # fmt: skip
     return Trajectory(**{**fields, **changes})
 

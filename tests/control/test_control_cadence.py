@@ -31,7 +31,12 @@ def test_cycles_start_on_the_grid_whatever_their_work_takes(clock: VirtualClock)
         clock.advance_ns(work_ms * MS)
     assert starts == [(0, 0, 0), (1, 20 * MS, 20 * MS), (2, 40 * MS, 40 * MS), (3, 60 * MS, 60 * MS)]
     report = cadence.report()
-    assert (report.cycles, report.overruns, report.overruns_beyond_period, report.skipped_periods) == (4, 0, 0, 0)
+    assert (report.cycles, report.overruns, report.overruns_beyond_period, report.skipped_periods) == (
+        4,
+        0,
+        0,
+        0,
+    )
     assert report.period == Spread(0.02, 0.02, 0.02)
 
 
@@ -52,7 +57,7 @@ def test_a_late_cycle_starts_at_once_and_the_next_is_on_time(clock: VirtualClock
 
 
 def test_whole_periods_are_skipped_not_caught_up(clock: VirtualClock) -> None:
-    """85 ms of work: deadlines 20, 40 and 60 are over, so the cycle of 80 ms runs at 85, and the next at 100."""
+    """85 ms of work: three deadlines are over, the cycle of 80 ms runs at 85, the next at 100."""
     cadence = Cadence(clock, 50.0)
     cadence.begin()
     clock.advance_ns(85 * MS)
@@ -62,10 +67,17 @@ def test_whole_periods_are_skipped_not_caught_up(clock: VirtualClock) -> None:
     assert cadence.begin() == (5, 123 + 100 * MS)
     assert clock.now_ns() == 123 + 100 * MS
     report = cadence.report()
-    assert (report.cycles, report.overruns, report.overruns_beyond_period, report.skipped_periods) == (3, 1, 1, 3)
+    assert (report.cycles, report.overruns, report.overruns_beyond_period, report.skipped_periods) == (
+        3,
+        1,
+        1,
+        3,
+    )
 
 
-@pytest.mark.parametrize(("late_ms", "overruns", "beyond"), [(2, 0, 0), (2.1, 1, 0), (19.9, 1, 0), (20, 1, 1)])
+@pytest.mark.parametrize(
+    ("late_ms", "overruns", "beyond"), [(2, 0, 0), (2.1, 1, 0), (19.9, 1, 0), (20, 1, 1)]
+)
 def test_an_overrun_is_a_tenth_of_a_period_late(
     clock: VirtualClock, late_ms: float, overruns: int, beyond: int
 ) -> None:
@@ -94,7 +106,9 @@ def test_report_survives_json(clock: VirtualClock) -> None:
     """What was never measured is null in JSON and NaN again after reading; the rest is equal."""
     cadence = Cadence(clock, 50.0)
     cadence.begin()
-    report = cadence.report(states=4, losses=1, link_errors=2, cycles_without_state=3, scheduling="SCHED_FIFO")
+    report = cadence.report(
+        states=4, losses=1, link_errors=2, cycles_without_state=3, scheduling="SCHED_FIFO"
+    )
     text = json.dumps(report.to_json(), allow_nan=False)
     again = CadenceReport.from_json(json.loads(text))
     assert again.to_json() == report.to_json()

@@ -12,6 +12,7 @@ import pytest
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.passive import make_passive
 from deal_hw.control.safety import Safety
 from deal_hw.data.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole import protocol
@@ -45,7 +46,7 @@ def sent_types(rig: Any) -> list[protocol.MessageType]:
 
 
 def test_a_run_balances_and_ends_passive(rig: Any) -> None:
-    """2 s are 100 cycles and 100 commands; the pole stands; hello, home, arm come first and stop comes last."""
+    """2 s are 100 commands; the pole stands; hello, home, arm come first and stop comes last."""
     report = make_loop(rig, balance()).run()
     assert (report.outcome, report.reason, report.error) == (Outcome.FINISHED, "the run is over", "")
     assert report.passive_confirmed
@@ -308,7 +309,11 @@ def test_a_recorder_that_is_gone_ends_the_run_passively(rig: Any) -> None:
         return True
 
     report = make_loop(rig, balance(), sink=sink).run()
-    assert (report.outcome, report.reason, report.error) == (Outcome.FAILED, "the recorder is gone", "DatasetError")
+    assert (report.outcome, report.reason, report.error) == (
+        Outcome.FAILED,
+        "the recorder is gone",
+        "DatasetError",
+    )
     assert report.passive_confirmed
 
 
@@ -324,6 +329,17 @@ def test_rich_runs_twice_alike_and_reaches_the_devices_own_limits(rig: Any) -> N
     assert any("CLAMPED" in (s.status.name or "") for r in rig.records for s in r.states)
 
 
+def test_only_what_comes_after_the_passive_command_confirms_it(rig: Any) -> None:
+    """A sample from before the run, still in the queue of a supervisor's robot, confirms nothing."""
+    rig.robot.connect()
+    rig.clock.advance_ns(20 * MS)
+    # Some samples, all unarmed, wait on the wire; then the device falls silent.
+    assert rig.robot.read_state(0.0).status == 0
+    tick = rig.device.tick
+    rig.device.tick = lambda: tick()[:0]
+    assert make_passive(rig.robot, rig.clock, attempts=2) is False
+
+
 def test_the_heartbeat_names_each_phase(rig: Any) -> None:
     """Phases in order, each with the longest silence to be expected."""
     phases: list[tuple[str, float]] = []
@@ -332,7 +348,13 @@ def test_the_heartbeat_names_each_phase(rig: Any) -> None:
         progress=lambda name, silence_s: phases.append((name, silence_s)),
     )  # fmt: skip
     loop.run()
-    assert [name for name, _ in phases] == ["connecting", "homing", "arming", *["running"] * 5, "making passive"]
+    assert [name for name, _ in phases] == [
+        "connecting",
+        "homing",
+        "arming",
+        *["running"] * 5,
+        "making passive",
+    ]
     assert all(silence_s > 0 for _, silence_s in phases)
 
 
@@ -348,4 +370,3 @@ def test_settings_that_cannot_be_are_refused() -> None:
         LoopConfig(duration_s=0.0)
     with pytest.raises(ConfigurationError, match="passive_attempts"):
         LoopConfig(duration_s=1.0, passive_attempts=0)
-

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from deal_hw.drivers.cartpole.description import DESCRIPTION
 
 from deal_hw.clock import VirtualClock
 from deal_hw.data.record import CycleRecord
 from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.transport import Message
 from deal_hw.types import Event, JointCommand, RobotState, Status, Trajectory
 
@@ -76,6 +76,7 @@ def write_episode(tmp_path: Path) -> WriteEpisode:
     """Return a function that records cycles in virtual time; ``torn`` leaves it as a kill would."""
 
     def write(name: str = "episode.mcap", cycles: int = 150, torn: bool = False) -> Path:
+        (tmp_path / name).unlink(missing_ok=True)  # Hypothesis replays what failed.
         clock = VirtualClock(HOST_START_NS)
         recorder = EpisodeRecorder(tmp_path / name, DESCRIPTION.to_json(), {"purpose": "test"}, clock)
         recorder.open()

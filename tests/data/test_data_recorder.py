@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from deal_hw.drivers.cartpole.description import DESCRIPTION
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -20,6 +19,7 @@ from deal_hw.data.reader import read_episode, read_trajectory, read_wire
 from deal_hw.data.record import CycleRecord
 from deal_hw.data.recorder import EpisodeRecorder
 from deal_hw.data.repair import verify
+from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
 
 CYCLES = 150

@@ -1,4 +1,4 @@
-"""The emulated device in virtual time: modes, watchdog, latency, sensor, and physics equal to the MJCF's own actuator."""
+"""The emulated device in virtual time: modes, watchdog, latency, sensor, physics."""
 
 import dataclasses
 import math
@@ -6,6 +6,8 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -15,6 +17,21 @@ from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
 from deal_hw.types import Status
 
 MS = 1_000_000
+FUZZED = candidate_truth("realistic", np.random.default_rng(1), seed=1, xi=5.0, refused=0)
+COMMANDS = st.one_of(
+    st.builds(
+        lambda *v: protocol.encode(Target(*v)),
+        *(st.integers(*bounds) for bounds in (
+            (0, 2**32 - 2), (-(2**31), 2**31 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (0, 2**16 - 1),
+            (0, 2**32 - 1),
+        )),
+    ),
+    st.builds(
+        lambda kind, request: protocol.encode(kind(request)),
+        st.sampled_from([protocol.Hello, protocol.Arm, protocol.Stop, protocol.Home]),
+        st.integers(0, 255),
+    ),
+)  # fmt: skip
 
 
 def messages(data: bytes) -> list[protocol.AnyMessage]:
@@ -27,7 +44,9 @@ def states(data: bytes) -> list[State]:
     return [m for m in messages(data) if isinstance(m, State)]
 
 
-def target(sequence: int, position_um: int = 0, speed_um_s: int = 1_000_000, effort_mn: int = 4_000) -> Target:
+def target(
+    sequence: int, position_um: int = 0, speed_um_s: int = 1_000_000, effort_mn: int = 4_000
+) -> Target:
     """Return a target with default gains."""
     return Target(sequence, position_um, 80_000, 8_000, effort_mn, speed_um_s)
 
@@ -60,7 +79,7 @@ def test_the_device_introduces_itself_to_any_version() -> None:
 
 
 def test_state_frames_come_every_fifth_tick() -> None:
-    """From power-on: device time 0, 5000, 10 000 us, numbers 0, 1, 2; the pole hangs, nothing is armed or homed."""
+    """Device times 0, 5000, 10 000 us, numbers 0, 1, 2; the pole hangs, nothing is armed."""
     found = states(CartpoleDevice(nominal_truth()).advance_to(10 * MS))
     assert [(s.sequence, s.device_us) for s in found] == [(0, 0), (1, 5000), (2, 10_000)]
     assert all(s.status == 0 and s.command_sequence == protocol.NO_COMMAND for s in found)
@@ -106,12 +125,14 @@ def test_a_repeated_request_does_not_act_twice() -> None:
     device.advance_to(300 * MS)
     device.receive(protocol.encode(protocol.Home(5)))
     out = device.advance_to((HOMING_TICKS + 10) * MS)
-    assert [m for m in messages(out) if isinstance(m, Ack)] == [Ack(5, protocol.MessageType.HOME, Result.DONE)]
+    assert [m for m in messages(out) if isinstance(m, Ack)] == [
+        Ack(5, protocol.MessageType.HOME, Result.DONE)
+    ]
     assert Status(states(out)[-1].status) == Status.HOMED
 
 
 def test_the_watchdog_stops_the_motor_after_200_ms_and_latches() -> None:
-    """With the last target handled at tick 510, tick 709 is still armed, tick 710 is not; targets do not undo that."""
+    """The last target is handled at tick 510: tick 709 is armed, 710 is not; targets do not undo that."""
     device = armed_device(nominal_truth(), keep_truth=True)
     command(device, target(0, 50_000), 1)
     device.advance_to((510 + WATCHDOG_TICKS - 1) * MS)
@@ -166,7 +187,7 @@ def test_the_age_gives_the_tick_of_reception() -> None:
 
 
 def test_a_command_acts_after_the_actuation_delay() -> None:
-    """Handled at tick 510 with a delay of 7, the first force is held in tick 517: 80 N/m times 1 mm of slew = 0.08 N."""
+    """Handled at tick 510, delay 7: the first force is in tick 517, 80 N/m times 1 mm of slew = 0.08 N."""
     device = armed_device(nominal_truth(actuation_ticks=7), keep_truth=True)
     command(device, target(0, 100_000), 20)
     force = device.true_trajectory().force
@@ -187,7 +208,7 @@ def test_a_frame_reports_the_state_of_the_sensing_delay_ago() -> None:
 
 
 def test_the_effort_estimate_is_in_the_units_of_the_command() -> None:
-    """A servo twice as strong still reports its own 80 N/m times the error, and its own limit when it saturates."""
+    """A servo twice as strong still reports its own 80 N/m times the error, and its own limit."""
     truth = nominal_truth()
     strong = dataclasses.replace(truth, parameters={**truth.parameters, "servo.stiffness": 160.0})
     device = armed_device(strong, keep_truth=True)
@@ -208,7 +229,7 @@ def test_the_speed_limit_shows_in_the_status() -> None:
 
 
 def test_the_sensor_profile_quantises_and_differences() -> None:
-    """Positions are multiples of 0.5 mm and 2 pi / 4096; velocities are differences over four frames, 20 ms."""
+    """Positions are multiples of 0.5 mm and 2 pi / 4096; velocities differ over four frames."""
     device = armed_device(nominal_truth("sensor"))
     data = b"".join(command(device, target(i, 40_000 * (i % 2)), 100) for i in range(5))
     found = states(data)
@@ -228,7 +249,9 @@ def test_the_sensor_noise_has_the_size_that_the_description_says() -> None:
     device.advance_to(600 * MS)
     found = states(device.advance_to(10_600 * MS))
     np.testing.assert_allclose(np.std([s.cart_um for s in found]), 333, rtol=0.1)
-    np.testing.assert_allclose(np.std([s.pole_urad for s in found]), math.hypot(2000, 1534 / math.sqrt(12)), rtol=0.1)
+    np.testing.assert_allclose(
+        np.std([s.pole_urad for s in found]), math.hypot(2000, 1534 / math.sqrt(12)), rtol=0.1
+    )
 
 
 def test_the_realistic_profile_drops_frames_and_counts_them() -> None:
@@ -275,9 +298,21 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
     assert run(3, 1) != run(4, 1)
 
 
+@settings(deadline=None)
+@given(st.lists(st.one_of(st.binary(max_size=60), COMMANDS), max_size=15))
+def test_whatever_the_host_sends_the_device_goes_on(sent: list[bytes]) -> None:
+    """Garbage and commands of any size, in any order, never stop the state frames."""
+    device = armed_device(FUZZED)
+    for sequence, data in enumerate(sent):
+        device.receive(b"\0" + data)
+        found = states(device.advance_to(device.device_ns + 10 * MS))
+        assert found, sequence
+        assert all(math.isfinite(value) for value in device.true_position)
+
+
 @pytest.mark.parametrize("seed", [0, 2, 3, 5])
 def test_the_trajectory_equals_that_of_the_position_actuator_of_the_mjcf(seed: int) -> None:
-    """Ideal profile, no latency: to 1e-9 a MuJoCo rollout of the MJCF's own actuator with ctrl = slewed set-point.
+    """Without latency and noise it is a MuJoCo rollout with ctrl = slewed set-point, to 1e-9.
 
     The calibrator models the robot so. The motion goes through both limits, dry friction and a fallen pole.
     """

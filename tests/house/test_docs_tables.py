@@ -14,6 +14,11 @@ from deal_hw.data.schemas import CHANNELS
 from deal_hw.types import Status
 
 ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ("deal_hw", "drivers", "calib", "policies")
+SOURCES = "\n".join(
+    path.read_text(encoding="utf-8")
+    for path in [ROOT / "Makefile", *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))]
+)
 DATA_FORMAT = (ROOT / "docs" / "data-format.md").read_text(encoding="utf-8")
 
 
@@ -44,3 +49,26 @@ def test_readme_shows_each_job() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     places = [readme.index(f"    deal-hw {verb.example}\n") for verb in JOBS.values()]
     assert places == sorted(places)
+
+
+def names_in_docs() -> list[tuple[str, str]]:
+    """Return every source file, class, method and constant that the docs name, with the document."""
+    paths = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+    found = {
+        (path.name, name)
+        for path in paths
+        for name in re.findall(
+            r"`((?:[a-z_]+/)+[a-z_]+\.py|_*[A-Z]\w+(?:\._?\w+)?)`", path.read_text(encoding="utf-8")
+        )
+    }
+    return sorted(found)
+
+
+@pytest.mark.parametrize(("document", "name"), names_in_docs())
+def test_name_in_docs_exists(document: str, name: str) -> None:
+    """What a document names is somewhere in the sources."""
+    if name.endswith(".py"):
+        assert (ROOT / name).is_file()
+        return
+    for word in name.split("."):
+        assert re.search(rf"\b{word}\b", SOURCES), f"{document} names {name}"

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERATED = {".venv", ".git", "build", "dist", "runs", "htmlcov"}
+GENERATED = {"build", "dist", "runs", "htmlcov", "__pycache__", "deal_hw.egg-info"}
+DOTTED = {".ci", ".gitignore"}
 
 # Written with a hole in each word, so that this file does not hold what it looks for.
 MACHINE_PATHS = re.compile(r"(?<![\w.])/(?:h~ome|U~sers|r~oot|w~ork)/\w".replace("~", ""))
@@ -35,7 +36,9 @@ def files() -> list[Path]:
     if listed.returncode == 0 and listed.stdout:
         paths = [ROOT / name for name in listed.stdout.split("\0") if name]
     else:  # An unpacked archive has no version control.
-        paths = [path for path in ROOT.rglob("*") if not GENERATED & set(path.relative_to(ROOT).parts)]
+        names = [(path, path.relative_to(ROOT).parts) for path in ROOT.rglob("*")]
+        hidden = [path for path, parts in names if parts[0][0] == "." and parts[0] not in DOTTED]
+        paths = sorted({path for path, parts in names if not GENERATED & set(parts)} - set(hidden))
     return [path for path in paths if path.is_file() and not path.is_symlink()]
 
 
@@ -68,6 +71,7 @@ def test_repository_names_no_machine(pattern: re.Pattern[str]) -> None:
         (REGISTRY_HOSTS, "https://mirror.example:8080/py/s~imple/"),
         (SECRETS, "https:/~/jo:word@example.org"),
     ],
+    ids=["home", "checkout", "registry", "mirror", "password"],
 )
 def test_seeded_slip_is_caught(pattern: re.Pattern[str], text: str) -> None:
     """The patterns find what they are for."""

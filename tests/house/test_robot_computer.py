@@ -1,4 +1,4 @@
-"""The robot's own computer has the base install only: collect, deploy and data run there without the extras."""
+"""The robot's own computer has the base install only: its verbs run there without the extras."""
 
 from __future__ import annotations
 

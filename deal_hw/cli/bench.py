@@ -1,0 +1,209 @@
+"""``deal-hw bench``: how well calibration and the loop do, as JSON rows, a CSV and a figure; stopped benches go on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from deal_hw.data.files import write_json
+from deal_hw.data.run_folder import git_commit, versions
+from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
+
+FORMAT = "deal_hw.bench/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
+
+    bench: tyro.conf.Positional[Literal["loop"]]
+    """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows."""
+
+    profile: Literal["ideal", "sensor", "realistic"] = "sensor"
+    """Profile of the emulated robots."""
+
+    seeds: str = "0,1"
+    """Seeds, comma separated; ranges as 1000-1009. 0-99 are for tuning, 1000 and up for reporting."""
+
+    methods: str = ""
+    """Methods, comma separated; by default the default with training, and each search without polish."""
+
+    xi: float = 5.0
+    """Ratio of the search range."""
+
+    train: bool = True
+    """Train and deploy policies with the default method."""
+
+    out: Path = Path("loop.json")
+    """File of the rows; the CSV and the figure lie beside it."""
+
+    threads: int | None = None
+    """Simulation threads; by default all CPUs."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of a text such as ``"0,3,1000-1009"``.
+
+    Raises:
+        ConfigurationError: It is not such a text.
+    """
+    seeds: list[int] = []
+    try:
+        for part in text.split(","):
+            first, dash, last = part.strip().partition("-")
+            seeds += range(int(first), int(last) + 1) if dash else [int(first)]
+    except ValueError as err:
+        raise ConfigurationError(f"--seeds {text!r}: give numbers and ranges, such as 0,1 or 1000-1009") from err
+    if not seeds:
+        raise ConfigurationError(f"--seeds {text!r} names no seed")
+    return tuple(seeds)
+
+
+def bench(config: Bench) -> int:
+    """Run the cells that are not done yet and write rows, CSV and figure after each; return 1 if any cell failed."""
+    try:
+        from deal_hw.calib.methods import check_method
+        from deal_hw.cli.bench_loop import SEARCHES, loop_cells, loop_row
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "bench") from err
+
+    methods = tuple(m.strip() for m in config.methods.split(",") if m.strip()) or ("default", *SEARCHES)
+    for method in methods:
+        check_method(method)
+    rows = _load(config.out)
+    policies = config.out.parent / f"{config.out.stem}_policies"
+    cells = loop_cells(methods, parse_seeds(config.seeds))
+    done = {(r["profile"], r["seed"], r["method"], r["xi"]) for r in rows if not r["error"]}
+    for number, (seed, method) in enumerate(cells):
+        if (config.profile, seed, method, config.xi) in done:
+            continue
+        policies.mkdir(parents=True, exist_ok=True)
+        row = loop_row(
+            config.profile, seed, method, config.xi, train=config.train, folder=policies, threads=config.threads
+        )
+        key = ("profile", "seed", "method", "xi")
+        rows = [r for r in rows if any(r[k] != row[k] for k in key)] + [row]
+        save(config.out, rows)
+        if not config.quiet:
+            print(f"{number + 1}/{len(cells)} {_line(row)}", flush=True)
+    if not config.quiet:
+        print_summary(rows)
+        print(f"written: {config.out}, {config.out.with_suffix('.csv')}, {config.out.with_suffix('.png')}")
+    return 1 if any(row["error"] for row in rows) else 0
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    head = f"{row['profile']} seed {row['seed']} {row['method']}"
+    if row["error"]:
+        return f"{head}: {row['error']}"
+    text = f"{head}: error {row['error_percent']:.2f} %, log error x100 {row['log_error_x100']:.2f}, {row['seconds']:.0f} s"
+    if "angle_error_retrained" in row:
+        text += (
+            f", angle error UDR {row['angle_error_udr']:.4f} retrained {row['angle_error_retrained']:.4f} "
+            f"oracle {row['angle_error_oracle']:.4f} rad"
+        )
+    return text
+
+
+def _load(path: Path) -> list[dict[str, Any]]:
+    if not path.exists():
+        return []
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if values["format"] != FORMAT:
+            raise DatasetError(f"{path} has format {values['format']!r}, expected {FORMAT!r}; name another file")
+        rows: list[dict[str, Any]] = values["rows"]
+    except (ValueError, KeyError, TypeError) as err:
+        raise DatasetError(f"{path} exists and is not a bench file ({err!r}); name another file") from err
+    return rows
+
+
+def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the machine they came from, the CSV and the figure."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    machine = {
+        "platform": platform.platform(),
+        "processors": len(os.sched_getaffinity(0)),
+        "load": list(os.getloadavg()),
+        "versions": versions(),
+        "git_commit": git_commit(),
+    }
+    write_json(path, {"format": FORMAT, "machine": machine, "argv": sys.argv, "rows": list(rows)})
+    names = sorted({k for row in rows for k, v in row.items() if not isinstance(v, dict | list)})
+    with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    _figure(path.with_suffix(".png"), [row for row in rows if not row["error"]])
+
+
+def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    if not rows:
+        return
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as err:
+        raise MissingExtraError("matplotlib", "bench") from err
+    figure = Figure(figsize=(7.5, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    for i, method in enumerate(methods):
+        values = [row["log_error_x100"] for row in rows if row["method"] == method]
+        left.plot([i] * len(values), values, "o", alpha=0.6, color=f"C{i}")
+    left.set_xticks(range(len(methods)), methods, rotation=30, ha="right")
+    left.set_yscale("log")
+    left.set_ylabel("100 mean |ln(p / p*)|")
+    left.set_title("parameter error, one point a seed", fontsize=10)
+    trained = [row for row in rows if "angle_error_retrained" in row]
+    for row in trained:
+        values = [row[f"angle_error_{name}"] for name in ("udr", "retrained", "oracle")]
+        right.plot(range(3), values, "o-", alpha=0.5, color="C0", linewidth=0.8)
+    right.set_xticks(range(3), ["UDR", "retrained", "oracle"])
+    right.set_title("pole-angle error [rad]" if trained else "no policies trained", fontsize=10)
+    figure.savefig(path, dpi=130)
+
+
+def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print median and worst by profile and method."""
+    import numpy as np
+    from rich.console import Console
+    from rich.table import Table
+
+    good = [row for row in rows if not row["error"]]
+    table = Table(title="median over seeds (worst)")
+    for name in ("profile", "method", "seeds", "error %", "log error x100", "coverage90", "width90", "held-out / nominal",
+                 "latency error ms", "flagged", "seconds"):  # fmt: skip
+        table.add_column(name, justify="left" if name in ("profile", "method") else "right")
+    for profile, method in dict.fromkeys((row["profile"], row["method"]) for row in good):
+        part = [row for row in good if (row["profile"], row["method"]) == (profile, method)]
+
+        def values(name: str, rows: Sequence[Mapping[str, Any]] = part) -> Any:
+            return np.array([row[name] for row in rows], dtype=float)
+
+        ratio = values("heldout_nrmse_calibrated") / values("heldout_nrmse_nominal")
+        late = 1e3 * np.abs(values("latency_found") - values("latency_true"))
+        table.add_row(
+            profile,
+            method,
+            str(len(part)),
+            *(f"{np.median(values(n)):.2f} ({values(n).max():.2f})" for n in ("error_percent", "log_error_x100")),
+            f"{values('coverage90').mean():.2f}",
+            f"{np.median(values('width90')):.2f}",
+            f"{np.median(ratio):.3f} ({ratio.max():.3f})",
+            f"{np.median(late):.2f} ({late.max():.2f})",
+            f"{int(values('flagged').sum())}",
+            f"{np.median(values('seconds')):.0f} ({values('seconds').max():.0f})",
+        )
+    Console(width=150).print(table)

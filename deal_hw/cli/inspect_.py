@@ -1,0 +1,192 @@
+"""``deal-hw inspect``: see the real, the nominal and the calibrated motion on one screen."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from deal_hw.calibration import CalibrationResult
+from deal_hw.data.reader import Episode, read_episode
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import robot_description
+from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
+from deal_hw.viz.episode_log import write_episode
+from deal_hw.viz.screenshot import save_screenshot
+from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
+
+RESULT_FILE = "result.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspect:
+    """See the real, the nominal and the calibrated motion on one screen.
+
+    Without --save, --screenshot and --web a window opens.
+    """
+
+    episode: tyro.conf.Positional[Path]
+    """The recording, such as runs/first/dataset/episodes/000000.mcap."""
+
+    calibration: Path | None = None
+    """Result of `deal-hw calibrate` to show beside it: the folder, or its result.json."""
+
+    save: Path | None = None
+    """Write a rerun recording (.rrd)."""
+
+    screenshot: Path | None = None
+    """Write a picture (.png); needs a Vulkan renderer, but no desktop."""
+
+    web: bool = False
+    """Serve it to a browser on this machine until Ctrl-C."""
+
+    web_port: int = DEFAULT_WEB_PORT
+    """Where the browser connects; 0 for any free port."""
+
+    window: float = DEFAULT_WINDOW_S
+    """Predictions restart from the measured state after this time [s]."""
+
+    latency: float | None = None
+    """Total latency in the predictions [s]; by default the calibration's, or 0."""
+
+    at: float | None = None
+    """Device time that the screenshot shows [s]; by default where the nominal model errs most."""
+
+    quiet: bool = False
+    """Print nothing but errors and the address to open."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("latency", self.latency), ("at", self.at)):
+            if value is not None and not (math.isfinite(value) and value >= 0):
+                raise ConfigurationError(f"--{name} must be 0 s or more, got {value:g} s")
+        if not 0 <= self.web_port < 65536:
+            raise ConfigurationError(f"--web-port must be between 0 and 65535, got {self.web_port}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectReport:
+    """What was shown.
+
+    Attributes:
+        overlay: The predictions; None where the recording allows none.
+        note: Why there is none; empty otherwise.
+        files: The files written.
+    """
+
+    overlay: Overlay | None
+    note: str
+    files: tuple[Path, ...]
+
+
+def inspect(config: Inspect) -> InspectReport:
+    """Write, serve, picture or open a recording with predictions beside it.
+
+    Raises:
+        DatasetError: The recording cannot be read.
+        ConfigurationError: A setting cannot be used, or this machine cannot show it; the message says what
+            would do.
+    """
+    if not (config.save or config.screenshot or config.web):
+        check_display()
+    episode = read_episode(config.episode)
+    description = robot_description(str(episode.description["name"]))
+    result = read_result(config.calibration) if config.calibration else None
+    overlay, note = _overlay(config, episode, description, result)
+    with contextlib.ExitStack() as stack:
+        rrd = config.save
+        if rrd is None:
+            rrd = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="deal-hw-"))) / "episode.rrd"
+        _prepare(rrd)
+        write_episode(
+            rrd, episode.trajectory, description, cycles=episode.cycles, overlay=overlay, result=result,
+            name=f"{config.episode.parent.parent.name}/{config.episode.stem}", note=note,
+        )  # fmt: skip
+        if config.screenshot:
+            save_screenshot(rrd, config.screenshot, at_s=_moment(config, overlay))
+        _show(config, rrd)
+    files = tuple(file for file in (config.save, config.screenshot) if file)
+    if not config.quiet:
+        _print(overlay, note, files)
+    return InspectReport(overlay=overlay, note=note, files=files)
+
+
+def read_result(path: Path) -> CalibrationResult:
+    """Return a calibration result from its folder or file.
+
+    Raises:
+        ConfigurationError: It is not there or does not hold one.
+    """
+    file = path / RESULT_FILE if path.is_dir() else path
+    try:
+        return CalibrationResult.from_json(json.loads(file.read_text(encoding="utf-8")))
+    except OSError as err:
+        raise ConfigurationError(
+            f"{file} cannot be read: {err.strerror}; `deal-hw calibrate` writes it"
+        ) from err
+    except (KeyError, TypeError, ValueError) as err:
+        raise ConfigurationError(f"{file} does not hold a calibration result: {err!r}") from err
+
+
+def _overlay(
+    config: Inspect, episode: Episode, description: RobotDescription, result: CalibrationResult | None
+) -> tuple[Overlay | None, str]:
+    space = ParameterSpace([]) if result is None else result.space
+    sets = {"nominal": space.nominal}
+    if result is not None:
+        sets["calibrated"] = result.estimate
+    latency_s = config.latency
+    if latency_s is None:
+        latency_s = 0.0 if result is None else result.latency_s
+    try:
+        overlay = compute_overlay(
+            episode.trajectory, description, space, sets, latency_s=latency_s, window_s=config.window
+        )
+    except InsufficientDataError as err:
+        return None, f"No predictions: {err}."
+    return overlay, ""
+
+
+def _moment(config: Inspect, overlay: Overlay | None) -> float | None:
+    if config.at is not None or overlay is None:
+        return config.at
+    return overlay.worst_moment_s("nominal")
+
+
+def _prepare(file: Path) -> None:
+    if file.is_dir():
+        raise ConfigurationError(f"{file} is a folder; name a file, such as {file / 'episode.rrd'}")
+    file.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _show(config: Inspect, rrd: Path) -> None:
+    if config.web:
+        with (
+            serve_web(rrd, port=config.web_port) as (address, server),
+            contextlib.suppress(KeyboardInterrupt),
+        ):
+            print(f"open {address}  (this machine only; Ctrl-C ends it)", flush=True)
+            server.process.wait()
+            server.check()
+    elif not (config.save or config.screenshot):
+        open_window(rrd)
+
+
+def _print(overlay: Overlay | None, note: str, files: tuple[Path, ...]) -> None:
+    if note:
+        print(note)
+    if overlay is not None:
+        for name, prediction in overlay.predictions.items():
+            shares = ", ".join(
+                f"{joint} {100 * share:.2g} %"
+                for joint, share in zip(overlay.joint_names, prediction.position_nrmse, strict=True)
+            )
+            print(f"{name:>10}: position error over {overlay.window_s:.2f} s, of the range: {shares}")
+    for file in files:
+        print(f"written: {file}")

@@ -1,0 +1,179 @@
+"""``deal-hw train``: train a policy under a parameter distribution."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tyro
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.parameters import ParameterDistribution, ParameterSpace
+
+if TYPE_CHECKING:
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.training import TrainingProgress
+
+ROBOTS = ("cartpole",)
+UDR_RATIO = 5.0
+UDR_LATENCY_S = (0.0, 0.03)
+"""Total latencies that uniform domain randomisation covers [s]."""
+POLICY_FILE = Path("policies") / "policy.onnx"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
+
+    robot: tyro.conf.Positional[str] = "cartpole"
+    """The robot."""
+
+    distribution: Path | None = None
+    """distribution.json of a calibration: parameters, their uncertainty, latency."""
+
+    udr: bool = False
+    """Train under uniform domain randomisation instead: every parameter within a factor of 5 of nominal."""
+
+    out: Path = Path("runs") / "train"
+    """The .onnx file to write, or a run folder, which gets policies/policy.onnx."""
+
+    steps: int | None = None
+    """Environment steps; by default what the shipped policy was trained with."""
+
+    members: int | None = None
+    """Robots simulated at once; by default what the shipped policy was trained with."""
+
+    seed: int = 0
+    """Decides everything random."""
+
+    quiet: bool = False
+    """No progress bar."""
+
+
+def train(config: Train) -> OnnxPolicy:
+    """Train a policy as the settings say and return it.
+
+    Raises:
+        ConfigurationError: Not exactly one distribution was asked for, or it cannot be read.
+        UnknownNameError: There is no such robot.
+    """
+    if (config.distribution is None) == (not config.udr):
+        raise ConfigurationError(
+            "say under what to train: --distribution FILE (deal-hw calibrate writes distribution.json) or --udr"
+        )
+    distribution = udr_distribution(config.robot) if config.distribution is None else read_distribution(config.distribution)
+    path = config.out if config.out.suffix == ".onnx" else config.out / POLICY_FILE
+    with _progress_bar(config.quiet) as bar:
+        policy = train_policy(
+            config.robot, distribution, path, seed=config.seed, steps=config.steps, members=config.members,
+            progress=_follow(bar),
+        )  # fmt: skip
+    print(f"policy: {path}")
+    print(f"record: {path.with_suffix('.json')}")
+    return policy
+
+
+def train_policy(
+    robot: str,
+    distribution: ParameterDistribution,
+    path: Path,
+    *,
+    seed: int = 0,
+    steps: int | None = None,
+    members: int | None = None,
+    progress: TrainingProgress | None = None,
+) -> OnnxPolicy:
+    """Train a policy by SAC and write it with its training record.
+
+    Args:
+        robot: The robot's name.
+        distribution: What parameters and latency are drawn from.
+        path: The .onnx file; the record goes beside it.
+        seed: Decides everything random.
+        steps: Environment steps; None for the default.
+        members: Robots simulated at once; None for the default.
+        progress: Called as the training goes on.
+
+    Returns:
+        The policy, read back from its file.
+    """
+    import dataclasses
+
+    from deal_hw.drivers import robot_description
+    from deal_hw.policies.cartpole_env import MEMBERS, CartPoleEnv
+    from deal_hw.policies.onnx_export import export_network
+    from deal_hw.policies.sac import SacConfig, SacTrainer
+
+    if robot not in ROBOTS:
+        raise UnknownNameError("robot with a training environment", robot, ROBOTS)
+    config = SacConfig() if steps is None else dataclasses.replace(SacConfig(), steps=steps)
+    env = CartPoleEnv(robot_description(robot), distribution, members or MEMBERS)
+    started, cpu = time.monotonic(), time.process_time()
+    policy = SacTrainer().train(env, config, np.random.default_rng(seed), progress)
+    record = {
+        "format": "deal_hw.training/1",
+        "robot": robot,
+        "seed": seed,
+        "training": dict(policy.spec.training),
+        "task": dataclasses.asdict(env.task),
+        "reward": CartPoleEnv.__doc__,
+        "distribution": distribution.to_json(),
+        "distribution_digest": distribution.digest(),
+        "spec_digest": policy.spec.digest(),
+        "seconds": time.monotonic() - started,
+        "cpu_seconds": time.process_time() - cpu,
+    }
+    return export_network(policy.network, policy.spec, path, record)
+
+
+def udr_distribution(robot: str) -> ParameterDistribution:
+    """Return the distribution of uniform domain randomisation.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    return ParameterDistribution.uniform(_space(robot).with_ratio(UDR_RATIO), UDR_LATENCY_S)
+
+
+def read_distribution(path: Path) -> ParameterDistribution:
+    """Read what a calibration wrote.
+
+    Raises:
+        ConfigurationError: There is no such file, or it holds no distribution.
+    """
+    try:
+        return ParameterDistribution.from_json(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError as err:
+        raise ConfigurationError(f"no such file: {path}; `deal-hw calibrate` writes calibration/distribution.json") from err
+    except (ValueError, KeyError, TypeError, AttributeError) as err:
+        raise ConfigurationError(f"{path} holds no parameter distribution: {err}") from err
+
+
+def _space(robot: str) -> ParameterSpace:
+    if robot not in ROBOTS:
+        raise UnknownNameError("robot with a training environment", robot, ROBOTS)
+    from deal_hw.drivers.cartpole.description import k9_space
+
+    return k9_space()
+
+
+def _progress_bar(quiet: bool) -> Progress:
+    return Progress(
+        TextColumn("training"), BarColumn(), TextColumn("{task.completed}/{task.total} steps"),
+        TextColumn("return {task.fields[recent]:.1f}"), TimeElapsedColumn(), disable=quiet,
+    )  # fmt: skip
+
+
+def _follow(bar: Progress) -> Callable[[int, int, float], None]:
+    row = bar.add_task("training", total=None, recent=0.0)
+
+    def follow(done: int, total: int, recent: float) -> None:
+        bar.update(row, completed=done, total=total, recent=recent)
+
+    return follow

@@ -1,0 +1,73 @@
+"""Showing a recording: in a browser, served to this machine only, or in rerun's own window."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import urllib.parse
+from collections.abc import Iterator
+from pathlib import Path
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.viz.viewer import LOOPBACK, Viewer, check_port, free_port, run_viewer, wait_until_listening
+
+DEFAULT_WEB_PORT = 9090
+_START_S = 20.0
+
+
+@contextlib.contextmanager
+def serve_web(rrd: Path, *, port: int = DEFAULT_WEB_PORT) -> Iterator[tuple[str, Viewer]]:
+    """Serve rerun's web viewer with a recording on the loopback interface until the block ends.
+
+    Args:
+        rrd: The recording.
+        port: Where the browser connects; 0 for any free one. The data come over another free port.
+
+    Yields:
+        The address to open, and the server.
+
+    Raises:
+        ConfigurationError: No such file, the port is taken, or the server does not start.
+    """
+    _check_file(rrd)
+    web_port = port or free_port()
+    check_port(web_port)
+    data_port = free_port()
+    arguments = [str(rrd), "--serve-web", "--bind", LOOPBACK]
+    arguments += ["--web-viewer-port", str(web_port), "--port", str(data_port)]
+    with run_viewer(arguments) as viewer:
+        for wanted in (web_port, data_port):
+            wait_until_listening(viewer, wanted, _START_S)
+        data = urllib.parse.quote(f"rerun+http://{LOOPBACK}:{data_port}/proxy", safe="")
+        yield f"http://{LOOPBACK}:{web_port}?url={data}", viewer
+
+
+def check_display() -> None:
+    """Check that there is a desktop to open a window on.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigurationError(
+            "there is no desktop to open a window on; use --web and a browser, --save FILE.rrd or "
+            "--screenshot FILE.png"
+        )
+
+
+def open_window(rrd: Path) -> None:
+    """Show a recording in rerun's own window and return when it is closed.
+
+    Raises:
+        ConfigurationError: No such file, there is no desktop, or the viewer failed.
+    """
+    _check_file(rrd)
+    check_display()
+    with run_viewer([str(rrd), "--bind", LOOPBACK, "--port", str(free_port())]) as viewer:
+        if viewer.process.wait():
+            viewer.check()
+
+
+def _check_file(rrd: Path) -> None:
+    if not rrd.is_file():
+        raise ConfigurationError(f"{rrd}: no such recording")

@@ -1,0 +1,141 @@
+"""Rerun's own program as a child: on loopback, without its usage statistics, gone when we are done."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from deal_hw.errors import ConfigurationError, MissingExtraError
+
+LOOPBACK = "127.0.0.1"
+"""Rerun's default is every interface: a recording would be readable from the whole network."""
+_STOP_S = 5.0
+
+
+@dataclass(slots=True)
+class Viewer:
+    """A running rerun program.
+
+    Attributes:
+        process: The child.
+        log: File with what it printed.
+    """
+
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    @property
+    def output(self) -> str:
+        """What it printed so far."""
+        return self.log.read_text(encoding="utf-8", errors="replace")
+
+    def check(self) -> None:
+        """Check that it runs.
+
+        Raises:
+            ConfigurationError: It ended; the message holds its last lines.
+        """
+        if (code := self.process.poll()) is not None:
+            last = "\n".join(self.output.strip().splitlines()[-5:])
+            raise ConfigurationError(f"rerun ended with exit code {code}:\n{last}")
+
+
+def program() -> Path:
+    """Return rerun's program.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
+    spec = importlib.util.find_spec("rerun_cli")
+    for folder in (spec.submodule_search_locations or []) if spec else []:
+        path = Path(folder) / "rerun"
+        if path.exists():
+            return path
+    raise MissingExtraError("rerun-sdk", "viz")
+
+
+def free_port() -> int:
+    """Return a TCP port that is free on the loopback interface now."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def check_port(port: int) -> None:
+    """Check that a TCP port can be had on the loopback interface.
+
+    Raises:
+        ConfigurationError: Somebody has it.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as err:
+            raise ConfigurationError(
+                f"port {port} of {LOOPBACK} cannot be had ({err.strerror}); choose another"
+            ) from err
+
+
+@contextlib.contextmanager
+def run_viewer(
+    arguments: Sequence[str], extra_environment: Mapping[str, str] | None = None
+) -> Iterator[Viewer]:
+    """Run rerun's program until the block ends.
+
+    It gets a settings folder of its own, so that it reports no usage whatever the user's settings say, and
+    looks the same on every machine; the user's own settings are not touched.
+
+    Args:
+        arguments: Its arguments.
+        extra_environment: Variables to set for it.
+    """
+    binary = str(program())
+    with tempfile.TemporaryDirectory(prefix="deal-hw-rerun-") as home:
+        environment = {**os.environ, **(extra_environment or {})}
+        environment.update(XDG_CONFIG_HOME=home, XDG_DATA_HOME=home)
+        environment.setdefault("XDG_RUNTIME_DIR", home)
+        subprocess.run([binary, "analytics", "disable"], env=environment, check=True, capture_output=True)
+        log = Path(home) / "log.txt"
+        with log.open("wb") as file:
+            process = subprocess.Popen(
+                [binary, *arguments], env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file
+            )
+        try:
+            yield Viewer(process, log)
+        finally:
+            _stop(process)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def wait_until_listening(viewer: Viewer, port: int, timeout_s: float) -> None:
+    """Wait until the program accepts connections on a port.
+
+    Raises:
+        ConfigurationError: It ended, or does not in time.
+    """
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        viewer.check()
+        with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=1.0):
+            return
+        time.sleep(0.05)
+    raise ConfigurationError(
+        f"rerun did not listen on port {port} within {timeout_s:g} s:\n{viewer.output[-500:]}"
+    )

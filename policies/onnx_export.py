@@ -1,0 +1,123 @@
+"""Writes a torch network as an ONNX file that carries its policy spec, and the record of its training beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+
+from deal_hw.errors import PolicyError
+from deal_hw.policies.onnx_runtime import SPEC_KEY, OnnxPolicy
+from deal_hw.policy import PolicySpec
+
+OPSET = 18
+IR_VERSION = 9
+"""Old enough for every onnxruntime that the base install accepts."""
+_ACTIVATIONS: Mapping[type[torch.nn.Module], str] = {
+    torch.nn.ReLU: "Relu",
+    torch.nn.Tanh: "Tanh",
+}
+TOLERANCE = 1e-5
+"""Largest difference between network and file on an action in [-1, 1]."""
+
+
+def export_network(
+    network: torch.nn.Module, spec: PolicySpec, path: Path, record: Mapping[str, Any] | None = None
+) -> OnnxPolicy:
+    """Write a network, compare the file with it, and return the file's policy.
+
+    The files are written under other names and then renamed: an interrupted export leaves nothing that could be deployed.
+
+    Args:
+        network: Observations (B, O) in, actions (B, A) out: a Sequential of linear layers and activations.
+        spec: What it observes and what its action means.
+        path: The .onnx file; the record goes beside it with the suffix .json.
+        record: Plain JSON values about the training.
+
+    Raises:
+        PolicyError: A layer is of an unknown type, or the file does not compute what the network computes.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        write_policy(_graph(network, len(spec.observation)), spec, draft)
+        policy = OnnxPolicy(draft)
+        _check_equal(network, policy)
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+    if record is not None:
+        path.with_suffix(".json").write_text(json.dumps(dict(record), indent=2, sort_keys=True) + "\n", encoding="utf-8")
+    return OnnxPolicy(path)
+
+
+def write_policy(model: onnx.ModelProto, spec: PolicySpec, path: Path) -> None:
+    """Write an ONNX network with a policy spec inside, weights included, as one file."""
+    kept = {entry.key: entry.value for entry in model.metadata_props if entry.key != SPEC_KEY}
+    onnx.helper.set_model_props(model, {**kept, SPEC_KEY: spec.to_json()})
+    onnx.checker.check_model(model)
+    path.write_bytes(model.SerializeToString())
+
+
+def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
+    # Built by hand: torch's exporter takes seconds, needs onnxscript, and writes the paths of this machine into every
+    # node. A policy network is a chain of a few known layers.
+    nodes: list[onnx.NodeProto] = []
+    weights: list[onnx.TensorProto] = []
+    width, value = observation, "observation"
+    layers = _chain(network)
+    for i, layer in enumerate(layers):
+        result = "action" if i == len(layers) - 1 else f"value_{i}"
+        if isinstance(layer, torch.nn.Linear):
+            names = [f"weight_{i}", f"bias_{i}"]
+            bias = torch.zeros(layer.out_features) if layer.bias is None else layer.bias
+            weights += [
+                onnx.numpy_helper.from_array(tensor.detach().cpu().numpy().astype(np.float32), name)
+                for tensor, name in zip((layer.weight, bias), names, strict=True)
+            ]
+            nodes.append(onnx.helper.make_node("Gemm", [value, *names], [result], transB=1))
+            width = layer.out_features
+        elif type(layer) in _ACTIVATIONS:
+            nodes.append(onnx.helper.make_node(_ACTIVATIONS[type(layer)], [value], [result]))
+        else:
+            known = ", ".join(["Linear", *(kind.__name__ for kind in _ACTIVATIONS)])
+            raise PolicyError(
+                f"cannot export a layer of type {type(layer).__name__}; known inside Sequential: {known}"
+            )
+        value = result
+    graph = onnx.helper.make_graph(
+        nodes,
+        "policy",
+        [onnx.helper.make_tensor_value_info("observation", onnx.TensorProto.FLOAT, ["batch", observation])],
+        [onnx.helper.make_tensor_value_info("action", onnx.TensorProto.FLOAT, ["batch", width])],
+        weights,
+    )
+    opset = onnx.helper.make_opsetid("", OPSET)
+    return onnx.helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="deal-hw")
+
+
+def _chain(network: torch.nn.Module) -> list[torch.nn.Module]:
+    if isinstance(network, torch.nn.Sequential):
+        return [layer for part in network for layer in _chain(part)]
+    return [network]
+
+
+def _check_equal(network: torch.nn.Module, policy: OnnxPolicy) -> None:
+    # Fixed draws: an export must not use up anybody's randomness.
+    scales = np.array([0.1, 1.0, 10.0], dtype=np.float32)[:, None, None]
+    draws = np.random.default_rng(0).standard_normal((3, 32, len(policy.spec.observation))).astype(np.float32)
+    observations = (scales * draws).reshape(-1, draws.shape[-1])
+    with torch.no_grad():
+        wanted = network(torch.as_tensor(observations)).numpy()
+    worst = float(np.abs(policy.act_batch(observations) - wanted).max())
+    if not worst <= TOLERANCE:
+        raise PolicyError(
+            f"the exported policy differs from the network by {worst:g}, allowed are {TOLERANCE:g}; "
+            "the network holds an operation that ONNX computes otherwise"
+        )

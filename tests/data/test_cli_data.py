@@ -1,0 +1,100 @@
+"""`deal-hw data`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deal_hw.cli.data import Info, Repair, Verify, data
+from deal_hw.data.dataset import Dataset
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.errors import DatasetError
+
+WriteEpisode = Callable[..., Path]
+
+
+@pytest.fixture
+def dataset(tmp_path: Path, write_episode: WriteEpisode) -> Path:
+    """A dataset of one sound episode."""
+    folder = tmp_path / "dataset"
+    with Dataset.create_or_open(folder, DESCRIPTION) as collection:
+        path = collection.next_episode_path()
+        shutil.copy(write_episode("source.mcap"), path)
+        collection.note_episode(path)
+    return folder
+
+
+def test_info_of_a_dataset(
+    dataset: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The table names robot, episode and counts."""
+    monkeypatch.setenv("COLUMNS", "200")
+    assert data(Info(path=dataset)) == 0
+    printed = capsys.readouterr().out
+    for words in ("cartpole", DESCRIPTION.digest(), "episodes/000000.mcap", "600", "150"):
+        assert words in printed
+
+
+def test_info_as_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """JSON of a dataset and of an episode hold the same episode."""
+    assert data(Info(path=dataset, json=True)) == 0
+    whole = json.loads(capsys.readouterr().out)
+    assert whole["robot"] == "cartpole"
+    assert data(Info(path=dataset / "episodes" / "000000.mcap", json=True)) == 0
+    assert json.loads(capsys.readouterr().out) == whole["episodes"][0]
+
+
+def test_info_of_an_episode_shows_checks(
+    dataset: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each check has its row, and the clocks theirs."""
+    monkeypatch.setenv("COLUMNS", "200")
+    assert data(Info(path=dataset / "episodes" / "000000.mcap")) == 0
+    printed = capsys.readouterr().out
+    for words in ("clamped_by_us", "host minus device", "excitation: position_range"):
+        assert words in printed
+
+
+def test_verify_then_repair(
+    dataset: Path, write_episode: WriteEpisode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Verify finds the torn episode and exits with 1, repair mends it and indexes it, verify is content."""
+    shutil.copy(write_episode("torn.mcap", torn=True), dataset / "episodes" / "000001.mcap")
+    assert data(Verify(path=dataset)) == 1
+    assert "no footer" in capsys.readouterr().out
+    assert data(Repair(path=dataset)) == 0
+    assert "Rewritten" in capsys.readouterr().out
+    assert data(Verify(path=dataset, json=True)) == 0
+    assert [file["sound"] for file in json.loads(capsys.readouterr().out)["files"]] == [True, True]
+    assert len(Dataset.open(dataset).episodes) == 2
+
+
+def test_unreadable_file_does_not_hide_the_others(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An empty file is named as an error; the sound one is still reported."""
+    (dataset / "episodes" / "000001.mcap").touch()
+    assert data(Repair(path=dataset)) == 1
+    printed = capsys.readouterr().out
+    assert "000000.mcap: sound" in printed
+    assert "000001.mcap is empty" in printed
+
+
+def test_wrong_path_is_said(tmp_path: Path) -> None:
+    """A folder without episodes and an absent file are errors with their paths."""
+    with pytest.raises(DatasetError, match="neither a dataset"):
+        data(Verify(path=tmp_path))
+    with pytest.raises(DatasetError, match=r"it has no dataset\.json"):
+        data(Info(path=tmp_path))
+    with pytest.raises(DatasetError, match="cannot be read"):
+        data(Info(path=tmp_path / "absent.mcap"))
+
+
+def test_command_line_reaches_the_verbs(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`deal-hw data verify DIR` is understood."""
+    from deal_hw.cli.main import main
+
+    assert main(["data", "verify", str(dataset)]) == 0
+    assert "sound" in capsys.readouterr().out

@@ -1,0 +1,250 @@
+"""The emulator over a pty: here with a clock that the test sets, and as a process of its own."""
+
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.clock import MonotonicClock, VirtualClock
+from deal_hw.drivers import adopt_robot, make_robot
+from deal_hw.drivers.cartpole import protocol
+from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.emulator_process import EmulatorProcess
+from deal_hw.drivers.transports.serial_transport import SerialTransport
+from deal_hw.errors import (
+    ConfigurationError,
+    PortBusyError,
+    TransportError,
+    TransportLostError,
+    UnknownNameError,
+)
+from deal_hw.testing.robot_suite import default_command
+from deal_hw.transport import Message
+from deal_hw.types import Status
+
+MS = 1_000_000
+
+
+class Bench:
+    """An emulator whose time the test moves, and a port on it."""
+
+    def __init__(self, hazards: Hazards | None = None, link: Path | None = None) -> None:
+        self.clock = VirtualClock()
+        self.device = CartpoleDevice(nominal_truth())
+        self.emulator = CartpoleEmulator(self.device, link=link, hazards=hazards, clock=self.clock)
+        self.port = SerialTransport(self.emulator.open())
+        self.port.open()
+        self.decoder = protocol.FrameDecoder()
+
+    def run(self, milliseconds: int, step_ms: int = 5) -> list[protocol.State]:
+        """Let time pass; return the states that came over the pty."""
+        found = []
+        for _ in range(milliseconds // step_ms):
+            self.clock.advance_ns(step_ms * MS)
+            if not self.emulator.step(0.0):
+                break
+            found += self.states()
+        return found
+
+    def states(self) -> list[protocol.State]:
+        """Return the states that are at hand."""
+        messages = []
+        while True:
+            try:
+                data = self.port.receive(0.0).payload
+            except TimeoutError:
+                return [m for m in messages if isinstance(m, protocol.State)]
+            messages += [protocol.decode(p) for p in self.decoder.feed(data)]
+
+    def send(self, message: protocol.AnyMessage) -> None:
+        """Send as the host."""
+        self.port.send(Message("", protocol.encode(message), 0))
+
+    def arm(self) -> None:
+        """Home and arm."""
+        self.send(protocol.Home(1))
+        self.run(550)
+        self.send(protocol.Arm(2))
+        self.run(20)
+        assert self.device.armed
+
+    def close(self) -> None:
+        """Close both ends."""
+        self.port.close()
+        self.emulator.close()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    yield made
+    made.close()
+
+
+def test_device_time_follows_the_clock(bench: Bench) -> None:
+    """One second of steps of 5 ms brings 201 states whose device time is the clock's."""
+    found = bench.run(1000)
+    assert len(found) == 201  # At 0, 5, ..., 1000 ms.
+    assert found[-1].device_us == bench.clock.now_ns() // 1000
+
+
+def test_a_stall_of_the_emulator_does_not_trip_the_watchdog(bench: Bench) -> None:
+    """After a stall of 1 s device time stood still, once; a silent host trips the watchdog all the same."""
+    bench.arm()
+    bench.clock.advance_ns(1000 * MS)
+    bench.run(50)
+    assert bench.emulator.slips == 1
+    assert bench.device.armed
+    assert Status.WATCHDOG in Status(bench.run(200)[-1].status)
+
+
+def test_a_short_stall_is_caught_up(bench: Bench) -> None:
+    """40 ms behind are made good at once: eight frames, no slip."""
+    bench.run(100)
+    assert len(bench.run(40, step_ms=40)) == 8
+    assert bench.emulator.slips == 0
+
+
+def test_nobody_reading_drops_frames_and_a_later_host_is_served(bench: Bench) -> None:
+    """After 10 s without a reader a host that opens the port gets whole frames of now."""
+    bench.port.close()
+    for _ in range(2000):
+        bench.clock.advance_ns(5 * MS)
+        bench.emulator.step(0.0)
+    assert bench.emulator.dropped > 1000
+    bench.port.open()
+    bench.decoder = protocol.FrameDecoder()
+    found = bench.run(500)
+    assert found[-1].device_us == bench.clock.now_ns() // 1000
+    assert len(found) >= 99
+
+
+def test_the_firmware_freezes_on_request() -> None:
+    """0.3 s after arming nothing comes any more, and the port is still there."""
+    bench = Bench(Hazards(freeze_after_s=0.3))
+    try:
+        bench.arm()
+        assert len(bench.run(1000)) in range(52, 62)
+        assert bench.run(100) == []
+    finally:
+        bench.close()
+
+
+def test_the_port_vanishes_on_request() -> None:
+    """0.3 s after arming the host's port reports that the device is gone."""
+    bench = Bench(Hazards(vanish_after_s=0.3))
+    try:
+        bench.arm()
+        with pytest.raises(TransportLostError, match="check the cable"):
+            bench.run(1000)
+            bench.states()
+    finally:
+        bench.close()
+
+
+def test_a_link_is_made_replaced_and_removed(tmp_path: Path) -> None:
+    """The link points at the port while it exists; a stale link is replaced, a file is not."""
+    link = tmp_path / "robot"
+    link.symlink_to("/dev/nowhere")
+    bench = Bench(link=link)
+    assert link.is_symlink()
+    assert os.readlink(link).startswith("/dev/")
+    assert len(bench.run(100)) == 21  # At 0, 5, ..., 100 ms.
+    bench.close()
+    assert not link.is_symlink()
+    link.write_text("mine")
+    emulator = CartpoleEmulator(CartpoleDevice(nominal_truth()), link=link)
+    with pytest.raises(ConfigurationError, match="not a symbolic link"):
+        emulator.open()
+    assert link.read_text() == "mine"
+
+
+def test_settings_are_checked() -> None:
+    """Unknown names list the table, negative times and impossible rates are refused."""
+    with pytest.raises(UnknownNameError, match="known: cartpole"):
+        Emulate(robot="go2")
+    with pytest.raises(UnknownNameError, match="known: serial"):
+        Emulate(transport="smoke")
+    with pytest.raises(ConfigurationError, match="vanish_after_s"):
+        Emulate(vanish_after_s=-1.0)
+    with pytest.raises(ConfigurationError, match="exclude each other"):
+        Emulate(nominal=True, truth_from=Path("truth.json"))
+    with pytest.raises(ConfigurationError, match="probability"):
+        emulate(Emulate(nominal=True, corrupt=1.5))
+
+
+def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It prints the port first and the truth last, writes the same truth, and takes it back."""
+    revealed = tmp_path / "truth.json"
+    config = Emulate(profile="sensor", seed=5, duration_s=0.0, reveal=True, reveal_to=revealed)
+    assert emulate(config) == 0
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("port /dev/")
+    assert json.loads(lines[-1]) == json.loads(revealed.read_text())
+    assert emulate(Emulate(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == lines[-1]
+
+
+def test_a_process_end_to_end(tmp_path: Path) -> None:
+    """A parent opens the port and drives, a second collector is refused, a child's robot takes over."""
+    clock = MonotonicClock()
+    with EmulatorProcess(
+        "cartpole", "--nominal", "--profile", "ideal", "--corrupt", "0.05", "--reveal"
+    ) as emulator:
+        robot = make_robot("cartpole", "serial", emulator.port, clock)
+        assert isinstance(robot, CartpoleRobot)
+        drive(robot)
+        with pytest.raises(PortBusyError):
+            make_robot("cartpole", "serial", emulator.port, clock).connect()
+        child = adopt_robot("cartpole", "serial", os.dup(robot.fileno()), clock)
+        drive(child)
+        child.disconnect()
+        robot.passive()
+        robot.disconnect()
+        again = make_robot("cartpole", "serial", emulator.port, clock)
+        drive(again)
+        again.disconnect()
+        out, errors = emulator.stop()
+    assert json.loads(out.splitlines()[-1])["parameters"]["cart.mass"] == 0.3
+    assert "stalls" in errors
+
+
+def test_a_process_that_loses_its_parent_ends() -> None:
+    """An emulator whose parent is another process than it was told stops by itself."""
+    emulator = EmulatorProcess("cartpole", "--nominal", "--parent", "1")
+    emulator.start()
+    process = emulator._process
+    assert process is not None
+    assert process.wait(10) == 0
+    emulator.stop()
+
+
+def test_a_process_that_cannot_start_says_why() -> None:
+    """The emulator's own error reaches whoever started it."""
+    with pytest.raises(TransportError, match="go2"):
+        EmulatorProcess("go2").start()
+
+
+def drive(robot: object) -> None:
+    """Connect, home, arm and send targets until ten were echoed; a loaded machine may trip the watchdog."""
+    assert isinstance(robot, CartpoleRobot)
+    robot.connect()
+    robot.home(5.0)
+    robot.arm(5.0)
+    deadline = time.monotonic() + 30.0
+    state = robot.read_state(5.0)
+    while state.command_sequence < 9:
+        assert time.monotonic() < deadline
+        if state.status & Status.WATCHDOG:
+            robot.arm(5.0)
+        robot.send_command(default_command(robot))
+        for _ in range(4):
+            state = robot.read_state(5.0)

@@ -1,0 +1,89 @@
+"""Hidden truths: reproducible, in range, balanced by the oracle; and the balancer itself."""
+
+import json
+
+import numpy as np
+import pytest
+
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.drivers.cartpole.lqr import design_lqr, linearise
+from deal_hw.drivers.cartpole.oracle import balances, draw_truth, oracle_balances
+from deal_hw.drivers.cartpole.profiles import PROFILES
+from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
+from deal_hw.errors import ConfigurationError, UnknownNameError
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_seed_decides_the_truth(profile: str) -> None:
+    """The same seed draws the same truth, another seed another one."""
+    assert draw_truth(profile, 3) == draw_truth(profile, 3)
+    assert draw_truth(profile, 3).parameters != draw_truth(profile, 4).parameters
+
+
+def test_candidates_lie_in_the_inner_part_of_the_range() -> None:
+    """Within 80 % of the range's half width, |ln ratio| <= 0.8 ln 5; latency 5 to 25 ticks."""
+    rng = np.random.default_rng(0)
+    truths = [candidate_truth("sensor", rng, seed=0, xi=5.0, refused=0) for _ in range(300)]
+    for parameter in k9_space():
+        ratios = np.log([t.parameters[parameter.name] / parameter.nominal for t in truths])
+        assert np.max(np.abs(ratios)) <= 0.8 * np.log(5) + 1e-12
+        assert np.max(np.abs(ratios)) > 0.75 * np.log(5)
+        assert abs(np.mean(ratios)) < 0.15
+    for known, value in k9_space().known.items():
+        assert all(t.parameters[known] == value for t in truths)
+    totals = {t.actuation_ticks + t.sensing_ticks for t in truths}
+    assert totals == set(range(5, 26))
+
+
+def test_the_ideal_profile_has_no_latency() -> None:
+    """Ideal means equations only."""
+    truth = candidate_truth("ideal", np.random.default_rng(1), seed=1, xi=5.0, refused=0)
+    assert truth.latency_s == 0.0
+
+
+def test_the_truth_survives_json() -> None:
+    """What --reveal-to writes can be read again."""
+    truth = draw_truth("sensor", 1)
+    assert Truth.from_json(json.loads(json.dumps(truth.to_json()))) == truth
+    with pytest.raises(ConfigurationError, match="reveal-to"):
+        Truth.from_json({"profile": "ideal"})
+
+
+def test_an_impossible_truth_is_refused() -> None:
+    """A motor of 0.1 N under 0.5 N of dry friction balances nothing; the nominal one does."""
+    nominal = nominal_truth("sensor", actuation_ticks=4, sensing_ticks=4)
+    weak = Truth(
+        profile="sensor",
+        seed=0,
+        parameters={**nominal.parameters, "servo.effort_limit": 0.1, "cart.frictionloss": 0.5},
+    )
+    assert oracle_balances(nominal)
+    assert not oracle_balances(weak)
+
+
+def test_settings_that_make_no_sense_are_refused() -> None:
+    """Unknown profile, ratio not above 1 and negative seed are errors, not draws."""
+    with pytest.raises(UnknownNameError, match="ideal, sensor, realistic"):
+        draw_truth("perfect", 0)
+    with pytest.raises(ConfigurationError, match="above 1"):
+        draw_truth("ideal", 0, xi=1.0)
+    with pytest.raises(ConfigurationError, match="seed"):
+        draw_truth("ideal", -1)
+
+
+@pytest.mark.parametrize("latency_ticks", [0, 10, 19, 20, 33])
+def test_the_balancer_stabilises_its_linear_model(latency_ticks: int) -> None:
+    """Open loop the upright pole is unstable by one mode; with the feedback all modes decay."""
+    model = linearise(nominal_truth().parameters, latency_ticks)
+    assert np.sum(np.abs(np.linalg.eigvals(model.A)) > 1.0) == 1
+    controller = design_lqr(nominal_truth().parameters, latency_ticks, DESCRIPTION.sensor)
+    closed = model.A - model.B @ controller._feedback[None]
+    assert np.max(np.abs(np.linalg.eigvals(closed))) < 1.0
+
+
+def test_planning_for_latency_matters() -> None:
+    """At 25 ms the balancer that knows it holds the pole; its state has one past target a period."""
+    truth = nominal_truth("sensor", actuation_ticks=15, sensing_ticks=10)
+    controller = design_lqr(truth.parameters, 25, PROFILES["sensor"].sensor)
+    assert balances(truth, controller, 0.03)
+    assert [len(linearise(truth.parameters, ticks).A) for ticks in (18, 19, 38, 39)] == [5, 6, 6, 7]

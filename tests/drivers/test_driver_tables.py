@@ -1,0 +1,56 @@
+"""The tables of robots and transports: every entry loads and agrees with itself, and loading stays light."""
+
+import subprocess
+import sys
+
+import pytest
+
+from deal_hw.clock import MonotonicClock
+from deal_hw.drivers import ROBOTS, TRANSPORTS, adopt_robot, make_robot, robot_description
+from deal_hw.errors import PortNotFoundError, UnknownNameError
+from deal_hw.robot import Robot
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_robot_is_described_under_its_name(name: str) -> None:
+    """The description's name is the table's, its model is there, its digest is stable."""
+    description = robot_description(name)
+    assert description.name == name
+    assert description.mjcf.is_file()
+    assert description.digest() == robot_description(name).digest()
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_pair_can_be_made_without_touching_the_port(name: str, transport: str) -> None:
+    """Constructors do no I/O: a port that does not exist is noticed at connect."""
+    robot = make_robot(name, transport, "/dev/ttyNOPE", MonotonicClock())
+    assert isinstance(robot, Robot)
+    assert isinstance(adopt_robot(name, transport, 999, MonotonicClock()), Robot)
+    with pytest.raises(PortNotFoundError):
+        robot.connect()
+
+
+def test_unknown_names_list_the_tables() -> None:
+    """A typing error is answered with what exists."""
+    with pytest.raises(UnknownNameError, match="known: cartpole"):
+        make_robot("catpole", "serial", "x", MonotonicClock())
+    with pytest.raises(UnknownNameError, match="known: serial"):
+        make_robot("cartpole", "cereal", "x", MonotonicClock())
+    with pytest.raises(UnknownNameError, match="known: cartpole"):
+        robot_description("catpole")
+
+
+def test_a_driver_loads_neither_torch_nor_mujoco_nor_scipy() -> None:
+    """The robot's own computer has none of them."""
+    code = (
+        "import sys\n"
+        "from deal_hw.clock import MonotonicClock\n"
+        "from deal_hw.drivers import make_robot\n"
+        "make_robot('cartpole', 'serial', 'x', MonotonicClock())\n"
+        "print([m for m in ('torch', 'mujoco', 'scipy', 'pytest', 'rerun') if m in sys.modules])\n"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        == "[]\n"
+    )

@@ -1,0 +1,126 @@
+"""The verb: a recorded episode in, a file out, and a clear error for what cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.calibration import CalibrationResult
+from deal_hw.cli.inspect_ import Inspect, inspect
+from deal_hw.clock import VirtualClock
+from deal_hw.data.record import CycleRecord
+from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.types import RobotState, Status, Trajectory
+
+
+@pytest.fixture
+def calibration(tmp_path: Path, result: CalibrationResult) -> Path:
+    """A folder with the result."""
+    folder = tmp_path / "calibration"
+    folder.mkdir()
+    (folder / "result.json").write_text(json.dumps(result.to_json()), encoding="utf-8")
+    return folder
+
+
+def test_episode_is_shown_beside_its_calibration(
+    episode_file: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The truth fits the recording, at the latency of the result; nominal does not; the file is named."""
+    rrd = tmp_path / "new" / "episode.rrd"
+    report = inspect(Inspect(episode=episode_file, calibration=calibration, save=rrd))
+    assert report.files == (rrd,) and rrd.stat().st_size > 100_000
+    assert report.overlay is not None
+    found = report.overlay.predictions
+    assert found["calibrated"].latency_s == pytest.approx(0.008)
+    assert (found["calibrated"].position_nrmse < 0.2 * found["nominal"].position_nrmse).all()
+    printed = capsys.readouterr().out
+    assert f"written: {rrd}" in printed and "calibrated: position error over 0.20 s" in printed
+
+
+def test_result_file_is_as_good_as_its_folder(episode_file: Path, calibration: Path, tmp_path: Path) -> None:
+    """--calibration takes result.json, and --window and --latency reach the predictions."""
+    report = inspect(
+        Inspect(
+            episode=episode_file, calibration=calibration / "result.json", save=tmp_path / "a.rrd",
+            window=0.1, latency=0.0, quiet=True,
+        )
+    )  # fmt: skip
+    assert report.overlay is not None
+    assert report.overlay.window_s == pytest.approx(0.1)
+    assert report.overlay.predictions["calibrated"].latency_s == 0.0
+
+
+def test_without_a_calibration_the_nominal_model_is_shown(episode_file: Path, tmp_path: Path) -> None:
+    """The nominal model alone, without latency."""
+    report = inspect(Inspect(episode=episode_file, save=tmp_path / "a.rrd", quiet=True))
+    assert report.overlay is not None
+    assert list(report.overlay.predictions) == ["nominal"]
+
+
+def test_unarmed_recordings_are_shown_without_predictions(
+    trajectory: Trajectory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where nothing can be predicted, what was measured is shown, and the reason is given."""
+    path = tmp_path / "episodes" / "000000.mcap"
+    states = tuple(
+        RobotState(
+            trajectory.position[i],
+            np.zeros(2),
+            np.zeros(2),
+            5_000_000 * i,
+            5_000_000 * i,
+            i,
+            -1,
+            -1,
+            Status.NONE,
+        )
+        for i in range(50)
+    )
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {"robot": "cartpole"}, VirtualClock(0)) as recorder:
+        recorder.write(CycleRecord(cycle=0, deadline_ns=0, start_ns=0, states=states))
+    report = inspect(Inspect(episode=path, save=tmp_path / "a.rrd"))
+    assert report.overlay is None and "no armed samples" in report.note
+    assert "No predictions" in capsys.readouterr().out
+
+
+def test_without_a_desktop_other_ways_are_named(episode_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No window without a desktop: --web, --save and --screenshot are offered before anything is computed."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigurationError, match=r"--web .* --save FILE\.rrd or --screenshot FILE\.png"):
+        inspect(Inspect(episode=episode_file))
+
+
+def test_wrong_files_are_named(episode_file: Path, tmp_path: Path) -> None:
+    """A missing recording, a missing or foreign result, and a folder to save to are each said in one line."""
+    save = tmp_path / "a.rrd"
+    with pytest.raises(DatasetError, match=r"none\.mcap"):
+        inspect(Inspect(episode=tmp_path / "none.mcap", save=save))
+    with pytest.raises(ConfigurationError, match=r"none\.json cannot be read.*deal-hw calibrate"):
+        inspect(Inspect(episode=episode_file, calibration=tmp_path / "none.json", save=save))
+    (tmp_path / "other.json").write_text('{"a": 1}', encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"other\.json does not hold a calibration result"):
+        inspect(Inspect(episode=episode_file, calibration=tmp_path / "other.json", save=save))
+    with pytest.raises(ConfigurationError, match="is a folder"):
+        inspect(Inspect(episode=episode_file, save=tmp_path))
+    assert not save.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"latency": -1.0}, "--latency must be 0 s or more"),
+        ({"at": float("nan")}, "--at must be 0 s or more"),
+        ({"web_port": 70_000}, "--web-port must be between 0 and 65535"),
+    ],
+)
+def test_settings_are_checked(changes: dict[str, float], words: str) -> None:
+    """A setting out of range is refused when it is given."""
+    with pytest.raises(ConfigurationError, match=words):
+        dataclasses.replace(Inspect(episode=Path("x.mcap")), **changes)
