@@ -43,7 +43,7 @@ class CriticSettings:
     learning_rate: float = 3e-4
     updates: int = 20
     batch: int = 1024
-    clip: float = 0.1
+    clip: float = 0.01
     penalty: float = 10.0
 
 

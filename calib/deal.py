@@ -57,6 +57,10 @@ class DealSettings:
     step_clip: float = 2.0
     noise_draws: int = 100
     average: int = 4
+    smooth: int = 4
+    context: bool = True
+    white: bool = True
+    floor: float = 1e-8
     torch_threads: int = 1
 
 
@@ -88,11 +92,13 @@ class Deal(CalibrationMethod[Problem]):
         means: list[FloatArray] = []
         with torch_threads(settings.torch_threads):
             for _ in range(min(settings.generations, budget.generations)):
+                if kalman.finished:
+                    break
                 z = kalman.ask()
                 members = coordinates.members(logistic(z))
                 centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
                 residual, gap = view.residual(members, centre)
-                step = kalman.tell(residual, keep=settings.keep)
+                step = kalman.tell(residual, keep=None if noisy else settings.keep)
                 means.append(kalman.ask().mean(axis=0))
                 run.note(
                     f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
@@ -117,7 +123,11 @@ class _CleanView:
         self._problem, self._settings, self._rng = problem, settings, rng
         self._every = samples_per_tick(problem)
         self._windows = problem.windows(settings.clean_ticks * self._every)
-        self._critic = PenaltyCritic(settings.clean_ticks * problem.joints, settings.critic, rng)
+        context = np.concatenate([_context(problem, data) for data in self._windows])
+        self._context = ((context - context.mean(axis=0)) / np.maximum(context.std(axis=0), 1e-9)).astype(np.float32)
+        if not settings.context: self._context = self._context[:, :0]
+        width = settings.clean_ticks * problem.joints + self._context.shape[1]
+        self._critic = PenaltyCritic(width, settings.critic, rng)
 
     def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
         """Return the recording's statistics minus each member's, (N, F), in units of the ensemble's spread."""
@@ -138,18 +148,36 @@ class _CleanView:
         good = np.isfinite(fake).all(axis=(1, 2))
         if not good.any() or not np.isfinite(real).all():
             return np.full((len(fake), 1), np.nan), float("nan")
-        scale = np.maximum(np.sqrt(np.mean(fake[good] ** 2, axis=(0, 1))), 1e-12)
-        imitation = _scaled(fake, scale)
-        data = _scaled(real, scale)
+        width = fake.shape[2]
+        flat = fake[good].reshape(-1, width)
+        scale = np.maximum(np.sqrt(np.mean(flat**2, axis=0)), 1e-12)
+        if self._settings.white:
+            limited = np.clip(flat / scale, -5, 5)
+            values, vectors = np.linalg.eigh(limited.T @ limited / len(limited))
+            root = vectors / np.sqrt(np.maximum(values, self._settings.floor * values[-1]))
+            def scaled(x): return (5 * np.tanh(x / scale @ root / 5)).astype(np.float32)
+        else:
+            def scaled(x): return _scaled(x, scale)
+        def join(x): return np.concatenate([scaled(x), np.broadcast_to(self._context, (*x.shape[:-1], self._context.shape[1]))], axis=-1)
+        imitation = join(np.nan_to_num(fake))
+        data = join(real)
         gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
         found = self._critic.statistics(np.nan_to_num(imitation))
         target = self._critic.statistics(data[None])[0]
         std = found[good].std(axis=0)
         # Units that are never active carry nothing and would divide by zero.
         alive = std > 1e-6 * max(float(std.max()), 1e-30)
-        residual = (target - found[:, alive]) / std[alive] if False else (target[alive] - found[:, alive]) / std[alive]
+        residual = (target[alive] - found[:, alive]) / std[alive]
         residual[~good] = np.nan
         return residual, gap
+
+
+def _context(problem: Problem, data: WindowData) -> FloatArray:
+    episode = problem.episodes[data.episode]
+    at = episode.sample[data.windows.start]
+    span = data.windows.length * data.windows.stride
+    target = np.stack([episode.target[k : k + span].mean(axis=0) for k in at])
+    return np.concatenate([data.start_position, data.start_velocity, target], axis=1)
 
 
 def _scaled(values: FloatArray, scale: FloatArray) -> Samples:
@@ -157,5 +185,68 @@ def _scaled(values: FloatArray, scale: FloatArray) -> Samples:
     return (5.0 * np.tanh(values / (5.0 * scale))).astype(np.float32)
 
 
-class _NoisyView(_CleanView):
-    pass
+class _NoisyView:
+    """Noisy recordings: one sample of the critic is one control period of whitened innovations, and its context."""
+
+    def __init__(self, problem: Problem, settings: DealSettings, rng: np.random.Generator) -> None:
+        self._problem, self._settings, self._rng = problem, settings, rng
+        self._every = samples_per_tick(problem)
+        self._windows = problem.windows(settings.noisy_ticks * self._every)
+        context = np.concatenate([_tick_context(problem, data, self._every) for data in self._windows])
+        self._context = _standardised(context)
+        width = self._every * problem.joints + self._context.shape[1]
+        self._critic = PenaltyCritic(width, settings.critic, rng)
+
+    def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
+        """Return the recording's statistics minus each member's, (N, F), whitened by the noise of the former."""
+        real, fake = [], []
+        wide = self._every * self._problem.joints
+        for data in self._windows:
+            whitening = linearise(self._problem, centre, data)
+            predicted, _ = predict(self._problem, members, data)
+            fake.append(whitening.apply(predicted - whitening.reference).reshape(len(predicted), -1, wide))
+            real.append(whitening.apply((data.measured - whitening.reference)[None]).reshape(-1, wide))
+        return self._statistics(np.concatenate(real), np.concatenate(fake, axis=1))
+
+    def _statistics(self, real: FloatArray, fake: FloatArray) -> tuple[FloatArray, float]:
+        good = np.isfinite(fake).all(axis=(1, 2))
+        if not good.any() or not np.isfinite(real).all():
+            return np.full((len(fake), 1), np.nan), float("nan")
+        draws = self._rng.standard_normal((self._settings.noise_draws, *real.shape))
+        fake = np.nan_to_num(fake)
+        scale = np.sqrt(1.0 + np.mean(np.clip(fake[good], -1e6, 1e6) ** 2, axis=(0, 1)))
+        noise = draws[self._rng.integers(len(draws), size=len(fake))]
+        imitation = self._join(fake + noise, scale)
+        data = self._join(real, scale)
+        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
+        found = np.mean(
+            [self._critic.statistics(self._join(fake + d, scale)) for d in draws[: self._settings.smooth]], axis=0
+        )
+        target = self._critic.statistics(data[None])[0]
+        floor = self._critic.statistics(self._join(draws, scale))
+        covariance = np.cov(floor, rowvar=False)
+        alive = np.diag(covariance) > 1e-12 * max(float(np.diag(covariance).max()), 1e-30)
+        covariance = covariance[np.ix_(alive, alive)]
+        # The covariance of F statistics from as many draws is singular: shrink it to its diagonal.
+        covariance = 0.9 * covariance + 0.1 * np.diag(np.diag(covariance))
+        factor = np.linalg.inv(np.linalg.cholesky(covariance))
+        residual = (target[alive] - found[:, alive]) @ factor.T
+        residual[~good] = np.nan
+        return residual, gap
+
+    def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
+        context = np.broadcast_to(self._context, (*values.shape[:-1], self._context.shape[1]))
+        return np.concatenate([_scaled(values, scale), context], axis=-1)
+
+
+def _tick_context(problem: Problem, data: WindowData, every: int) -> FloatArray:
+    starts, episode = problem.starts[data.episode], problem.episodes[data.episode]
+    row = (data.windows.start[:, None] + np.arange(0, data.windows.length, every)).ravel()
+    return np.concatenate(
+        [starts.position[row], starts.velocity[row], episode.target[episode.sample[row]]], axis=1
+    )
+
+
+def _standardised(values: FloatArray) -> Samples:
+    spread = np.maximum(values.std(axis=0), 1e-9)
+    return np.asarray((values - values.mean(axis=0)) / spread, dtype=np.float32)

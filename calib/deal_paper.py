@@ -127,6 +127,32 @@ class DealPaper(CalibrationMethod[Problem]):
         )
 
 
+def paper() -> DealPaper:
+    """Return `deal-paper`: Algorithm 1, open choices made as well as we could."""
+    return DealPaper()
+
+
+def literal() -> DealPaper:
+    """Return Algorithm 1 to the letter where it has letters: raw softmax (eq. 22), distance summed over K (eq. 1)."""
+    diffusion = DiffusionSettings(temperature=None, divide_distance=False)
+    return DealPaper(PaperSettings(diffusion=diffusion), name="deal-paper-literal")
+
+
+def without_noise_adaptation() -> DealPaper:
+    """Return the paper's ablation DEAL\\FN: no eq. 9."""
+    return DealPaper(PaperSettings(diffusion=DiffusionSettings(adapt_noise=False)), name="deal-paper-fn")
+
+
+def without_normalisation() -> DealPaper:
+    """Return the paper's ablation DEAL\\PN: the search moves in raw units."""
+    return DealPaper(PaperSettings(normalise=False), name="deal-paper-pn")
+
+
+def flat() -> DealPaper:
+    """Return `deal-paper` with a constant fitness: whatever it finds, it did not find in the data."""
+    return DealPaper(PaperSettings(constant_fitness=True), name="deal-paper-flat")
+
+
 def _with_generations(settings: DiffusionSettings, generations: int) -> DiffusionSettings:
     return dataclasses.replace(settings, generations=max(generations, 1))
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calibration import CalibrationResult
+from deal_hw.data.files import write_json
 from deal_hw.errors import DatasetError
-from deal_hw.parameters import ParameterDistribution
 from deal_hw.sim.model import RobotModel, write_calibrated_mjcf
 
 RESULT = "result.json"
@@ -37,8 +36,8 @@ def write_result(folder: Path, robot: RobotModel, result: CalibrationResult) -> 
     files = {name: folder / name for name in (RESULT, DISTRIBUTION, MODEL, TRACE)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write(files[RESULT], json.dumps(result.to_json(), indent=1))
-        _write(files[DISTRIBUTION], json.dumps(result.distribution().to_json(), indent=1))
+        write_json(files[RESULT], result.to_json())
+        write_json(files[DISTRIBUTION], result.distribution().to_json())
         write_calibrated_mjcf(robot, result.space, result.estimate, files[MODEL], result.latency_s)
         keys = sorted({key for row in result.trace for key in row})
         columns: dict[str, Any] = {
@@ -50,12 +49,6 @@ def write_result(folder: Path, robot: RobotModel, result: CalibrationResult) -> 
     except OSError as err:
         raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
     return files
-
-
-def _write(path: Path, text: str) -> None:
-    part = path.with_suffix(path.suffix + ".part")
-    part.write_text(text + "\n", encoding="utf-8")
-    os.replace(part, path)
 
 
 def read_result(path: Path) -> CalibrationResult:
@@ -70,18 +63,4 @@ def read_result(path: Path) -> CalibrationResult:
     except (OSError, ValueError, KeyError) as err:
         raise DatasetError(
             f"{file} is not a calibration result ({err}); `deal-hw calibrate` writes one"
-        ) from err
-
-
-def read_distribution(path: Path) -> ParameterDistribution:
-    """Read a parameter distribution.
-
-    Raises:
-        DatasetError: There is none.
-    """
-    try:
-        return ParameterDistribution.from_json(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError) as err:
-        raise DatasetError(
-            f"{path} is not a parameter distribution ({err}); `deal-hw calibrate` writes one"
         ) from err

@@ -108,7 +108,7 @@ def uncertainty(
     if fixed_latency:
         prior[-1] = 1e-12
     # The range is a flat prior; its variance keeps what the data cannot see as wide as the range.
-    covariance = np.linalg.inv(hessian / inflation + np.diag(1.0 / prior))
+    covariance: FloatArray = np.linalg.inv(hessian / inflation + np.diag(1.0 / prior))
     std = np.sqrt(np.diag(covariance))
     latency = (
         max(latency_s - Z90 * std[K], latency_range_s[0]),

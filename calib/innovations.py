@@ -106,7 +106,8 @@ def linearise(problem: Problem, centre: Members, data: WindowData) -> Whitening:
     # (W, H J, 2 J), already multiplied by the standard deviations: J sqrt(P0).
     root = np.moveaxis((flat[1::2] - flat[2::2]), 0, -1) * (std / (2 * width))
     sigma = root @ np.swapaxes(root, 1, 2)
-    noise = np.tile(problem.noise_std, data.measured.shape[1]) ** 2
-    sigma[:, np.arange(noise.size), np.arange(noise.size)] += noise
+    noise = data.std.reshape(W, -1) ** 2
+    diagonal = np.arange(noise.shape[1])
+    sigma[:, diagonal, diagonal] += noise
     factor = np.linalg.inv(np.linalg.cholesky(sigma))
     return Whitening(predicted[0], factor)

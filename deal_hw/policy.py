@@ -209,11 +209,11 @@ class ObservationBuilder:
 
     def _term(self, term: ObservationTerm) -> FloatArray:
         if term.quantity == "action":
-            return term.scale * self._action[term.delay][..., self._actuator[term.joint]]
+            return np.asarray(term.scale * self._action[term.delay][..., self._actuator[term.joint]])
         source = self._velocity if term.quantity == "velocity" else self._position
         value = source[term.delay][..., self._joint[term.joint]]
         if term.quantity == "sin_position":
             value = np.sin(value)
         elif term.quantity == "cos_position":
             value = np.cos(value)
-        return term.scale * value
+        return np.asarray(term.scale * value)

@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -19,8 +19,10 @@ import tyro
 from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.data.dataset import Dataset
     from deal_hw.sim.episode import Episode
     from deal_hw.sim.model import RobotModel
 
@@ -156,17 +158,13 @@ def calibrate(config: Calibrate) -> CalibrateReport:
 
 
 def choose_episodes(
-    dataset: object, episodes: Sequence[int], holdout: Sequence[int]
+    dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int]
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the episodes to fit and those to judge by.
 
     Raises:
         ConfigurationError: Nothing is left to fit, or an episode is in both.
     """
-    from deal_hw.data.dataset import Dataset
-
-    if not isinstance(dataset, Dataset):
-        raise TypeError(f"expected a Dataset, got {type(dataset).__name__}")
     every = range(len(dataset.episodes))
     profiles = {i: str(dataset.read(i).metadata.get("profile", "")) for i in every}
     held = tuple(holdout) or tuple(i for i in every if profiles[i] == HELDOUT_PROFILE and i not in episodes)
@@ -207,24 +205,18 @@ def make_space(robot: str, config: Calibrate) -> ParameterSpace:
     return space
 
 
-def _simulation(dataset: object, recordings: dict[int, object]) -> tuple[RobotModel, dict[int, Episode]]:
+def _simulation(
+    dataset: Dataset, recordings: Mapping[int, Trajectory]
+) -> tuple[RobotModel, dict[int, Episode]]:
     try:
         from deal_hw.sim.episode import align
         from deal_hw.sim.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
-    from deal_hw.data.dataset import Dataset
     from deal_hw.drivers import robot_description
-    from deal_hw.types import Trajectory
 
-    if not isinstance(dataset, Dataset):
-        raise TypeError(f"expected a Dataset, got {type(dataset).__name__}")
     description = robot_description(dataset.description["name"])
-    episodes = {}
-    for index, trajectory in recordings.items():
-        if isinstance(trajectory, Trajectory):
-            episodes[index] = align(trajectory, description)
-    return load_model(description), episodes
+    return load_model(description), {i: align(t, description) for i, t in recordings.items()}
 
 
 def calibrate_episodes(

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -22,14 +18,14 @@ from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
+from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.supervised import RunReport
 from deal_hw.control.cadence import CadenceReport
 from deal_hw.data.run_folder import RunFolder
-from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError, TransportError
+from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.types import FloatArray
 
-START_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,47 +77,6 @@ class _Stages:
             self.seconds[name] = round(time.perf_counter() - start, 2)
 
 
-@contextmanager
-def emulated_cartpole(profile: str, seed: int, reveal_to: Path) -> Iterator[str]:
-    """Run an emulator in a process of its own and yield its port; its truth is written when it ends.
-
-    Raises:
-        TransportError: It does not start.
-    """
-    process = subprocess.Popen(
-        [
-            sys.executable, "-m", "deal_hw", "emulate", "cartpole", "--profile", profile, "--seed", str(seed),
-            "--reveal-to", str(reveal_to), "--parent", str(os.getpid()),
-        ],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, start_new_session=True,
-    )  # fmt: skip
-    try:
-        yield _read_port(process)
-    finally:
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def _read_port(process: subprocess.Popen[str]) -> str:
-    import selectors
-
-    output: IO[str] | None = process.stdout
-    if output is None:
-        raise TransportError("the emulator has no output")
-    with selectors.DefaultSelector() as selector:
-        selector.register(output, selectors.EVENT_READ)
-        ready = selector.select(START_TIMEOUT_S)
-    line = output.readline() if ready else ""
-    word, _, port = line.strip().partition(" ")
-    if word != "port":
-        raise TransportError(f"the emulator did not start (it said {line.strip()!r}); try `deal-hw emulate cartpole`")
-    return port
-
-
 def demo(config: Demo) -> DemoReport:
     """Run the whole loop and print what came of it.
 
@@ -145,7 +100,9 @@ def demo(config: Demo) -> DemoReport:
             {"kind": "demo", "profile": config.profile, "episodes": config.episodes, "steps": config.steps},
             {"demo": config.seed},
         )
-        with emulated_cartpole(config.profile, config.seed, truth_file) as port:
+        options = ("--profile", config.profile, "--seed", str(config.seed), "--reveal-to", str(truth_file))
+        with EmulatorProcess("cartpole", *options) as emulator:
+            port = emulator.port
             print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
             with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
                 for kind in ("rich", "chirp"):
@@ -163,8 +120,8 @@ def demo(config: Demo) -> DemoReport:
             with stages.stage("train", "a policy under what is now known of the robot"):
                 train(
                     Train(
-                        robot="cartpole", distribution=found.files["distribution.json"], out=policy, seed=config.seed,
-                        **({} if config.steps is None else {"steps": config.steps}),
+                        robot="cartpole", distribution=found.files["distribution.json"], out=policy,
+                        steps=config.steps, seed=config.seed,
                     )
                 )  # fmt: skip
             runs: dict[str, RunReport] = {}

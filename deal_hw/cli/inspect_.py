@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import signal
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,16 +167,22 @@ def _prepare(file: Path) -> None:
 
 
 def _show(config: Inspect, rrd: Path) -> None:
-    if config.web:
+    if not config.web:
+        if not (config.save or config.screenshot):
+            open_window(rrd)
+        return
+    # By default SIGTERM would end us without a word to the server, which would stay behind.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
         with (
-            serve_web(rrd, port=config.web_port) as (address, server),
             contextlib.suppress(KeyboardInterrupt),
+            serve_web(rrd, port=config.web_port) as (address, server),
         ):
             print(f"open {address}  (this machine only; Ctrl-C ends it)", flush=True)
             server.process.wait()
             server.check()
-    elif not (config.save or config.screenshot):
-        open_window(rrd)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _print(overlay: Overlay | None, note: str, files: tuple[Path, ...]) -> None:

@@ -28,6 +28,7 @@ class Episode:
         speed_limit: (S, A).
         usable: Samples between which the simulator may predict: armed, no watchdog, no gap to the next, (T,).
         start_setpoint: The set-point at the first period, (A,).
+        first_row: Sample of the recording that became the first sample here.
     """
 
     step_s: float
@@ -41,6 +42,7 @@ class Episode:
     speed_limit: FloatArray
     usable: npt.NDArray[np.bool_]
     start_setpoint: FloatArray
+    first_row: int = 0
 
     @property
     def steps(self) -> int:
@@ -83,13 +85,10 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
     sample = device[rows] - origin
     steps = int(sample[-1])
 
-    order = {int(s): i for i, s in enumerate(trajectory.sent_sequence)}
+    begins = _begins(trajectory, rows, np.where(known[rows], sequence, -1), acts, step_s)
     in_force = np.zeros(max(steps, 1), dtype=np.int64)
-    seen, first = np.unique(np.where(known[rows], sequence, -1), return_index=True)
-    for number, at in zip(seen, first, strict=True):
-        if number < 0:
-            continue
-        in_force[max(int(acts[at]) - origin, 0) :] = order[int(number)]
+    for index, begin in begins:
+        in_force[max(begin - origin, 0) :] = index
     gap = np.diff(sample, append=sample[-1])
     usable = armed[rows] & known[rows] & ((trajectory.status[rows] & int(Status.WATCHDOG)) == 0)
     usable &= gap <= 2 * round(description.device_rate_hz / description.state_rate_hz)
@@ -106,4 +105,39 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
         speed_limit=trajectory.speed_limit[in_force],
         usable=usable,
         start_setpoint=trajectory.position[rows[0]][list(description.actuated_index)],
+        first_row=int(rows[0]),
     )
+
+
+def _begins(
+    trajectory: Trajectory, rows: IntArray, sequence: IntArray, acts: IntArray, step_s: float
+) -> list[tuple[int, int]]:
+    """Return which command acts from which device period on, in order.
+
+    A command that no sample reports was lost, unless no sample came while it would have been reported: then it is
+    placed by the clocks' offset, which the reported commands give.
+
+    Args:
+        trajectory: The recording.
+        rows: The samples that count, (T,).
+        sequence: Command in force at each, (T,); -1 where unknown.
+        acts: Device period from which that command acts, (T,).
+        step_s: Device period [s].
+
+    Returns:
+        Index among the commands sent, and device period.
+    """
+    order = {int(s): i for i, s in enumerate(trajectory.sent_sequence)}
+    numbers, first = np.unique(sequence, return_index=True)
+    seen = {order[int(n)]: int(acts[at]) for n, at in zip(numbers, first, strict=True) if n >= 0}
+    offset = float(np.median([period * step_s - trajectory.sent_s[i] for i, period in seen.items()]))
+    sampled = np.round(trajectory.device_s[rows] / step_s)
+    begins = dict(seen)
+    indices = sorted(seen)
+    for before, after in zip(indices, indices[1:], strict=False):
+        for i in range(before + 1, after):
+            begin = round((trajectory.sent_s[i] + offset) / step_s)
+            until = begins[after] if i + 1 == after else round((trajectory.sent_s[i + 1] + offset) / step_s)
+            if seen[before] < begin and not np.any((sampled >= begin) & (sampled < until)):
+                begins[i] = begin
+    return sorted(begins.items())

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.policy import Observation, ObservationTerm, PolicySpec
+from deal_hw.policy import Observation, ObservationTerm, PolicySpec, Quantity
 from deal_hw.types import FloatArray
 
 CARTPOLE_GAINS = (1.65, 1.04, 0.475, 0.171)
@@ -16,7 +16,7 @@ CARTPOLE_GAINS = (1.65, 1.04, 0.475, 0.171)
 
 def feedback_spec(description: RobotDescription, action_scale: float = 0.25) -> PolicySpec:
     """Return the spec of a policy that observes all positions, then all velocities, unscaled."""
-    quantities = ("position", "velocity")
+    quantities: tuple[Quantity, ...] = ("position", "velocity")
     return PolicySpec(
         robot=description.name,
         joint_names=description.joint_names,

@@ -104,8 +104,8 @@ def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
     reach = max([0.4, *slides])
     eye = rrb.EyeControls3D(
         kind=rrb.components.Eye3DKind.Orbital,
-        position=(0.12 * reach, -1.75 * reach, 0.6 * reach),
-        look_target=(0.0, 0.0, 0.27 * reach),
+        position=(0.12 * reach, -2.1 * reach, 0.5 * reach),
+        look_target=(0.0, 0.0, 0.04 * reach),
         eye_up=(0.0, 0.0, 1.0),
     )
     return rrb.Spatial3DView(

@@ -85,9 +85,8 @@ def test_policy_reset_forgets_past_actions() -> None:
 
 def test_rich_balances_first_then_holds_random_set_points() -> None:
     """1.6 s of the policy, then steps within 0.12 m, each held for 0.1 to 0.3 s rounded up to cycles."""
-    behaviour = RichBehaviour(
-        DESCRIPTION, PolicyBehaviour(LinearPolicy(SPEC), DESCRIPTION), RichConfig(), seed=7
-    )
+    config = RichConfig(balance_s=1.6, amplitude=0.12, hold_s=(0.1, 0.3), segments=())
+    behaviour = RichBehaviour(DESCRIPTION, PolicyBehaviour(LinearPolicy(SPEC), DESCRIPTION), config, seed=7)
     states = [at(0.05)] * 80
     balancing = [behaviour.command(s, k / 50).position_target[0] for k, s in enumerate(states)]
     assert balancing == pytest.approx([1.65 * 0.05] * 80, abs=1e-6)

@@ -16,7 +16,7 @@ from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
-from deal_hw.drivers.emulator_process import EmulatorProcess
+from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import (
     ConfigurationError,

@@ -119,7 +119,8 @@ def violations(sources: Mapping[str, str]) -> list[str]:
         for line, target in imports(tree):
             if reason := complaint(importer, target):
                 found.append(f"{path}:{line}: {reason}")
-            if target.startswith("deal_hw.") and part_of(target) != part_of(importer):
+            inside = importer.startswith("deal_hw") and target.startswith("deal_hw.")
+            if inside and part_of(target) != part_of(importer):
                 edges.setdefault(part_of(importer), set()).add(part_of(target))
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "time.time":

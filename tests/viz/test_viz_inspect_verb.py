@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from deal_hw.calibration import CalibrationResult
@@ -95,6 +99,23 @@ def test_without_a_desktop_other_ways_are_named(episode_file: Path, monkeypatch:
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ConfigurationError, match=r"--web .* --save FILE\.rrd or --screenshot FILE\.png"):
         inspect(Inspect(episode=episode_file))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_web_ends_with_its_server(episode_file: Path, number: signal.Signals) -> None:
+    """Ctrl-C and SIGTERM end the verb in peace, and rerun's server with it."""
+    command = [sys.executable, "-m", "deal_hw", "inspect", str(episode_file), "--web", "--web-port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("open http://127.0.0.1:")
+        (server,) = psutil.Process(process.pid).children()
+        process.send_signal(number)
+        rest, _ = process.communicate(timeout=30)
+    left = server.is_running()
+    if left:
+        server.kill()
+    assert not left
+    assert process.returncode == 0 and "nominal: position error" in rest
 
 
 def test_wrong_files_are_named(episode_file: Path, tmp_path: Path) -> None:

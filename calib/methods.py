@@ -1,0 +1,58 @@
+"""The table of calibration methods: a name, and the function that makes the method. Imported on use."""
+
+from __future__ import annotations
+
+import importlib
+from typing import cast
+
+from deal_hw.calib.problem import Problem
+from deal_hw.calibration import CalibrationMethod
+from deal_hw.errors import UnknownNameError
+
+METHODS: dict[str, str] = {
+    "default": "deal_hw.calib.weki:Weki",
+    "weki": "deal_hw.calib.weki:Weki",
+    "deal": "deal_hw.calib.deal:Deal",
+    "deal-paper": "deal_hw.calib.deal_paper:paper",
+    "deal-paper-literal": "deal_hw.calib.deal_paper:literal",
+    "deal-paper-fn": "deal_hw.calib.deal_paper:without_noise_adaptation",
+    "deal-paper-pn": "deal_hw.calib.deal_paper:without_normalisation",
+    "deal-paper-flat": "deal_hw.calib.deal_paper:flat",
+    "random": "deal_hw.calib.baselines.simple:RandomSearch",
+    "centre": "deal_hw.calib.baselines.simple:Centre",
+    "nominal": "deal_hw.calib.baselines.simple:Nominal",
+}
+"""Name -> ``module:callable`` without arguments. ``default`` is the search that won on the tuning seeds."""
+
+NULL_METHODS = frozenset({"centre", "nominal", "deal-paper-flat"})
+"""Rows that must not read the data, so they are never polished."""
+
+
+def check_method(name: str) -> None:
+    """Raise where there is no such method.
+
+    Raises:
+        UnknownNameError: The name is not in the table; the message lists the table.
+    """
+    if name not in METHODS:
+        raise UnknownNameError("calibration method", name, METHODS)
+
+
+def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem]:
+    """Return a new method.
+
+    Args:
+        name: A name in `METHODS`.
+        polish: Follow the search by the polish; null rows stay what they are.
+
+    Raises:
+        UnknownNameError: The name is not in the table.
+    """
+    check_method(name)
+    module, _, attribute = METHODS[name].partition(":")
+    search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
+    if not polish or name in NULL_METHODS:
+        return search
+    from deal_hw.calib.pipeline import PolishedMethod
+
+    return PolishedMethod(search, name)

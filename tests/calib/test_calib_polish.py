@@ -1,0 +1,237 @@
+"""The polish and what is said about its result, on recordings of the real device core with hidden truths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.excitation import check_excitation
+from deal_hw.calib.identifiability import correlation_time, intervals, null_directions, uncertainty
+from deal_hw.calib.metrics import error_percent, interval_score, log_error_x100
+from deal_hw.calib.noise import noise_model, white_noise_std
+from deal_hw.calib.pipeline import LatencyScan, PolishedMethod
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.refine import polish
+from deal_hw.calib.validate import heldout_nrmse
+from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.cli.bench_loop import Demonstration, demonstrate
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
+from deal_hw.errors import InsufficientDataError
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.model import load_model
+from deal_hw.types import FloatArray
+
+
+class Near(CalibrationMethod[Problem]):
+    """A search that starts some percent off the truth: what is tested is what comes after it."""
+
+    name = "near"
+
+    def __init__(self, theta: FloatArray, latency_s: float) -> None:
+        self._theta, self._latency_s = theta, latency_s
+        self.runs = 0
+
+    def run(
+        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
+    ) -> CalibrationResult:
+        """Return a point near the truth."""
+        self.runs += 1
+        theta = self._theta * np.exp(rng.normal(0.0, 0.05, len(self._theta)))
+        interval = np.stack([problem.space.low, problem.space.high], axis=1)
+        return CalibrationResult(
+            method="near", space=problem.space, estimate=theta, interval=interval, latency_s=self._latency_s + 1e-3
+        )
+
+
+@pytest.fixture(scope="module")
+def ideal() -> Demonstration:
+    """A noise-free demonstration of a tuning seed."""
+    return demonstrate("ideal", 1, 5.0)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Demonstration:
+    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
+    return demonstrate("sensor", 2, 5.0)
+
+
+def test_polish_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
+    """Truth recovery: from 10 % off, all nine parameters within 0.01 % and the latency within a microsecond."""
+    problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
+    start = ideal.theta * np.exp(0.1 * np.cos(np.arange(9)))
+    found = polish(problem, start, 1e-3)
+    assert error_percent(found.theta, ideal.theta) < 0.01
+    assert abs(found.latency_s - ideal.truth.latency_s) < 1e-6
+    assert found.chi2 < 2.0
+
+
+def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
+    """Truth recovery with sensor noise: mean error within 3 %, latency to the tick, at least 7 of 9 intervals hold."""
+    problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
+    stages: list[str] = []
+
+    def watch(p: Progress) -> None:
+        stages.append(p.stage)
+
+    method = PolishedMethod(Near(noisy.theta, noisy.truth.latency_s))
+    result = method.run(problem, Budget(), np.random.default_rng(0), watch)
+    assert error_percent(result.estimate, noisy.theta) < 3.0
+    assert abs(result.latency_s - noisy.truth.latency_s) < 1.1e-3
+    inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
+    assert inside.sum() >= 7
+    assert result.alarms == ()
+    assert set(stages) == {"polish", "latency"}
+    assert result.provenance["latency_scan"]["ticks"]
+
+
+def test_heldout_error_falls_far_below_nominal(noisy: Demonstration) -> None:
+    """On another motion family the true parameters predict at least four times better than the nominal ones."""
+    errors = heldout_nrmse(
+        noisy.robot, noisy.space, [noisy.heldout],
+        {"nominal": (noisy.space.nominal, 0.0), "truth": (noisy.theta, noisy.truth.latency_s)},
+        truth=[noisy.heldout_truth], threads=1,
+    )  # fmt: skip
+    assert errors["truth"] < 0.25 * errors["nominal"]
+    assert errors["truth"] < errors["null"]
+
+
+def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal: Demonstration) -> None:
+    """With a wrong latency forced on it nothing explains the data: a second search, the same residual, then an alarm."""
+    problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
+    search = Near(ideal.theta, 0.02)
+    result = PolishedMethod(search).run(problem, Budget(), np.random.default_rng(0))
+    assert search.runs >= 2
+    assert any("does not explain" in words for words in result.alarms)
+
+
+def test_white_noise_is_measured_under_motion() -> None:
+    """0.3 mm of noise on a 5 cm swing at 1 Hz is found within 15 %."""
+    t = np.arange(800) * 5e-3
+    values = 0.05 * np.sin(2 * np.pi * t)[:, None] + np.random.default_rng(0).normal(0, 3e-4, (800, 1))
+    assert white_noise_std(values, 1e-7)[0] == pytest.approx(3e-4, rel=0.15)
+
+
+def test_timing_jitter_is_told_from_noise() -> None:
+    """Samples off by up to 2 ms (std 0.816 ms) beside 1 mrad of noise: both are found, and none where there is none."""
+    rng = np.random.default_rng(1)
+    t = np.arange(1600) * 5e-3
+    swing = lambda s: 1.5 * np.sin(2 * np.pi * 0.8 * s)  # noqa: E731
+    speed = (1.5 * 2 * np.pi * 0.8 * np.cos(2 * np.pi * 0.8 * t))[:, None]
+    jitter = rng.integers(0, 3, t.size) * 1e-3
+    noise = rng.normal(0, 1e-3, t.size)
+    found = noise_model([(swing(t - jitter) + noise)[:, None]], [speed], 1e-7)
+    assert found.timing_std_s == pytest.approx(0.816e-3, rel=0.25)
+    assert found.position_std[0] == pytest.approx(1e-3, rel=0.4)
+    still = noise_model([(swing(t) + noise)[:, None]], [speed], 1e-7)
+    assert still.timing_std_s == 0.0
+    assert found.std(np.array([2.0]))[0] == pytest.approx(np.hypot(found.position_std[0], 2 * found.timing_std_s))
+
+
+def test_correlation_time_by_hand() -> None:
+    """White residuals have time 1; a moving sum of two has rho_1 = 1/2 and so time 2."""
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(20, 200, 1))
+    assert correlation_time((white,)) == pytest.approx(1.0, abs=0.1)
+    assert correlation_time((white[:, 1:] + white[:, :-1],)) == pytest.approx(2.0, abs=0.15)
+
+
+def _two(low: float = 0.2, high: float = 5.0) -> ParameterSpace:
+    return ParameterSpace(
+        Parameter(name=n, kind="body_mass", elements=("cart",), unit="kg", nominal=1.0, low=low, high=high)
+        for n in ("a", "b")
+    )
+
+
+def test_null_direction_names_the_common_factor() -> None:
+    """Information on ln a - ln b alone: a and b only up to a common factor; on ln a + ln b: one up, one down."""
+    (words,) = null_directions(_two(), 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
+    assert "common factor" in words and "a" in words and "b" in words
+    (words,) = null_directions(_two(), 1e6 * np.array([[1.0, 1.0], [1.0, 1.0]]))
+    assert "raised while" in words
+    (words,) = null_directions(_two(), np.diag([1e6, 0.0]))
+    assert words.startswith("b leaves no trace")
+    assert null_directions(_two(), np.diag([1e6, 1e6])) == ()
+
+
+def test_k11_names_its_null_directions_on_real_information(ideal: Demonstration) -> None:
+    """With nothing weighed, two combinations are invisible, and masses are among the parameters they name."""
+    space = parameter_space().with_ratio(5.0)
+    problem = Problem(ideal.robot, space, [ideal.fit], threads=1)
+    from deal_hw.calib.residuals import Shooting
+
+    theta = np.array([ideal.truth.parameters[name] for name in space.names])
+    shooting = Shooting(problem, 80)
+    # The information of a sensor, not of the wire's micrometres, decides what counts as invisible.
+    hessian = shooting.normal(shooting.start(theta, 0.0)).hessian * (1e-6 / 1e-3) ** 2
+    words = null_directions(space, hessian[:-1, :-1])
+    assert len(words) >= 2
+    assert all("mass" in text for text in words[:2])
+
+
+def test_intervals_of_what_the_data_cannot_see_are_the_ranges() -> None:
+    """A parameter as uncertain as its range gets the range's own 90 %; one known to 1 % gets +-1.645 %."""
+    space = _two()
+    prior = space.width[0] ** 2 / 12
+    got = intervals(space, np.array([1.0, 4.9]), np.diag([1e-4, prior]))
+    assert got[0] == pytest.approx([np.exp(-0.016448536), np.exp(0.016448536)])
+    assert got[1] == pytest.approx(space.unnormalize(np.array([[0.05, 0.05], [0.95, 0.95]]))[:, 1])
+
+
+def test_a_parameter_at_its_bound_is_reported() -> None:
+    """The alarm names the parameter and says to widen the range."""
+    space = _two()
+    told = uncertainty(
+        space, np.array([1.0, 5.0]), 0.01, np.diag([1e4, 1e4, 1e8]), 1.0,
+        (np.random.default_rng(0).normal(size=(4, 50, 2)),), (0.0, 0.04),
+    )  # fmt: skip
+    assert any(words.startswith("b ended at the bound") for words in told.alarms)
+    assert told.verdicts == ("identifiable", "identifiable")
+
+
+def test_scores_by_hand() -> None:
+    """Estimates 1.1 and 0.5 of truth 1: 30 %, 100 (ln 1.1 + ln 2) / 2 = 39.42; half of the intervals hold."""
+    theta, truth = np.array([1.1, 0.5]), np.ones(2)
+    assert error_percent(theta, truth) == pytest.approx(30.0)
+    assert log_error_x100(theta, truth) == pytest.approx(39.423, abs=1e-3)
+    score = interval_score(_two(), np.array([[0.9, 1.2], [0.4, 0.6]]), truth, np.array([0.1, 0.1]))
+    assert score.coverage90 == 0.5
+    widths = np.log(1.2 / 0.9), np.log(0.6 / 0.4)
+    assert score.width90 == pytest.approx(np.median(widths) / (2 * 1.6448536 * 0.1))
+
+
+def test_recording_without_excitation_is_refused_before_any_search(ideal: Demonstration) -> None:
+    """A robot that stands still is refused, and the message says what to record."""
+    import dataclasses
+
+    still = dataclasses.replace(ideal.fit, position=np.zeros_like(ideal.fit.position))
+    problem = Problem(ideal.robot, ideal.space, [still], threads=1)
+    search = Near(ideal.theta, 0.0)
+    with pytest.raises(InsufficientDataError, match=r"hardly moves.*--profile rich"):
+        PolishedMethod(search).run(problem, Budget(), np.random.default_rng(0))
+    assert search.runs == 0
+    short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 60)
+    with pytest.raises(InsufficientDataError, match=r"0\.30 s of usable samples"):
+        check_excitation(Problem(ideal.robot, ideal.space, [short], threads=1))
+
+
+def test_diverged_members_are_nan_and_the_others_untouched() -> None:
+    """A state that MuJoCo calls unstable is reported, not silently reset."""
+    robot, space = load_model(DESCRIPTION), k9_space()
+    batch = ServoBatch(robot, space, 2, threads=1)
+    batch.set_state(np.array([[0.0, 0.1], [0.0, 0.1]]), np.array([[0.0, 0.0], [1e12, 0.0]]))
+    position, _ = batch.advance(np.zeros((2, 50, 1)), every=10)
+    assert np.isfinite(position[0]).all()
+    assert np.isnan(position[1]).all()
+
+
+def test_latency_scan_weighs_ticks_by_their_cost(ideal: Demonstration) -> None:
+    """Costs 10 and 12 at chi2 1 weigh 1 : exp(-1)."""
+    problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
+    at = polish(problem, ideal.theta, 0.0, (0.2,), iterations=1)
+    import dataclasses
+
+    costs = [dataclasses.replace(at, chi2=1.0, normal=dataclasses.replace(at.normal, cost=c)) for c in (12.0, 10.0)]
+    scan = LatencyScan((4, 5), tuple(costs))
+    assert scan.best == 1
+    assert scan.weights == pytest.approx(np.array([np.exp(-1), 1.0]) / (1 + np.exp(-1)))

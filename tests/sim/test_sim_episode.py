@@ -1,0 +1,112 @@
+"""From a recording to the device's time grid, through the real device core on a virtual wire."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode
+from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.episode import align
+from deal_hw.sim.model import load_model
+from deal_hw.sim.windows import cut_windows, predict_windows, setpoints
+
+SEGMENT = Segment(start=0.5, stop=1.0, effort_limit=0.4, speed_limit=2.0)
+
+
+@pytest.fixture(scope="module")
+def recorded() -> VirtualEpisode:
+    """Two seconds of random set-points on a nominal robot with a latency of 7 + 4 ticks, ideal sensors."""
+    truth = nominal_truth("ideal", 3, actuation_ticks=7, sensing_ticks=4)
+    config = RichConfig(duration_s=2.0, balance_s=0.0, segments=(SEGMENT,))
+    return VirtualCartpole(truth).run(RichBehaviour(DESCRIPTION, None, config, 5), 2.0)
+
+
+def test_simulation_explains_the_recording_to_the_wire_resolution(recorded: VirtualEpisode) -> None:
+    """With the true parameters and the summed latency, windows predict the recording to a few micrometres.
+
+    This is the equality that calibration rests on: driver, bytes, firmware, recorder, alignment and simulator agree
+    on what acted when, through changes of gains and limits.
+    """
+    robot, space = load_model(DESCRIPTION), k9_space()
+    episode = align(recorded.trajectory, DESCRIPTION)
+    windows = cut_windows(episode, 20)
+    batch = ServoBatch(robot, space, 2, threads=1)
+    path = setpoints(batch, episode, np.array([0.011, 0.013]))
+    x, v = episode.position[windows.start], episode.velocity[windows.start]
+    predicted, _ = predict_windows(batch, episode, windows, x, v, path)
+    error = np.abs(predicted - episode.position[windows.samples()])
+    # Whole micrometres and microradians at the start grow over 0.1 s of a falling pole.
+    assert error[0].max() < 2e-5
+    assert error[1].max() > 1e-3
+
+
+def test_windows_keep_clear_of_changes_of_what_is_sent(recorded: VirtualEpisode) -> None:
+    """No window begins before and ends after the moment at which another effort limit came into force."""
+    episode = align(recorded.trajectory, DESCRIPTION)
+    change = int(np.flatnonzero(np.diff(episode.effort_limit[:, 0]))[0])
+    windows = cut_windows(episode, 40)
+    begin, end = episode.sample[windows.start], episode.sample[windows.start + 40]
+    assert not np.any((begin <= change) & (end > change))
+    assert len(windows) >= 6
+
+
+def test_windows_leave_gaps_out(recorded: VirtualEpisode) -> None:
+    """Ten lost frames end one window and another starts after them."""
+    t = recorded.trajectory
+    keep = np.r_[0:100, 110 : len(t.device_s)]
+    fields = ("receive_s", "device_s", "position", "velocity", "effort", "status", "command_sequence", "command_age_s")
+    torn = dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
+    episode = align(torn, DESCRIPTION)
+    windows = cut_windows(episode, 10)
+    spans = episode.sample[windows.start + 10] - episode.sample[windows.start]
+    assert set(spans.tolist()) == {50}
+    assert not np.any((windows.start < 99) & (windows.start + 10 > 99))
+
+
+def test_recording_that_was_never_armed_is_refused(recorded: VirtualEpisode) -> None:
+    """Without armed samples there is nothing to align, and the error says what to do."""
+    t = recorded.trajectory
+    idle = dataclasses.replace(t, status=np.zeros_like(t.status))
+    with pytest.raises(InsufficientDataError, match="collect"):
+        align(idle, DESCRIPTION)
+
+
+def test_episode_shorter_than_one_window_is_refused(recorded: VirtualEpisode) -> None:
+    """The error says how long a window is and how much there is."""
+    episode = align(recorded.trajectory, DESCRIPTION)
+    with pytest.raises(InsufficientDataError, match=r"no window of 1000 samples \(5\.00 s\)"):
+        cut_windows(episode, 1000)
+
+
+def test_command_inside_a_gap_is_placed_by_the_clocks(recorded: VirtualEpisode) -> None:
+    """With 12 frames lost, three commands are never reported; each is placed within a period of where it acted."""
+    t = recorded.trajectory
+    keep = np.r_[0:100, 112 : len(t.device_s)]
+    fields = ("receive_s", "device_s", "position", "velocity", "effort", "status", "command_sequence", "command_age_s")
+    torn = dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
+    whole, mended = align(t, DESCRIPTION), align(torn, DESCRIPTION)
+    # Three commands, each at most one period from where it was.
+    assert np.count_nonzero(whole.target != mended.target) <= 3
+
+
+def test_command_that_never_arrived_is_not_placed(recorded: VirtualEpisode) -> None:
+    """When the command that carries a new target is lost on the wire, the target acts one control period later."""
+    t = recorded.trajectory
+    i = int(np.flatnonzero(np.diff(t.position_target[:, 0]))[2]) + 1
+    lost = int(t.sent_sequence[i])
+    hit = t.command_sequence == lost
+    silent = dataclasses.replace(
+        t,
+        command_sequence=np.where(hit, lost - 1, t.command_sequence),
+        command_age_s=np.where(hit, t.command_age_s + 0.02, t.command_age_s),
+    )
+    new = t.position_target[i]
+    begin = [int(np.flatnonzero(align(x, DESCRIPTION).target[:, 0] == new[0])[0]) for x in (t, silent)]
+    assert begin[1] - begin[0] == DESCRIPTION.steps_per_control

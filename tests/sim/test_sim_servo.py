@@ -1,0 +1,42 @@
+"""The set-point generator: hand-computed slews and delays, and the laws they obey."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deal_hw.sim.servo import delay, slew
+
+
+def test_slew_by_hand() -> None:
+    """From 0 to 0.25 at 0.1 a step: 0.1, 0.2, 0.25, and back to 0 from there: 0.15, 0.05, 0."""
+    target = np.array([0.25, 0.25, 0.25, 0.0, 0.0, 0.0])[:, None]
+    path = slew(np.zeros((1, 1)), target, np.full((1, 1), 0.1))
+    np.testing.assert_allclose(path[0, :, 0], [0.1, 0.2, 0.25, 0.15, 0.05, 0.0], atol=1e-15)
+
+
+def test_members_slew_at_their_own_rates() -> None:
+    """Two members, 0.1 and 0.3 a step, to 0.3."""
+    path = slew(np.zeros((2, 1)), np.full((3, 1), 0.3), np.array([[0.1], [0.3]]))
+    np.testing.assert_allclose(path[:, :, 0], [[0.1, 0.2, 0.3], [0.3, 0.3, 0.3]])
+
+
+def test_delay_by_hand() -> None:
+    """Two whole steps, and one and a half: half of the value one step ago and half of that two steps ago."""
+    path = np.array([1.0, 2.0, 3.0, 4.0])[None, :, None].repeat(2, axis=0)
+    late = delay(path, np.array([2.0, 1.5]), np.zeros((2, 1)))
+    np.testing.assert_allclose(late[:, :, 0], [[0, 0, 1, 2], [0, 0.5, 1.5, 2.5]])
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 20))
+def test_delaying_the_target_delays_the_setpoint(seed: int, steps: int) -> None:
+    """A whole-step latency on the target and on the set-point are the same thing."""
+    rng = np.random.default_rng(seed)
+    target = rng.uniform(-1, 1, 8).repeat(10)[:, None]
+    late_target = np.concatenate([np.zeros((steps, 1)), target])[: len(target)]
+    rate, start = np.full((1, 1), 0.07), np.zeros((1, 1))
+    direct = slew(start, late_target, rate)
+    shifted = delay(slew(start, target, rate), np.array([float(steps)]), start)
+    np.testing.assert_allclose(direct, shifted, atol=1e-12)
