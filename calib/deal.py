@@ -17,14 +17,16 @@ hidden features that hardly depend on the parameters.
 
 from __future__ import annotations
 
+import abc
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.coordinates import Coordinates, Members, logistic, logit
 from deal_hw.calib.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
 from deal_hw.calib.ensemble_kalman import EnsembleKalman
-from deal_hw.calib.innovations import is_noisy, linearise, predict, samples_per_tick
+from deal_hw.calib.innovations import explained, is_noisy, linearise, predict, samples_per_tick
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem, WindowData
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
@@ -42,25 +44,21 @@ class DealSettings:
         generations: Search steps; never more than the budget's.
         clean_ticks: Window length in control periods where positions carry no noise.
         noisy_ticks: The same where they do.
-        keep: Share of the statistics' residual that one step leaves.
+        keep: Share of the statistics' residual that one step leaves (noise-free recordings).
         step_clip: Largest step of a coordinate, in logits.
         noise_draws: Draws of the noise from which its effect on the statistics is estimated (noisy recordings).
-        average: How many last generations' means make the estimate (noisy recordings).
+        smooth_draws: How many of these a member's statistics are averaged over.
         torch_threads: Threads of the critic's arithmetic.
     """
 
     critic: CriticSettings = field(default_factory=lambda: _CRITIC)
-    generations: int = 15
+    generations: int = 30
     clean_ticks: int = 10
     noisy_ticks: int = 20
-    keep: float = 0.3
+    keep: float = 0.25
     step_clip: float = 2.0
     noise_draws: int = 100
-    average: int = 4
-    smooth: int = 4
-    context: bool = True
-    white: bool = True
-    floor: float = 1e-8
+    smooth_draws: int = 4
     torch_threads: int = 1
 
 
@@ -79,7 +77,7 @@ class Deal(CalibrationMethod[Problem]):
     def run(
         self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
     ) -> CalibrationResult:
-        """Calibrate: one critic update round and one Kalman step a generation."""
+        """Calibrate: one round of critic updates and one Kalman step a generation."""
         settings = self.settings
         run = Run(self.name, problem, budget, progress)
         coordinates = Coordinates(problem)
@@ -87,9 +85,10 @@ class Deal(CalibrationMethod[Problem]):
             logit(coordinates.sample(rng, budget.population)), rng, step_clip=settings.step_clip
         )
         noisy = is_noisy(problem)
-        view: _CleanView | _NoisyView
-        view = _NoisyView(problem, settings, rng) if noisy else _CleanView(problem, settings, rng)
-        means: list[FloatArray] = []
+        view: _View = (_NoisyView if noisy else _CleanView)(problem, settings, rng)
+        # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise begins.
+        # Noise-free ones have no such end: each step takes a fixed share of what is left.
+        keep = None if noisy else settings.keep
         with torch_threads(settings.torch_threads):
             for _ in range(min(settings.generations, budget.generations)):
                 if kalman.finished:
@@ -98,155 +97,170 @@ class Deal(CalibrationMethod[Problem]):
                 members = coordinates.members(logistic(z))
                 centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
                 residual, gap = view.residual(members, centre)
-                step = kalman.tell(residual, keep=None if noisy else settings.keep)
-                means.append(kalman.ask().mean(axis=0))
+                step = kalman.tell(residual, keep=keep)
                 run.note(
                     f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
                     members.theta,
                     {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
                 )
         z = kalman.ask()
-        middle = np.mean(means[-settings.average :], axis=0) if noisy and means else z.mean(axis=0)
+        centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
         return run.result(
             coordinates,
-            coordinates.members(logistic(middle[None])),
+            centre,
             coordinates.members(logistic(z)),
             settings=settings,
-            extra={"interval": "ensemble spread, uncalibrated", "view": "per tick" if noisy else "windows"},
+            chi2=explained(problem, centre, settings.noisy_ticks if noisy else settings.clean_ticks),
+            extra={"interval": "ensemble spread, uncalibrated", "view": "control periods" if noisy else "windows"},
         )
 
 
-class _CleanView:
-    """Noise-free recordings: one sample of the critic is one window of innovations at the control rate."""
+class _View(abc.ABC):
+    """What the critic sees of recording and population, and what the members are told.
+
+    Args:
+        problem: Data and simulator.
+        settings: Window lengths, critic.
+        rng: Seeds the critic and draws the noise.
+    """
 
     def __init__(self, problem: Problem, settings: DealSettings, rng: np.random.Generator) -> None:
         self._problem, self._settings, self._rng = problem, settings, rng
         self._every = samples_per_tick(problem)
-        self._windows = problem.windows(settings.clean_ticks * self._every)
-        context = np.concatenate([_context(problem, data) for data in self._windows])
-        self._context = ((context - context.mean(axis=0)) / np.maximum(context.std(axis=0), 1e-9)).astype(np.float32)
-        if not settings.context: self._context = self._context[:, :0]
-        width = settings.clean_ticks * problem.joints + self._context.shape[1]
-        self._critic = PenaltyCritic(width, settings.critic, rng)
+        self._windows = problem.windows(self._ticks() * self._every)
+        context = np.concatenate([self._make_context(data) for data in self._windows])
+        spread = np.maximum(context.std(axis=0), 1e-9)
+        self._context = np.asarray((context - context.mean(axis=0)) / spread, dtype=np.float32)
+        self._critic = PenaltyCritic(self._width() + self._context.shape[1], settings.critic, rng)
+
+    @abc.abstractmethod
+    def _ticks(self) -> int:
+        """Return the window length in control periods."""
+
+    @abc.abstractmethod
+    def _width(self) -> int:
+        """Return how many innovations one sample of the critic holds."""
+
+    @abc.abstractmethod
+    def _make_context(self, data: WindowData) -> FloatArray:
+        """Return the state and action that belong to each sample of an episode, (n, C): the s and a of D(s, a, s')."""
+
+    @abc.abstractmethod
+    def _innovations(self, members: Members, centre: Members, data: WindowData) -> tuple[FloatArray, FloatArray]:
+        """Return innovations of the recording, (n, width), and of the members, (N, n, width)."""
+
+    @abc.abstractmethod
+    def _statistics(
+        self, real: FloatArray, fake: FloatArray, good: npt.NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Train the critic; return whitened statistics of the recording, of the members, and the distance."""
 
     def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
-        """Return the recording's statistics minus each member's, (N, F), in units of the ensemble's spread."""
-        real, fake = [], []
-        for data in self._windows:
-            together = Members(
-                np.concatenate([members.theta, centre.theta]),
-                np.concatenate([members.latency_s, centre.latency_s]),
-            )
-            predicted, _ = predict(self._problem, together, data)
-            predicted = predicted[:, :, self._every - 1 :: self._every]
-            measured = data.measured[:, self._every - 1 :: self._every]
-            real.append((measured - predicted[-1]).reshape(len(measured), -1))
-            fake.append((predicted[:-1] - predicted[-1]).reshape(len(members.theta), len(measured), -1))
-        return self._statistics(np.concatenate(real), np.concatenate(fake, axis=1))
+        """Return the recording's statistics minus each member's, (N, F), and the critic's Wasserstein estimate.
 
-    def _statistics(self, real: FloatArray, fake: FloatArray) -> tuple[FloatArray, float]:
+        Args:
+            members: The population.
+            centre: The simulator whose prediction both are compared with.
+        """
+        parts = [self._innovations(members, centre, data) for data in self._windows]
+        real = np.concatenate([part[0] for part in parts])
+        fake = np.concatenate([part[1] for part in parts], axis=1)
         good = np.isfinite(fake).all(axis=(1, 2))
         if not good.any() or not np.isfinite(real).all():
             return np.full((len(fake), 1), np.nan), float("nan")
-        width = fake.shape[2]
-        flat = fake[good].reshape(-1, width)
-        scale = np.maximum(np.sqrt(np.mean(flat**2, axis=0)), 1e-12)
-        if self._settings.white:
-            limited = np.clip(flat / scale, -5, 5)
-            values, vectors = np.linalg.eigh(limited.T @ limited / len(limited))
-            root = vectors / np.sqrt(np.maximum(values, self._settings.floor * values[-1]))
-            def scaled(x): return (5 * np.tanh(x / scale @ root / 5)).astype(np.float32)
-        else:
-            def scaled(x): return _scaled(x, scale)
-        def join(x): return np.concatenate([scaled(x), np.broadcast_to(self._context, (*x.shape[:-1], self._context.shape[1]))], axis=-1)
-        imitation = join(np.nan_to_num(fake))
-        data = join(real)
-        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
-        found = self._critic.statistics(np.nan_to_num(imitation))
-        target = self._critic.statistics(data[None])[0]
-        std = found[good].std(axis=0)
-        # Units that are never active carry nothing and would divide by zero.
-        alive = std > 1e-6 * max(float(std.max()), 1e-30)
-        residual = (target[alive] - found[:, alive]) / std[alive]
-        residual[~good] = np.nan
-        return residual, gap
-
-
-def _context(problem: Problem, data: WindowData) -> FloatArray:
-    episode = problem.episodes[data.episode]
-    at = episode.sample[data.windows.start]
-    span = data.windows.length * data.windows.stride
-    target = np.stack([episode.target[k : k + span].mean(axis=0) for k in at])
-    return np.concatenate([data.start_position, data.start_velocity, target], axis=1)
-
-
-def _scaled(values: FloatArray, scale: FloatArray) -> Samples:
-    # Far members' windows run away by many scales; a critic that spends itself on them sees nothing near the middle.
-    return (5.0 * np.tanh(values / (5.0 * scale))).astype(np.float32)
-
-
-class _NoisyView:
-    """Noisy recordings: one sample of the critic is one control period of whitened innovations, and its context."""
-
-    def __init__(self, problem: Problem, settings: DealSettings, rng: np.random.Generator) -> None:
-        self._problem, self._settings, self._rng = problem, settings, rng
-        self._every = samples_per_tick(problem)
-        self._windows = problem.windows(settings.noisy_ticks * self._every)
-        context = np.concatenate([_tick_context(problem, data, self._every) for data in self._windows])
-        self._context = _standardised(context)
-        width = self._every * problem.joints + self._context.shape[1]
-        self._critic = PenaltyCritic(width, settings.critic, rng)
-
-    def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
-        """Return the recording's statistics minus each member's, (N, F), whitened by the noise of the former."""
-        real, fake = [], []
-        wide = self._every * self._problem.joints
-        for data in self._windows:
-            whitening = linearise(self._problem, centre, data)
-            predicted, _ = predict(self._problem, members, data)
-            fake.append(whitening.apply(predicted - whitening.reference).reshape(len(predicted), -1, wide))
-            real.append(whitening.apply((data.measured - whitening.reference)[None]).reshape(-1, wide))
-        return self._statistics(np.concatenate(real), np.concatenate(fake, axis=1))
-
-    def _statistics(self, real: FloatArray, fake: FloatArray) -> tuple[FloatArray, float]:
-        good = np.isfinite(fake).all(axis=(1, 2))
-        if not good.any() or not np.isfinite(real).all():
-            return np.full((len(fake), 1), np.nan), float("nan")
-        draws = self._rng.standard_normal((self._settings.noise_draws, *real.shape))
-        fake = np.nan_to_num(fake)
-        scale = np.sqrt(1.0 + np.mean(np.clip(fake[good], -1e6, 1e6) ** 2, axis=(0, 1)))
-        noise = draws[self._rng.integers(len(draws), size=len(fake))]
-        imitation = self._join(fake + noise, scale)
-        data = self._join(real, scale)
-        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
-        found = np.mean(
-            [self._critic.statistics(self._join(fake + d, scale)) for d in draws[: self._settings.smooth]], axis=0
-        )
-        target = self._critic.statistics(data[None])[0]
-        floor = self._critic.statistics(self._join(draws, scale))
-        covariance = np.cov(floor, rowvar=False)
-        alive = np.diag(covariance) > 1e-12 * max(float(np.diag(covariance).max()), 1e-30)
-        covariance = covariance[np.ix_(alive, alive)]
-        # The covariance of F statistics from as many draws is singular: shrink it to its diagonal.
-        covariance = 0.9 * covariance + 0.1 * np.diag(np.diag(covariance))
-        factor = np.linalg.inv(np.linalg.cholesky(covariance))
-        residual = (target[alive] - found[:, alive]) @ factor.T
+        target, found, gap = self._statistics(real, np.nan_to_num(fake), good)
+        residual = target - found
         residual[~good] = np.nan
         return residual, gap
 
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
+        # Far members' windows run away by many scales; a critic that spends itself on them sees nothing in the middle.
+        limited = (5.0 * np.tanh(values / (5.0 * scale))).astype(np.float32)
         context = np.broadcast_to(self._context, (*values.shape[:-1], self._context.shape[1]))
-        return np.concatenate([_scaled(values, scale), context], axis=-1)
+        return np.concatenate([limited, context], axis=-1)
 
 
-def _tick_context(problem: Problem, data: WindowData, every: int) -> FloatArray:
-    starts, episode = problem.starts[data.episode], problem.episodes[data.episode]
-    row = (data.windows.start[:, None] + np.arange(0, data.windows.length, every)).ravel()
-    return np.concatenate(
-        [starts.position[row], starts.velocity[row], episode.target[episode.sample[row]]], axis=1
-    )
+class _CleanView(_View):
+    """Noise-free recordings: one sample is one window of innovations at the control rate."""
+
+    def _ticks(self) -> int:
+        return self._settings.clean_ticks
+
+    def _width(self) -> int:
+        return self._settings.clean_ticks * self._problem.joints
+
+    def _make_context(self, data: WindowData) -> FloatArray:
+        episode = self._problem.episodes[data.episode]
+        span = data.windows.length * data.windows.stride
+        begin = episode.sample[data.windows.start]
+        target = np.stack([episode.target[k : k + span].mean(axis=0) for k in begin])
+        return np.concatenate([data.start_position, data.start_velocity, target], axis=1)
+
+    def _innovations(self, members: Members, centre: Members, data: WindowData) -> tuple[FloatArray, FloatArray]:
+        at = slice(self._every - 1, None, self._every)
+        both = Members(
+            np.concatenate([members.theta, centre.theta]), np.concatenate([members.latency_s, centre.latency_s])
+        )
+        predicted = predict(self._problem, both, data)[0][:, :, at]
+        real = data.measured[:, at] - predicted[-1]
+        fake = predicted[:-1] - predicted[-1]
+        return real.reshape(len(real), -1), fake.reshape(*fake.shape[:2], -1)
+
+    def _statistics(
+        self, real: FloatArray, fake: FloatArray, good: npt.NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        scale = np.maximum(np.sqrt(np.mean(fake[good] ** 2, axis=(0, 1))), 1e-12)
+        data, imitation = self._join(real, scale), self._join(fake, scale)
+        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
+        target, found = self._critic.statistics(data[None])[0], self._critic.statistics(imitation)
+        std = found[good].std(axis=0)
+        # Units that are never active carry nothing and would divide by zero.
+        alive = std > 1e-6 * max(float(std.max()), 1e-30)
+        return target[alive] / std[alive], found[:, alive] / std[alive], gap
 
 
-def _standardised(values: FloatArray) -> Samples:
-    spread = np.maximum(values.std(axis=0), 1e-9)
-    return np.asarray((values - values.mean(axis=0)) / spread, dtype=np.float32)
+class _NoisyView(_View):
+    """Noisy recordings: one sample is one control period of whitened innovations.
+
+    Members are given simulated noise of the same whitened size, or the critic would tell them by its absence.
+    """
+
+    def _ticks(self) -> int:
+        return self._settings.noisy_ticks
+
+    def _width(self) -> int:
+        return self._every * self._problem.joints
+
+    def _make_context(self, data: WindowData) -> FloatArray:
+        starts, episode = self._problem.starts[data.episode], self._problem.episodes[data.episode]
+        row = (data.windows.start[:, None] + np.arange(0, data.windows.length, self._every)).ravel()
+        target = episode.target[episode.sample[row]]
+        return np.concatenate([starts.position[row], starts.velocity[row], target], axis=1)
+
+    def _innovations(self, members: Members, centre: Members, data: WindowData) -> tuple[FloatArray, FloatArray]:
+        whitening = linearise(self._problem, centre, data)
+        predicted, _ = predict(self._problem, members, data)
+        # The inverse Cholesky factor is lower triangular: each period's innovation is whitened by its past only.
+        fake = whitening.apply(predicted - whitening.reference).reshape(len(predicted), -1, self._width())
+        real = whitening.apply((data.measured - whitening.reference)[None]).reshape(-1, self._width())
+        return real, fake
+
+    def _statistics(
+        self, real: FloatArray, fake: FloatArray, good: npt.NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        settings = self._settings
+        draws = self._rng.standard_normal((settings.noise_draws, *real.shape))
+        scale = np.sqrt(1.0 + np.mean(fake[good] ** 2, axis=(0, 1)))
+        noise = draws[self._rng.integers(len(draws), size=len(fake))]
+        data, imitation = self._join(real, scale), self._join(fake + noise, scale)
+        gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
+        target = self._critic.statistics(data[None])[0]
+        repeats = [self._critic.statistics(self._join(fake + d, scale)) for d in draws[: settings.smooth_draws]]
+        found = np.mean(repeats, axis=0)
+        covariance = np.cov(self._critic.statistics(self._join(draws, scale)), rowvar=False)
+        variance = np.diag(covariance)
+        alive = variance > 1e-12 * max(float(variance.max()), 1e-30)
+        # The covariance of so many statistics from as few draws is singular: shrink it to its diagonal.
+        covariance = 0.9 * covariance[np.ix_(alive, alive)] + 0.1 * np.diag(variance[alive])
+        factor = np.linalg.inv(np.linalg.cholesky(covariance))
+        return factor @ target[alive], found[:, alive] @ factor.T, gap

@@ -29,6 +29,13 @@ from deal_hw.calib.rollouts import (
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
 from deal_hw.types import FloatArray
 
+HALF_WIDTH = 3.0**0.5
+"""The box is [-HALF_WIDTH, HALF_WIDTH]: a uniform start then has unit variance, as eq. 12 has it at t = T.
+
+In [-1, 1] the unit noise of eq. 10 puts a third of all coordinates outside the range, where they are simulated at its
+edge, and the search is drawn into the corners.
+"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperSettings:
@@ -167,7 +174,7 @@ class _Box:
     def from_unit(self, unit: FloatArray) -> FloatArray:
         """Map unit coordinates, (N, C), into the box."""
         if self._normalise:
-            return 2 * unit - 1
+            return HALF_WIDTH * (2 * unit - 1)
         members = self.coordinates.members(unit)
         if self.coordinates.fixed_latency_s is not None:
             return members.theta
@@ -176,7 +183,7 @@ class _Box:
     def members(self, x: FloatArray) -> Members:
         """Map the box to physical values; what left the box is simulated at its edge (the paper does not say)."""
         if self._normalise:
-            return self.coordinates.members(np.clip((x + 1) / 2, 0.0, 1.0))
+            return self.coordinates.members(np.clip((x / HALF_WIDTH + 1) / 2, 0.0, 1.0))
         space = self.coordinates.space
         theta = np.clip(x[:, : len(space)], space.low, space.high)
         unit = space.normalize(theta)

@@ -111,3 +111,39 @@ def linearise(problem: Problem, centre: Members, data: WindowData) -> Whitening:
     sigma[:, diagonal, diagonal] += noise
     factor = np.linalg.inv(np.linalg.cholesky(sigma))
     return Whitening(predicted[0], factor)
+
+
+def whitened_residual(
+    problem: Problem, members: Members, centre: Members, windows: list[WindowData]
+) -> FloatArray:
+    """Return recording minus prediction of every window, whitened around one simulator.
+
+    Args:
+        problem: Data and simulator.
+        members: The N simulators.
+        centre: The simulator to linearise around, such as the population's mean.
+        windows: The windows.
+
+    Returns:
+        (N, M); not finite in rows of members that diverged.
+    """
+    parts = []
+    for data in windows:
+        whitening = linearise(problem, centre, data)
+        predicted, _ = predict(problem, members, data)
+        whitened = whitening.apply(data.measured - predicted)
+        parts.append(whitened.reshape(len(whitened), -1))
+    return np.concatenate(parts, axis=1)
+
+
+def explained(problem: Problem, centre: Members, ticks: int) -> float:
+    """Return the mean squared whitened residual of one simulator; 1 is a perfect model.
+
+    Args:
+        problem: Data and simulator.
+        centre: One member.
+        ticks: Window length in control periods.
+    """
+    windows = problem.windows(ticks * samples_per_tick(problem))
+    chi2 = float(np.mean(whitened_residual(problem, centre, centre, windows) ** 2))
+    return chi2 if np.isfinite(chi2) else float("inf")

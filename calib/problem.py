@@ -16,7 +16,7 @@ from deal_hw.calib.noise import NoiseModel, noise_model, white_noise_std
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.episode import Episode, fill_gaps
 from deal_hw.sim.model import RobotModel
 from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray
@@ -55,7 +55,7 @@ class WindowData:
         start_position: Smoothed positions at the starts, (W, J).
         start_velocity: Smoothed velocities at the starts, (W, J).
         reported_start: Reported positions at the starts, (W, J).
-        std: Standard deviation of the measured positions, (W, H, J).
+        std: Standard deviation of the measured positions, (W, H, J); infinite where none was reported.
         start_std: Standard deviation of the reported start positions, (W, J).
     """
 
@@ -76,7 +76,7 @@ class Problem:
     Attributes:
         robot: The nominal model.
         space: What is searched.
-        episodes: The recordings to fit.
+        episodes: The recordings to fit; short gaps are filled in and not fitted to.
         threads: Simulation threads; None for all CPUs.
         latency_range_s: Total latencies that are searched [s].
         fixed_latency_s: A latency that is given; None to search it.
@@ -99,6 +99,7 @@ class Problem:
     def __post_init__(self) -> None:
         if not self.episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
+        self.episodes = [fill_gaps(e) for e in self.episodes]
         floor = WIRE_RESOLUTION / np.sqrt(12.0)
         self.noise_std = np.max([white_noise_std(e.position, floor) for e in self.episodes], axis=0)
         self.starts = [smooth_states(e, self.noise_std) for e in self.episodes]
@@ -142,6 +143,8 @@ class Problem:
                 continue
             starts = self.starts[index]
             std = self.noise.std(starts.velocity)
+            if episode.reported is not None:
+                std = np.where(episode.reported[:, None], std, np.inf)
             found.append(
                 WindowData(
                     episode=index,

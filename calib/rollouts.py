@@ -18,6 +18,9 @@ from deal_hw.sim.servo import delay, slew
 from deal_hw.sim.windows import setpoints
 from deal_hw.types import FloatArray, IntArray
 
+INPUT_LIMIT = 5.0
+"""Standardised inputs of the critic are cut to this."""
+
 PopulationPolicy = Callable[[FloatArray, FloatArray, int], FloatArray]
 """pi_0 in the loop: position (N, J), velocity (N, J), tick -> position target (N, A)."""
 
@@ -204,6 +207,8 @@ class TransitionScale:
         """Standardise in place, (..., inputs)."""
         raw -= self.mean.astype(np.float32)
         raw *= (1.0 / self.std).astype(np.float32)
+        # A member whose pole spins would own the critic's output, and with it the softmax.
+        np.clip(raw, -INPUT_LIMIT, INPUT_LIMIT, out=raw)
         return raw
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.coordinates import Coordinates, Members, logistic, logit
+from deal_hw.calib.coordinates import Coordinates, logistic, logit
 from deal_hw.calib.ensemble_kalman import EnsembleKalman
-from deal_hw.calib.innovations import is_noisy, linearise, predict, samples_per_tick
+from deal_hw.calib.innovations import explained, is_noisy, samples_per_tick, whitened_residual
 from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem, WindowData
+from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
 from deal_hw.types import FloatArray
 
@@ -98,8 +98,8 @@ class Weki(CalibrationMethod[Problem]):
         kalman = EnsembleKalman(
             logit(coordinates.sample(rng, budget.population)), rng, step_clip=settings.step_clip
         )
-        windows: list[WindowData] = []
-        for stage, ticks in enumerate(settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks):
+        lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
+        for stage, ticks in enumerate(lengths):
             windows = problem.windows(ticks * tick)
             if stage:
                 kalman.widen(settings.widen)
@@ -123,29 +123,4 @@ class Weki(CalibrationMethod[Problem]):
                 )
         z = kalman.ask()
         centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-        residual = whitened_residual(problem, centre, centre, windows)
-        chi2 = float(np.mean(residual**2))
-        return (chi2 if np.isfinite(chi2) else float("inf")), z
-
-
-def whitened_residual(
-    problem: Problem, members: Members, centre: Members, windows: list[WindowData]
-) -> FloatArray:
-    """Return recording minus prediction of every window, whitened around one simulator.
-
-    Args:
-        problem: Data and simulator.
-        members: The N simulators.
-        centre: The simulator to linearise around, such as the population's mean.
-        windows: The windows.
-
-    Returns:
-        (N, M); not finite in rows of members that diverged.
-    """
-    parts = []
-    for data in windows:
-        whitening = linearise(problem, centre, data)
-        predicted, _ = predict(problem, members, data)
-        whitened = whitening.apply(data.measured - predicted)
-        parts.append(whitened.reshape(len(whitened), -1))
-    return np.concatenate(parts, axis=1)
+        return explained(problem, centre, lengths[-1]), z

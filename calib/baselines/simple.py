@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.innovations import explained, samples_per_tick, whitened_residual
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem
-from deal_hw.calib.weki import whitened_residual
-from deal_hw.calib.innovations import samples_per_tick
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
 from deal_hw.types import FloatArray
 
@@ -108,12 +107,11 @@ class RandomSearch(CalibrationMethod[Problem]):
         order = np.argsort(np.concatenate(scores))[: max(self.settings.elite, 2)]
         elite = coordinates.members(np.concatenate(kept)[order])
         best = Members(elite.theta[:1], elite.latency_s[:1])
-        residual = whitened_residual(problem, best, best, windows)
         return run.result(
             coordinates,
             best,
             elite,
             settings=self.settings,
-            chi2=float(np.mean(residual**2)),
+            chi2=explained(problem, best, self.settings.ticks),
             extra={"interval": "spread of the best draws, uncalibrated"},
         )

@@ -17,7 +17,7 @@ import numpy as np
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import calibrate_episodes
 from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
-from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode
+from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
@@ -26,7 +26,7 @@ from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import Policy
-from deal_hw.sim.episode import Episode, align
+from deal_hw.sim.episode import Episode, align, fill_gaps
 from deal_hw.sim.model import RobotModel, load_model
 from deal_hw.types import FloatArray
 
@@ -74,8 +74,7 @@ def demonstrate(profile: str, seed: int, xi: float) -> Demonstration:
             robot="cartpole", profile=kind, seconds=DEMONSTRATION_S, seed=seed, policy=str(shipped_policy("cartpole") or "")
         )  # fmt: skip
         recordings.append(virtual.run(make_behaviour(plan, DESCRIPTION), DEMONSTRATION_S))
-    fit, heldout = (align(r.trajectory, DESCRIPTION) for r in recordings)
-    fit_x, fit_v = _true_states(recordings[0], fit)
+    fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
     return Demonstration(
         truth=truth,
         space=space,
@@ -83,15 +82,9 @@ def demonstrate(profile: str, seed: int, xi: float) -> Demonstration:
         theta=np.array([truth.parameters[name] for name in space.names]),
         fit=fit,
         heldout=heldout,
-        fit_truth=(fit_x, fit_v),
-        heldout_truth=_true_states(recordings[1], heldout)[0],
+        fit_truth=recordings[0].true_states(fit),
+        heldout_truth=recordings[1].true_states(heldout)[0],
     )
-
-
-def _true_states(recording: VirtualEpisode, episode: Episode) -> tuple[FloatArray, FloatArray]:
-    """Return true states at an episode's samples; the episode leaves out samples at the recording's ends."""
-    rows = slice(episode.first_row, episode.first_row + len(episode.position))
-    return recording.true_position[rows], recording.true_velocity[rows]
 
 
 def calibration_row(

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from deal_hw.sim.model import RobotModel
 
 HELDOUT_PROFILE = "chirp"
+TABLE_WIDTH = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,6 +319,8 @@ def print_result(result: CalibrationResult) -> None:
     low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
     table.add_row("latency", "ms", "0", f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}", "")
     console = Console()
+    if console.width < TABLE_WIDTH:
+        console = Console(width=TABLE_WIDTH)
     console.print(table)
     for words in result.null_directions:
         console.print(f"the data cannot tell: {words}")

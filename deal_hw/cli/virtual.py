@@ -22,6 +22,7 @@ from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.sim.episode import Episode
 from deal_hw.types import FloatArray, Trajectory
 
 _START_NS = 10**9
@@ -33,15 +34,21 @@ class VirtualEpisode:
 
     Attributes:
         trajectory: The recording, as read back from its file.
-        true_position: Noise-free positions at the trajectory's samples and their device time, (T, J).
-        true_velocity: (T, J).
+        first_tick: Device tick of the recording's first sample.
+        true: What really happened since the robot was made.
         report: How the run went.
     """
 
     trajectory: Trajectory
-    true_position: FloatArray
-    true_velocity: FloatArray
+    first_tick: int
+    true: TrueTrajectory
     report: LoopReport
+
+    def true_states(self, episode: Episode) -> tuple[FloatArray, FloatArray]:
+        """Return noise-free positions and velocities at an episode's samples, (T, J) each."""
+        rows = np.searchsorted(self.true.tick, self.first_tick + episode.origin + episode.sample)
+        rows = np.minimum(rows, len(self.true.tick) - 1)
+        return self.true.position[rows], self.true.velocity[rows]
 
 
 class VirtualCartpole:
@@ -92,11 +99,4 @@ class VirtualCartpole:
                 config = LoopConfig(duration_s=seconds)
                 report = ControlLoop(robot, behaviour, safety, self.clock, sink, config).run()
             trajectory = read_trajectory(file)
-        position, velocity = _at(self.device.true_trajectory(), np.array(ticks))
-        return VirtualEpisode(trajectory, position, velocity, report)
-
-
-def _at(true: TrueTrajectory, ticks: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[FloatArray, FloatArray]:
-    rows = np.searchsorted(true.tick, ticks)
-    rows = np.minimum(rows, len(true.tick) - 1)
-    return true.position[rows], true.velocity[rows]
+        return VirtualEpisode(trajectory, ticks[0], self.device.true_trajectory(), report)

@@ -33,7 +33,12 @@ def become_realtime() -> Granted:
 
     What is refused is a warning, never an error: the loop still runs, only less regularly.
     """
-    words, warnings = [], []
+    words: list[str] = []
+    warnings: list[str] = []
+    gc.collect()
+    gc.freeze()
+    # Before SCHED_FIFO: locking reads in every page of every library and must hold up nobody with a deadline.
+    memory_refused = _lock_memory()
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
         words.append("SCHED_FIFO")
@@ -43,15 +48,13 @@ def become_realtime() -> Granted:
             f"SCHED_FIFO was refused ({err.strerror}); expect late cycles under load. "
             "Remedy: an rtprio line for this user in /etc/security/limits.conf, or CAP_SYS_NICE"
         )
-    if (reason := _lock_memory()) is None:
+    if memory_refused is None:
         words.append("mlockall")
     else:
         warnings.append(
-            f"mlockall was refused ({reason}); a page fault may delay a cycle. "
+            f"mlockall was refused ({memory_refused}); a page fault may delay a cycle. "
             "Remedy: a memlock line for this user in /etc/security/limits.conf, or CAP_IPC_LOCK"
         )
-    gc.collect()
-    gc.freeze()
     return Granted(" + ".join(words), tuple(warnings))
 
 

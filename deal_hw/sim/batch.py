@@ -15,7 +15,6 @@ from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
 from deal_hw.types import FloatArray
 
 
-
 def default_threads() -> int:
     """Return the number of CPUs this process may use."""
     return len(os.sched_getaffinity(0))

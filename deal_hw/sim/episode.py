@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ class Episode:
         usable: Samples between which the simulator may predict: armed, no watchdog, no gap to the next, (T,).
         start_setpoint: The set-point at the first period, (A,).
         first_row: Sample of the recording that became the first sample here.
+        origin: Device period 0 of the grid, counted from the recording's first sample.
+        reported: Samples that the robot reported; the others are filled in, (T,). None: all.
     """
 
     step_s: float
@@ -43,6 +46,8 @@ class Episode:
     usable: npt.NDArray[np.bool_]
     start_setpoint: FloatArray
     first_row: int = 0
+    origin: int = 0
+    reported: npt.NDArray[np.bool_] | None = None
 
     @property
     def steps(self) -> int:
@@ -106,6 +111,42 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
         usable=usable,
         start_setpoint=trajectory.position[rows[0]][list(description.actuated_index)],
         first_row=int(rows[0]),
+        origin=origin - int(device[0]),
+    )
+
+
+def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
+    """Return the episode with samples at regular times, lost ones filled in where the gap is short.
+
+    What is filled in (by straight lines) only holds the place: ``reported`` marks it, and nothing is fitted to it.
+    Without this a single lost frame would end every window that it falls into.
+
+    Args:
+        episode: The episode.
+        longest_s: Longest gap that is bridged [s].
+    """
+    stride = int(np.median(np.diff(episode.sample)))
+    if not np.any(np.diff(episode.sample) > stride):
+        return episode
+    regular = np.arange(episode.sample[0], episode.sample[-1] + 1, stride)
+    after = np.clip(np.searchsorted(episode.sample, regular), 0, len(episode.sample) - 1)
+    reported = episode.sample[after] == regular
+    before = np.where(reported, after, after - 1)
+    bridged = (episode.sample[after] - episode.sample[before]) * episode.step_s <= longest_s
+    both = np.isfinite(episode.position).all(axis=1)
+
+    def line(values: FloatArray) -> FloatArray:
+        return np.stack([np.interp(regular, episode.sample, column) for column in values.T], axis=1)
+
+    # A sample before a gap was marked as unusable for that alone; what counts now is whether the gap is bridged.
+    sound = both & ((episode.usable) | (np.diff(episode.sample, append=episode.sample[-1]) > stride))
+    return dataclasses.replace(
+        episode,
+        sample=regular,
+        position=np.where(reported[:, None], episode.position[after], line(episode.position)),
+        velocity=np.where(reported[:, None], episode.velocity[after], line(episode.velocity)),
+        usable=sound[before] & sound[after] & bridged,
+        reported=reported,
     )
 
 
