@@ -56,8 +56,8 @@ def fisher_std(
 ) -> FloatArray:
     """Return the standard deviations of the Fisher bound at the truth, in each parameter's own scale, (K,).
 
-    The bound of the same windows with the same unknowns (start states and latency) under the true noise, with the
-    range as a prior, as the intervals have it.
+    The bound of the same windows with the same unknowns (start states and latency) under the true noise, with
+    the range as a prior, as the intervals have it.
 
     Args:
         problem: The recordings and the simulator.

@@ -22,8 +22,8 @@ _CERTAIN = 2.0
 class NoiseModel:
     """White noise on positions, and samples whose time is uncertain.
 
-    A sample that reports the state of a slightly other moment is off by speed times time, so a jittering sensor looks
-    noisier the faster the joint moves.
+    A sample that reports the state of a slightly other moment is off by speed times time, so a jittering
+    sensor looks noisier the faster the joint moves.
 
     Attributes:
         position_std: Noise of positions at rest, (J,) [m or rad].
@@ -41,8 +41,9 @@ class NoiseModel:
 def white_noise_std(values: FloatArray, floor: float) -> FloatArray:
     """Estimate the standard deviation of white noise on top of smooth motion.
 
-    The sixth difference of a smooth motion nearly vanishes while white noise of variance s^2 comes out with variance
-    924 s^2 (the sum of the squared binomial coefficients); the median keeps impacts and stick-slip out.
+    The sixth difference of a smooth motion nearly vanishes while white noise of variance s^2 comes out with
+    variance 924 s^2 (the sum of the squared binomial coefficients); the median keeps impacts and stick-slip
+    out.
 
     Args:
         values: Uniformly sampled channels, (T, J).
@@ -64,8 +65,9 @@ def _spread(difference: FloatArray) -> FloatArray:
 def noise_model(positions: list[FloatArray], velocities: list[FloatArray], floor: float) -> NoiseModel:
     """Estimate noise and timing jitter of recordings.
 
-    The noise is estimated in bins of equal speed, joint by joint, and its square fitted by a straight line in the
-    squared speed: the intercept is the noise at rest, the slope, which all joints share, the jitter's variance.
+    The noise is estimated in bins of equal speed, joint by joint, and its square fitted by a straight line in
+    the squared speed: the intercept is the noise at rest, the slope, which all joints share, the jitter's
+    variance.
 
     Args:
         positions: Reported positions of each recording, (T, J) each, uniformly sampled.
@@ -79,7 +81,9 @@ def noise_model(positions: list[FloatArray], velocities: list[FloatArray], floor
         return NoiseModel(whole, 0.0)
     difference = np.concatenate([np.diff(positions[i], n=_ORDER, axis=0) for i in usable])
     middle = _ORDER // 2
-    speed2 = np.concatenate([velocities[i][middle : middle + len(velocities[i]) - _ORDER] ** 2 for i in usable])
+    speed2 = np.concatenate(
+        [velocities[i][middle : middle + len(velocities[i]) - _ORDER] ** 2 for i in usable]
+    )
     slopes, weights = [], []
     lines: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     for j in range(J):
@@ -87,7 +91,8 @@ def noise_model(positions: list[FloatArray], velocities: list[FloatArray], floor
         parts = np.array_split(order, _BINS)
         x = np.array([speed2[part, j].mean() for part in parts])
         y = np.array([float(_spread(difference[part, j : j + 1])[0]) ** 2 for part in parts])
-        # A variance from n samples through a median is known to about 2.3 / sqrt(n); neighbours share differences.
+        # A variance from n samples through a median is known to about 2.3 / sqrt(n); neighbours share
+        # differences.
         sigma = y * 2.3 * math.sqrt(3.0 / len(parts[0])) + floor**2
         slope, error = _slope(x, y, sigma)
         slopes.append(slope)

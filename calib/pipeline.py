@@ -1,4 +1,4 @@
-"""The whole calibration: check, search, polish, latency scan, restart until explained, intervals, held-out error."""
+"""The whole calibration: check, search, polish, latency scan, restarts until explained, intervals."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from deal_hw.calib.refine import Polished, polish
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
 from deal_hw.types import FloatArray
 
-RESTARTS = 3
-SAME_CHI2 = 0.02
+RESTARTS = 2
+SAME_CHI2 = 0.2
 SCAN_TICKS = 2
 SCAN_ITERATIONS = 6
 SCAN_MOST = 15
@@ -49,7 +49,7 @@ class LatencyScan:
 
 
 class PolishedMethod(CalibrationMethod[Problem]):
-    """A search followed by the polish; the search is run again from other draws while the residual is unexplained.
+    """A search followed by the polish; searched again from other draws while the residual is unexplained.
 
     Args:
         search: The search.
@@ -91,7 +91,11 @@ class PolishedMethod(CalibrationMethod[Problem]):
         }
         if scan is not None:
             chi2 = [p.chi2 for p in scan.polished]
-            provenance["latency_scan"] = {"ticks": list(scan.ticks), "chi2": chi2, "weights": scan.weights.tolist()}
+            provenance["latency_scan"] = {
+                "ticks": list(scan.ticks),
+                "chi2": chi2,
+                "weights": scan.weights.tolist(),
+            }
         return dataclasses.replace(
             searched,
             method=self.name,
@@ -120,7 +124,8 @@ class PolishedMethod(CalibrationMethod[Problem]):
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or _better(polished, best[1]):
                 best = (searched, polished)
-            # Two searches that end at the same unexplained residual say that the model is wrong, not the search.
+            # Two searches that end at the same unexplained residual say that the model is wrong, not the
+            # search.
             same = abs(polished.chi2 - previous) < SAME_CHI2 * previous
             if best[1].chi2 < MISMATCH_CHI2 or same:
                 break
@@ -142,7 +147,7 @@ def _period(problem: Problem) -> float:
 
 
 def polish_from(problem: Problem, searched: CalibrationResult, progress: ProgressCallback | None) -> Polished:
-    """Polish a search's estimate and, where that is not explained, the best members of its last population."""
+    """Polish a search's estimate."""
     fixed = problem.fixed_latency_s is not None
     latency = searched.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
 
@@ -156,8 +161,8 @@ def polish_from(problem: Problem, searched: CalibrationResult, progress: Progres
 def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallback | None) -> LatencyScan:
     """Polish again at the whole device ticks around the latency found.
 
-    The device acts on period boundaries, so its latency is a whole number of ticks; knowing that sharpens the other
-    parameters, and the ticks that remain plausible say how much.
+    The device acts on period boundaries, so its latency is a whole number of ticks; knowing that sharpens the
+    other parameters, and the ticks that remain plausible say how much.
     """
     tick = problem.episodes[0].step_s
     centre = round(polished.latency_s / tick)
@@ -169,11 +174,19 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
     while waiting and len(found) < SCAN_MOST:
         t = waiting.pop(0)
         found[t] = polish(
-            problem, polished.theta, t * tick, (length_s,), iterations=SCAN_ITERATIONS, fixed_latency=True, states=states
+            problem,
+            polished.theta,
+            t * tick,
+            (length_s,),
+            iterations=SCAN_ITERATIONS,
+            fixed_latency=True,
+            states=states,
         )
         if progress is not None:
             progress(
-                Progress("latency", len(found), len(found) + len(waiting), f"{t} ticks: chi2 {found[t].chi2:.3g}")
+                Progress(
+                    "latency", len(found), len(found) + len(waiting), f"{t} ticks: chi2 {found[t].chi2:.3g}"
+                )
             )
         best = min(found, key=lambda tick: found[tick].normal.cost)
         if not waiting:

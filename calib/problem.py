@@ -1,7 +1,7 @@
 """A calibration problem: recordings on the device's time grid, a batched simulator, and what is searched.
 
-Every method sees the data through this class, so that all of them use the same simulator, the same start states and
-the same count of simulated steps.
+Every method sees the data through this class, so that all of them use the same simulator, the same start
+states and the same count of simulated steps.
 """
 
 from __future__ import annotations
@@ -203,8 +203,8 @@ NOISE_FREE_STD = 2e-5
 def smooth_states(episode: Episode, noise_std: FloatArray) -> StartStates:
     """Estimate the state at every sample by local polynomials (Savitzky-Golay).
 
-    Positions that are free of noise are left alone, and so are the reported velocities then: smoothing would only
-    round off the impacts.
+    Positions that are free of noise are left alone, and so are the reported velocities then: smoothing would
+    only round off the impacts.
 
     Args:
         episode: The recording.
@@ -220,7 +220,8 @@ def smooth_states(episode: Episode, noise_std: FloatArray) -> StartStates:
     T = len(episode.sample)
     if length > T:
         raise InsufficientDataError(
-            f"the recording has {T} usable samples, the shortest that can be smoothed has {length}; record longer"
+            f"the recording has {T} usable samples, the shortest that can be smoothed has {length}; "
+            "record longer"
         )
     position, velocity = np.empty_like(episode.position), np.empty_like(episode.position)
     centre = savgol_coeffs(length, SMOOTHING_ORDER, use="dot")

@@ -1,4 +1,4 @@
-"""The polish: Levenberg-Marquardt on multiple shooting, in windows that grow, with the latency as one more unknown."""
+"""The polish: Levenberg-Marquardt on multiple shooting in growing windows, the latency one more unknown."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ STAGES_S = (0.2, 0.4, 0.8)
 """Window lengths, short first: short windows have a wide basin, long ones the information."""
 
 WORSE = 1.2
-"""A longer window whose chi2 grows by more than this factor is not kept: its start states are in another basin, or the
-model is wrong in a way that adds up."""
+"""A longer window whose chi2 grows by more than this factor is not kept: its start states are in another
+basin, or the model is wrong in a way that adds up."""
 
 STEP_LIMIT = 0.7
 """Largest step of a parameter in its own scale (about a factor two)."""

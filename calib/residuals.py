@@ -1,7 +1,8 @@
-"""Multiple shooting: residuals of windows whose start states are unknowns of their own, and their normal equations.
+"""Multiple shooting: residuals of windows whose start states are unknowns, and their normal equations.
 
-Each window's start state is eliminated (Schur complement), so what is left is a small system in the parameters and the
-latency, and its inverse is their covariance with the start states' uncertainty already in it.
+Each window's start state is eliminated (Schur complement), so what is left is a small system in the
+parameters and the latency, and its inverse is their covariance with the start states' uncertainty already in
+it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Held-out error: open-loop prediction of a recording that the search has not seen, beside null predictors."""
+"""Held-out error: open-loop prediction of a recording the search has not seen, beside null predictors."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def heldout_nrmse(
         space: The parameters.
         episodes: Held-out recordings.
         candidates: Name to physical parameters, (K,), and latency [s].
-        truth: Noise-free positions at the episodes' samples, (T, J) each, where there are any; else the reported ones.
+        truth: Noise-free positions at the episodes' samples, (T, J) each, where there are any; else the
+            reported ones.
         window_s: Prediction restarts from the smoothed reported state this often [s].
         threads: Simulation threads.
 

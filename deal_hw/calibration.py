@@ -70,7 +70,8 @@ class CalibrationResult:
         latency_interval_s: 90 % interval of the latency [s].
         chi2: Mean squared residual over its expected variance; 1 is a perfect model.
         alarms: Reasons to distrust the model (mismatch), in words; empty is good.
-        heldout_nrmse: Held-out error by predictor: "nominal", "calibrated", "null" (the state stays as it is).
+        heldout_nrmse: Held-out error by predictor: "nominal", "calibrated", "null" (the state stays as it
+            is).
         trace: One mapping a generation or iteration.
         steps: Simulated physics steps.
         seconds: Wall clock [s].
@@ -162,7 +163,7 @@ class CalibrationResult:
 
 
 class CalibrationMethod(abc.ABC, Generic[ProblemT]):
-    """A way to calibrate. Methods know a problem (data and simulator); the optimisers inside them know neither."""
+    """A way to calibrate: it knows a problem (data and simulator); the optimiser inside knows neither."""
 
     name: str
 

@@ -111,11 +111,13 @@ class RobotDescription:
     def __post_init__(self) -> None:
         unknown = [name for name in self.actuated if name not in self.joint_names]
         if unknown:
-            raise ConfigurationError(f"robot {self.name!r}: actuated joints {unknown} are not among {self.joint_names}")
+            raise ConfigurationError(
+                f"robot {self.name!r}: actuated joints {unknown} are not among {self.joint_names}"
+            )
         J, A = len(self.joint_names), len(self.actuated)
         for name, length in (
-            ("position_units", J), ("default_position", J), ("stiffness", A), ("damping", A), ("effort_limit", A),
-            ("speed_limit", A),
+            ("position_units", J), ("default_position", J), ("stiffness", A), ("damping", A),
+            ("effort_limit", A), ("speed_limit", A),
         ):  # fmt: skip
             if len(getattr(self, name)) != length:
                 raise ConfigurationError(

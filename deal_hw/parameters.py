@@ -1,7 +1,8 @@
-"""Contract of parameters: what may be searched, in which range and scale, and what is known about it afterwards.
+"""Contract of parameters: what may be searched, in which range, and what is known about it afterwards.
 
-A :class:`Parameter` is named after the element and the MuJoCo field it changes. The search runs in the unit cube;
-:meth:`ParameterSpace.normalize` and :meth:`ParameterSpace.unnormalize` are the one pair that maps to it.
+A :class:`Parameter` is named after the element and the MuJoCo field it changes. The search runs in the unit
+cube; :meth:`ParameterSpace.normalize` and :meth:`ParameterSpace.unnormalize` are the one pair that maps to
+it.
 """
 
 from __future__ import annotations
@@ -50,11 +51,13 @@ class Parameter:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
             raise ConfigurationError(
-                f"parameter {self.name!r}: range [{self.low:g}, {self.high:g}] {self.unit} must have low < high"
+                f"parameter {self.name!r}: range [{self.low:g}, {self.high:g}] {self.unit} must have "
+                "low < high"
             )
         if self.scale == "log" and self.low <= 0:
             raise ConfigurationError(
-                f"parameter {self.name!r}: a log scale needs a positive range, got low={self.low:g} {self.unit}"
+                f"parameter {self.name!r}: a log scale needs a positive range, "
+                f"got low={self.low:g} {self.unit}"
             )
         if not self.low <= self.nominal <= self.high:
             raise ConfigurationError(
@@ -161,7 +164,11 @@ class ParameterSpace:
             self[name]
         return ParameterSpace(
             dataclasses.replace(
-                p, nominal=values[p.name], low=min(p.low, values[p.name]), high=max(p.high, values[p.name]), known=True
+                p,
+                nominal=values[p.name],
+                low=min(p.low, values[p.name]),
+                high=max(p.high, values[p.name]),
+                known=True,
             )
             if p.name in values
             else p
@@ -169,7 +176,7 @@ class ParameterSpace:
         )
 
     def with_free(self, names: Iterable[str]) -> ParameterSpace:
-        """Return the space in which exactly these parameters are searched; the others keep their nominal value."""
+        """Return the space in which exactly these are searched; the others keep their nominal value."""
         wanted = set(names)
         for name in wanted:
             self[name]

@@ -49,7 +49,8 @@ class PolicySpec:
         joint_names: The robot's joints in the order the policy was trained with.
         actuated: The joints of the action, in order.
         observation: The terms of the observation, in order.
-        action_scale: Position target [m or rad] = default + scale * action, (A,). Actions are unitless in [-1, 1].
+        action_scale: Position target [m or rad] = default + scale * action, (A,). Actions are unitless in
+            [-1, 1].
         default_position: The pose that observation and action are relative to, (J,).
         stiffness: kp sent with each target, (A,).
         damping: kd sent with each target, (A,).
@@ -134,7 +135,9 @@ class PolicySpec:
             ("speed_limit", limits.speed),
         ):  # fmt: skip
             given = getattr(self, name)
-            if len(given) != len(allowed) or any(g > a or not g >= 0 for g, a in zip(given, allowed, strict=False)):
+            if len(given) != len(allowed) or any(
+                g > a or not g >= 0 for g, a in zip(given, allowed, strict=False)
+            ):
                 wrong.append(f"{name}: policy asks for {given!r}, the robot allows at most {allowed!r}")
         if wrong:
             raise PolicyMismatchError("the policy does not fit the robot: " + "; ".join(wrong))

@@ -14,8 +14,9 @@ from deal_hw.types import JointCommand, RobotState
 class Robot(abc.ABC):
     """A robot behind a transport. The constructor does no I/O; ``connect`` and ``disconnect`` are idempotent.
 
-    A driver never waits longer than it is told to, never retries silently, and does not judge commands: that is the
-    safety filter's work. What it cannot represent on the wire it rounds, and returns what was really sent.
+    A driver never waits longer than it is told to, never retries silently, and does not judge commands: that
+    is the safety filter's work. What it cannot represent on the wire it rounds, and returns what was really
+    sent.
     """
 
     description: ClassVar[RobotDescription]

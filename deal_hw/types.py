@@ -1,7 +1,8 @@
 """Messages between robot, policy, recorder and calibration.
 
-All quantities are SI: m, rad, s, N, N·m. Stamps are monotonic nanoseconds of the clock that is named. Arrays follow
-the joint order of the robot's :class:`~deal_hw.description.RobotDescription`: J joints, of which A are actuated.
+All quantities are SI: m, rad, s, N, N·m. Stamps are monotonic nanoseconds of the clock that is named. Arrays
+follow the joint order of the robot's :class:`~deal_hw.description.RobotDescription`: J joints, of which A are
+actuated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``deal-hw bench``: how well calibration and the loop do, as JSON rows, a CSV and a figure; stopped benches go on."""
+"""``deal-hw bench``: how well calibration and the loop do, as JSON rows, a CSV and a figure."""
 
 from __future__ import annotations
 
@@ -65,14 +65,16 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             first, dash, last = part.strip().partition("-")
             seeds += range(int(first), int(last) + 1) if dash else [int(first)]
     except ValueError as err:
-        raise ConfigurationError(f"--seeds {text!r}: give numbers and ranges, such as 0,1 or 1000-1009") from err
+        raise ConfigurationError(
+            f"--seeds {text!r}: give numbers and ranges, such as 0,1 or 1000-1009"
+        ) from err
     if not seeds:
         raise ConfigurationError(f"--seeds {text!r} names no seed")
     return tuple(seeds)
 
 
 def bench(config: Bench) -> int:
-    """Run the cells that are not done yet and write rows, CSV and figure after each; return 1 if any cell failed."""
+    """Run the cells that are not done yet, writing the files after each; return 1 if any cell failed."""
     try:
         from deal_hw.calib.methods import check_method
         from deal_hw.cli.bench_loop import SEARCHES, loop_cells, loop_row
@@ -91,7 +93,13 @@ def bench(config: Bench) -> int:
             continue
         policies.mkdir(parents=True, exist_ok=True)
         row = loop_row(
-            config.profile, seed, method, config.xi, train=config.train, folder=policies, threads=config.threads
+            config.profile,
+            seed,
+            method,
+            config.xi,
+            train=config.train,
+            folder=policies,
+            threads=config.threads,
         )
         key = ("profile", "seed", "method", "xi")
         rows = [r for r in rows if any(r[k] != row[k] for k in key)] + [row]
@@ -108,7 +116,8 @@ def _line(row: Mapping[str, Any]) -> str:
     head = f"{row['profile']} seed {row['seed']} {row['method']}"
     if row["error"]:
         return f"{head}: {row['error']}"
-    text = f"{head}: error {row['error_percent']:.2f} %, log error x100 {row['log_error_x100']:.2f}, {row['seconds']:.0f} s"
+    text = f"{head}: error {row['error_percent']:.2f} %, log error x100 {row['log_error_x100']:.2f}"
+    text += f", {row['seconds']:.0f} s"
     if "angle_error_retrained" in row:
         text += (
             f", angle error UDR {row['angle_error_udr']:.4f} retrained {row['angle_error_retrained']:.4f} "
@@ -123,7 +132,9 @@ def _load(path: Path) -> list[dict[str, Any]]:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if values["format"] != FORMAT:
-            raise DatasetError(f"{path} has format {values['format']!r}, expected {FORMAT!r}; name another file")
+            raise DatasetError(
+                f"{path} has format {values['format']!r}, expected {FORMAT!r}; name another file"
+            )
         rows: list[dict[str, Any]] = values["rows"]
     except (ValueError, KeyError, TypeError) as err:
         raise DatasetError(f"{path} exists and is not a bench file ({err!r}); name another file") from err
@@ -183,8 +194,10 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 
     good = [row for row in rows if not row["error"]]
     table = Table(title="median over seeds (worst)")
-    for name in ("profile", "method", "seeds", "error %", "log error x100", "coverage90", "width90", "held-out / nominal",
-                 "latency error ms", "flagged", "seconds"):  # fmt: skip
+    for name in (
+        "profile", "method", "seeds", "error %", "log error x100", "coverage90", "width90",
+        "held-out / nominal", "latency error ms", "flagged", "seconds",
+    ):  # fmt: skip
         table.add_column(name, justify="left" if name in ("profile", "method") else "right")
     for profile, method in dict.fromkeys((row["profile"], row["method"]) for row in good):
         part = [row for row in good if (row["profile"], row["method"]) == (profile, method)]
@@ -198,7 +211,10 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
             profile,
             method,
             str(len(part)),
-            *(f"{np.median(values(n)):.2f} ({values(n).max():.2f})" for n in ("error_percent", "log_error_x100")),
+            *(
+                f"{np.median(values(n)):.2f} ({values(n).max():.2f})"
+                for n in ("error_percent", "log_error_x100")
+            ),
             f"{values('coverage90').mean():.2f}",
             f"{np.median(values('width90')):.2f}",
             f"{np.median(ratio):.3f} ({ratio.max():.3f})",

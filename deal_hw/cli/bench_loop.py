@@ -1,7 +1,7 @@
-"""The loop bench: calibration, training and deployment on emulated cart-poles whose truth only the bench knows.
+"""The loop bench: calibration, training, deployment on emulated cart-poles whose truth only it knows.
 
-One row a seed and method, as the project's benchmark page defines them. Everything runs in virtual time through the
-same driver, bytes, loop and recorder as on the wire.
+One row a seed and method, as the project's benchmark page defines them. Everything runs in virtual time
+through the same driver, bytes, loop and recorder as on the wire.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import calibrate_episodes
-from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.run_plan import Profile, RunPlan, make_behaviour, shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -34,8 +34,6 @@ DEMONSTRATION_S = 4.0
 TASK_EPISODES = 5
 SEARCHES = ("deal", "weki", "deal-paper", "deal-paper-flat", "centre")
 """Run without the polish, beside the default with everything."""
-
-
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +67,10 @@ def demonstrate(profile: str, seed: int, xi: float) -> Demonstration:
     space = k9_space().with_ratio(xi)
     virtual = VirtualCartpole(truth)
     recordings = []
-    for kind in ("rich", "chirp"):
-        plan = RunPlan(
-            robot="cartpole", profile=kind, seconds=DEMONSTRATION_S, seed=seed, policy=str(shipped_policy("cartpole") or "")
-        )  # fmt: skip
+    policy = str(shipped_policy("cartpole") or "")
+    kinds: tuple[Profile, ...] = ("rich", "chirp")
+    for kind in kinds:
+        plan = RunPlan(robot="cartpole", profile=kind, seconds=DEMONSTRATION_S, seed=seed, policy=policy)
         recordings.append(virtual.run(make_behaviour(plan, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
     return Demonstration(

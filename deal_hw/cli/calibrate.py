@@ -117,7 +117,8 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         failed = [v.message for v in check(trajectory) if v.severity is Severity.FAIL]
         if failed:
             raise InsufficientDataError(
-                f"episode {index} of {config.dataset} cannot be used: {'; '.join(failed)}; record again with `deal-hw collect`"
+                f"episode {index} of {config.dataset} cannot be used: {'; '.join(failed)}; "
+                "record again with `deal-hw collect`"
             )
     robot, episodes = _simulation(dataset, recordings)
     result = calibrate_episodes(
@@ -261,8 +262,8 @@ def calibrate_episodes(
     if not holdout:
         return result
     errors = heldout_nrmse(
-        robot, space, holdout, {"nominal": (space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)},
-        threads=threads,
+        robot, space, holdout,
+        {"nominal": (space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}, threads=threads,
     )  # fmt: skip
     return dataclasses.replace(result, heldout_nrmse=errors)
 
@@ -301,8 +302,8 @@ def print_result(result: CalibrationResult) -> None:
 
     table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
     for name, align in (
-        ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"), ("90 % interval", "left"),
-        ("verdict", "left"),
+        ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"),
+        ("90 % interval", "left"), ("verdict", "left"),
     ):  # fmt: skip
         table.add_column(name, justify="right" if align == "right" else "left")
     for k, p in enumerate(result.space):

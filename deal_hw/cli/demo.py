@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
@@ -25,7 +24,6 @@ from deal_hw.control.cadence import CadenceReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.types import FloatArray
-
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +88,9 @@ def demo(config: Demo) -> DemoReport:
         raise MissingExtraError(str(err.name), "all") from err
     udr = shipped_policy("cartpole")
     if udr is None:
-        raise ConfigurationError("no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it")
+        raise ConfigurationError(
+            "no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it"
+        )
     _clear(config.out)
     folder = RunFolder(config.out)
     stages = _Stages()
@@ -106,14 +106,16 @@ def demo(config: Demo) -> DemoReport:
             print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
             with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
                 for kind in ("rich", "chirp"):
-                    collect(Collect(robot="cartpole", port=port, out=config.out, profile=kind, seed=config.seed))
+                    collect(
+                        Collect(robot="cartpole", port=port, out=config.out, profile=kind, seed=config.seed)
+                    )
             with stages.stage("calibrate", "search, polish, latency, intervals"):
                 found = calibrate(Calibrate(dataset=folder.dataset, out=config.out, seed=config.seed))
             with stages.stage("calibrate deal", "the adversarial search alone, to compare with"):
                 beside = calibrate(
                     Calibrate(
-                        dataset=folder.dataset, out=config.out / "deal", method="deal", polish=False, seed=config.seed,
-                        quiet=True,
+                        dataset=folder.dataset, out=config.out / "deal", method="deal", polish=False,
+                        seed=config.seed, quiet=True,
                     )
                 )  # fmt: skip
             policy = folder.policies / "calibrated.onnx"
@@ -137,7 +139,9 @@ def demo(config: Demo) -> DemoReport:
             rrd = config.out / "inspect.rrd"
             inspect(
                 Inspect(
-                    episode=folder.dataset / "episodes" / "000000.mcap", calibration=folder.calibration, save=rrd
+                    episode=folder.dataset / "episodes" / "000000.mcap",
+                    calibration=folder.calibration,
+                    save=rrd,
                 )
             )
         truth = json.loads(truth_file.read_text(encoding="utf-8"))
@@ -159,7 +163,9 @@ def _clear(folder: Path) -> None:
     except (DealHwError, KeyError, AttributeError):
         former = False
     if not former:
-        raise ConfigurationError(f"{folder} exists and does not hold a former demo; name another folder with --out")
+        raise ConfigurationError(
+            f"{folder} exists and does not hold a former demo; name another folder with --out"
+        )
     shutil.rmtree(folder)
 
 
@@ -242,10 +248,13 @@ def _print(summary: dict[str, Any], result: CalibrationResult, folder: Path) -> 
         inside = row["low"] <= row["truth"] <= row["high"]
         table.add_row(
             name, row["unit"], f"{row['nominal']:.4g}", f"{row['deal']:.4g}", f"{row['estimate']:.4g}",
-            f"{row['low']:.4g} .. {row['high']:.4g}", f"{row['truth']:.4g}" + ("" if inside else " (outside)"),
+            f"{row['low']:.4g} .. {row['high']:.4g}",
+            f"{row['truth']:.4g}" + ("" if inside else " (outside)"),
         )  # fmt: skip
     latency = summary["latency_s"]
-    table.add_row("latency", "ms", "0", "", f"{1e3 * latency['found']:.1f}", "", f"{1e3 * latency['true']:.1f}")
+    table.add_row(
+        "latency", "ms", "0", "", f"{1e3 * latency['found']:.1f}", "", f"{1e3 * latency['true']:.1f}"
+    )
     console.print(table)
     for words in result.alarms:
         console.print(f"alarm: {words}")
@@ -256,13 +265,20 @@ def _print(summary: dict[str, Any], result: CalibrationResult, folder: Path) -> 
     for name in ("udr", "retrained"):
         cells = (
             f"{summary[key][name]:.4f} ± {summary[std][name]:.4f}"
-            for key, std in (("angle_error_rad", "angle_error_std_rad"), ("cart_speed_m_s", "cart_speed_std_m_s"))
+            for key, std in (
+                ("angle_error_rad", "angle_error_std_rad"),
+                ("cart_speed_m_s", "cart_speed_std_m_s"),
+            )
         )
         table.add_row(name, *cells)
     console.print(table)
     errors = summary["heldout_nrmse"]
     console.print(f"held-out error: nominal {errors['nominal']:.4f}, calibrated {errors['calibrated']:.4f}")
-    console.print("seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in summary["seconds"].items()))
+    console.print(
+        "seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in summary["seconds"].items())
+    )
     for name, path in summary["paths"].items():
         console.print(f"{name}: {path}", soft_wrap=True)
-    console.print(f"summary: {folder / 'summary.json'}; look at it with: deal-hw inspect --help", soft_wrap=True)
+    console.print(
+        f"summary: {folder / 'summary.json'}; look at it with: deal-hw inspect --help", soft_wrap=True
+    )

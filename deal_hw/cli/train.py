@@ -67,7 +67,11 @@ def train(config: Train) -> OnnxPolicy:
         raise ConfigurationError(
             "say under what to train: --distribution FILE (deal-hw calibrate writes distribution.json) or --udr"
         )
-    distribution = udr_distribution(config.robot) if config.distribution is None else read_distribution(config.distribution)
+    distribution = (
+        udr_distribution(config.robot)
+        if config.distribution is None
+        else read_distribution(config.distribution)
+    )
     path = config.out if config.out.suffix == ".onnx" else config.out / POLICY_FILE
     with _progress_bar(config.quiet) as bar:
         policy = train_policy(
@@ -150,7 +154,9 @@ def read_distribution(path: Path) -> ParameterDistribution:
     try:
         return ParameterDistribution.from_json(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as err:
-        raise ConfigurationError(f"no such file: {path}; `deal-hw calibrate` writes calibration/distribution.json") from err
+        raise ConfigurationError(
+            f"no such file: {path}; `deal-hw calibrate` writes calibration/distribution.json"
+        ) from err
     except (ValueError, KeyError, TypeError, AttributeError) as err:
         raise ConfigurationError(f"{path} holds no parameter distribution: {err}") from err
 

@@ -1,4 +1,4 @@
-"""Emulated robots in virtual time: the same bytes, driver, loop and recorder as on the wire, faster than real time."""
+"""Emulated robots in virtual time: same bytes, driver, loop and recorder, faster than real time."""
 
 from __future__ import annotations
 

@@ -30,7 +30,9 @@ class ServoBatch:
         threads: Threads; None for all CPUs.
     """
 
-    def __init__(self, robot: RobotModel, space: ParameterSpace, count: int, threads: int | None = None) -> None:
+    def __init__(
+        self, robot: RobotModel, space: ParameterSpace, count: int, threads: int | None = None
+    ) -> None:
         self.robot = robot
         self.space = space
         self.count = count
@@ -96,7 +98,7 @@ class ServoBatch:
     def set_state(
         self, position: FloatArray, velocity: FloatArray, where: npt.NDArray[np.intp] | slice = slice(None)
     ) -> None:
-        """Set joint positions and velocities, (N, J) or (J,) each, of all members or of those in ``where``."""
+        """Set joint positions and velocities, (N, J) or (J,) each, of the members in ``where``."""
         rows = np.arange(self.count)[where][:, None]
         self._qpos[rows, list(self.robot.qpos)] = position
         self._qvel[rows, list(self.robot.qvel)] = velocity
@@ -121,8 +123,8 @@ class ServoBatch:
             every: Record each ``every``-th step; 0 records only the last.
 
         Returns:
-            Positions and velocities after steps every, 2 every, ..., (N, S // every, J) each. A member that diverged
-            (MuJoCo's warning counters rose) is NaN from there on.
+            Positions and velocities after steps every, 2 every, ..., (N, S // every, J) each. A member that
+            diverged (MuJoCo's warning counters rose) is NaN from there on.
         """
         count, steps, _ = setpoint.shape
         nu = self.robot.model.nu
@@ -146,12 +148,13 @@ class ServoBatch:
         return position, velocity
 
     def _warnings(self) -> npt.NDArray[np.int64]:
-        # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): a rise is a divergence, which MuJoCo answers by a reset.
+        # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): a rise is a divergence, which MuJoCo answers
+        # by a reset.
         return np.asarray(self.batch.warning[..., 1].sum(axis=-1), dtype=np.int64)
 
 
 def bare_steps_per_second(robot: RobotModel, count: int, steps: int, threads: int | None = None) -> float:
-    """Measure the engine alone: physics steps a second of ``count`` members over ``steps`` steps, open loop."""
+    """Measure the engine alone: physics steps a second of ``count`` members, open loop."""
     import time
 
     batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())
@@ -159,6 +162,3 @@ def bare_steps_per_second(robot: RobotModel, count: int, steps: int, threads: in
     start = time.perf_counter()
     batch.step(nstep=steps)
     return count * steps / (time.perf_counter() - start)
-
-
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,9 +59,9 @@ class Episode:
 def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
     """Put a recording on the device's time grid.
 
-    A state sample says which command was in force and how long ago the device received it, so the reception of each
-    command is known on the device's clock to the microsecond, whatever the wire did in between. A command acts from
-    the first period that starts at or after its reception.
+    A state sample says which command was in force and how long ago the device received it, so the reception
+    of each command is known on the device's clock to the microsecond, whatever the wire did in between. A
+    command acts from the first period that starts at or after its reception.
 
     Args:
         trajectory: The recording.
@@ -83,7 +84,8 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
     rows = np.arange(int(np.argmax(known)), len(known) - int(np.argmax(known[::-1])))
     device = np.round(trajectory.device_s / step_s).astype(np.int64)
     sequence, age = trajectory.command_sequence[rows], trajectory.command_age_s[rows]
-    # Acts from the next period boundary on; the small part keeps a reception on the boundary on this side of it.
+    # Acts from the next period boundary on; the small part keeps a reception on the boundary on this side of
+    # it.
     acts = np.ceil((trajectory.device_s[rows] - np.nan_to_num(age)) / step_s - 1e-3).astype(np.int64)
     # The set-point starts to move with the first command, before the first sample that reports it.
     origin = min(int(acts[0]), int(device[rows[0]]))
@@ -118,8 +120,8 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
 def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
     """Return the episode with samples at regular times, lost ones filled in where the gap is short.
 
-    What is filled in (by straight lines) only holds the place: ``reported`` marks it, and nothing is fitted to it.
-    Without this a single lost frame would end every window that it falls into.
+    What is filled in (by straight lines) only holds the place: ``reported`` marks it, and nothing is fitted
+    to it. Without this a single lost frame would end every window that it falls into.
 
     Args:
         episode: The episode.
@@ -138,7 +140,8 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
     def line(values: FloatArray) -> FloatArray:
         return np.stack([np.interp(regular, episode.sample, column) for column in values.T], axis=1)
 
-    # A sample before a gap was marked as unusable for that alone; what counts now is whether the gap is bridged.
+    # A sample before a gap was marked as unusable for that alone; what counts now is whether the gap is
+    # bridged.
     sound = both & ((episode.usable) | (np.diff(episode.sample, append=episode.sample[-1]) > stride))
     return dataclasses.replace(
         episode,
@@ -155,8 +158,8 @@ def _begins(
 ) -> list[tuple[int, int]]:
     """Return which command acts from which device period on, in order.
 
-    A command that no sample reports was lost, unless no sample came while it would have been reported: then it is
-    placed by the clocks' offset, which the reported commands give.
+    A command that no sample reports was lost, unless no sample came while it would have been reported: then
+    it is placed by the clocks' offset, which the reported commands give.
 
     Args:
         trajectory: The recording.
@@ -175,7 +178,7 @@ def _begins(
     sampled = np.round(trajectory.device_s[rows] / step_s)
     begins = dict(seen)
     indices = sorted(seen)
-    for before, after in zip(indices, indices[1:], strict=False):
+    for before, after in itertools.pairwise(indices):
         for i in range(before + 1, after):
             begin = round((trajectory.sent_s[i] + offset) / step_s)
             until = begins[after] if i + 1 == after else round((trajectory.sent_s[i + 1] + offset) / step_s)

@@ -1,7 +1,7 @@
 """One view on model fields for a batch of simulations and for a single model.
 
-The functions in ``deal_hw.sim.parameters`` write through this view, so that the calibrator's batch, the emulator's
-hidden model and the model written for the user are all changed by the same code.
+The functions in ``deal_hw.sim.parameters`` write through this view, so that the calibrator's batch, the
+emulator's hidden model and the model written for the user are all changed by the same code.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""MuJoCo models of servo-driven robots: loading, the link between actuators and joints, and writing calibrated MJCF."""
+"""MuJoCo models of servo-driven robots: loading, joints and actuators by name, calibrated MJCF."""
 
 from __future__ import annotations
 

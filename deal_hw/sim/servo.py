@@ -1,7 +1,8 @@
 """The set-point generator in front of a position servo: it moves towards the target at a limited speed.
 
-MuJoCo has no such limit, so it is applied to the control before the engine sees it. The set-point depends on targets,
-limit and time only, never on the state, so whole episodes are computed at once, and a constant latency only shifts it.
+MuJoCo has no such limit, so it is applied to the control before the engine sees it. The set-point depends on
+targets, limit and time only, never on the state, so whole episodes are computed at once, and a constant
+latency only shifts it.
 """
 
 from __future__ import annotations

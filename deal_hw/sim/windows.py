@@ -1,7 +1,7 @@
 """Open-loop prediction in short windows that restart from given states.
 
-An unstable robot's open-loop replay diverges from its own record within a second, whatever the model; windows of some
-ticks do not. All members of a population predict all windows of an episode.
+An unstable robot's open-loop replay diverges from its own record within a second, whatever the model; windows
+of some ticks do not. All members of a population predict all windows of an episode.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def predict_windows(
         setpoint: Set-points of the whole episode, (N, S, A), from :func:`setpoints`.
 
     Returns:
-        Positions and velocities at the samples after each start, (N, W, H, J) each; NaN where a member diverged.
+        Positions and velocities at the samples after each start, (N, W, H, J) each; NaN where a member
+        diverged.
     """
     N, W, H = batch.count, len(windows), windows.length
     J = episode.position.shape[1]
@@ -129,7 +130,11 @@ def predict_windows(
     sent: tuple[bytes, bytes, bytes] | None = None
     for w, start in enumerate(windows.start):
         at = int(episode.sample[start])
-        now = (episode.stiffness[at].tobytes(), episode.damping[at].tobytes(), episode.effort_limit[at].tobytes())
+        now = (
+            episode.stiffness[at].tobytes(),
+            episode.damping[at].tobytes(),
+            episode.effort_limit[at].tobytes(),
+        )
         if now != sent:
             batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
             sent = now

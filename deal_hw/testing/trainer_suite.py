@@ -44,7 +44,9 @@ class TrainerCase:
     learned: float
     export: Callable[[Policy, Path], Policy]
 
-    def train(self, config: Any, seed: int = _SEED, progress: Callable[[int, int, float], None] | None = None) -> Policy:
+    def train(
+        self, config: Any, seed: int = _SEED, progress: Callable[[int, int, float], None] | None = None
+    ) -> Policy:
         """Train on a new environment."""
         return self.trainer.train(self.make_env(), config, np.random.default_rng(seed), progress)
 
@@ -87,7 +89,9 @@ class TrainerSuite:
         rng = np.random.default_rng(0)
         for scale in (0.1, 1.0, 10.0):
             observation = (scale * rng.standard_normal(len(short.spec.observation))).astype(np.float32)
-            np.testing.assert_allclose(exported.act(observation), short.act(observation), rtol=0.0, atol=_SAME)
+            np.testing.assert_allclose(
+                exported.act(observation), short.act(observation), rtol=0.0, atol=_SAME
+            )
         assert PolicySpec.from_json(exported.spec.to_json()) == PolicySpec.from_json(short.spec.to_json())
 
     def test_actions_have_their_shape_and_range(self, short: Policy) -> None:

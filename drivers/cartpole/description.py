@@ -1,8 +1,8 @@
-"""Facts about the cart-pole: a cart on a 0.8 m rail with a 0.3 m pole, P-D position loop at 1 kHz in the device.
+"""Facts about the cart-pole: a 0.8 m rail, a 0.3 m pole, a P-D position loop at 1 kHz in the device.
 
-The numbers of the mechanics are a plausible bench build, not a measured one: the paper's Table 8 prints the sizes
-(0.3 m, 0.1 kg, 0.3 kg) beside frictions and gains that no such cart could have (a pole friction of 0.1 N·m is two
-thirds of the pole's whole gravity torque), so those were replaced; each source says which.
+The numbers of the mechanics are a plausible bench build, not a measured one: the paper's Table 8 prints the
+sizes (0.3 m, 0.1 kg, 0.3 kg) beside frictions and gains that no such cart could have (a pole friction of 0.1
+N·m is two thirds of the pole's whole gravity torque), so those were replaced; each source says which.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ DESCRIPTION = RobotDescription(
     sources={
         "joint_names": "slide along the rail, hinge at the cart; angle 0 is upright",
         "default_position": "middle of the rail, pole upright",
-        "stiffness": "chosen so that the cart settles on a set-point within 0.2 s; the paper's 0.1 N/m could not move it",
+        "stiffness": "the cart settles on a set-point within 0.2 s; the paper's 0.1 N/m could not move it",
         "damping": "about 0.7 of critical for cart plus pole at that stiffness",
-        "effort_limit": "ten times the force that accelerates cart and pole at 1 m/s^2; the paper's 0.2 N is below friction",
+        "effort_limit": "ten times what 1 m/s^2 of cart and pole takes; the paper's 0.2 N is below friction",
         "speed_limit": "DEAL (Table 8): Cart Vel 1.0 m/s",
         "control_rate_hz": "DEAL, section 4.4: targets at 50 Hz",
         "device_rate_hz": "DEAL, section 4.4: P-D loop at 1000 Hz",
-        "state_rate_hz": "a 40-byte state frame at 1 Mbaud takes 0.4 ms; 200 Hz leaves the line 92 % idle",
+        "state_rate_hz": "a 45-byte state frame at 1 Mbaud takes 0.45 ms; 200 Hz leaves the line 91 % idle",
         "limits": "rail of +-0.40 m between the stops; trips 20 mm before them; targets 0.15 m before them",
-        "sensor": "0.3 mm / 2 mrad noise, 0.5 mm belt encoder step, 12-bit pole encoder, velocity by differencing",
+        "sensor": "0.3 mm / 2 mrad noise, 0.5 mm belt encoder, 12-bit pole encoder, differenced velocity",
         "mjcf": "own model of primitives; lengths and masses from DEAL (Table 8)",
     },
 )
@@ -74,13 +74,19 @@ DESCRIPTION = RobotDescription(
 def parameter_space() -> ParameterSpace:
     """Return all 11 parameters (K11); search ranges are a factor 5 to either side of the nominal value.
 
-    The four servo parameters are what the device does when it is sent the description's default gains and limits;
-    when it is sent others, they scale along.
+    The four servo parameters are what the device does when it is sent the description's default gains and
+    limits; when it is sent others, they scale along.
     """
 
     def log(name: str, kind: str, element: str, unit: str, nominal: float) -> Parameter:
         return Parameter(
-            name=name, kind=kind, elements=(element,), unit=unit, nominal=nominal, low=nominal / 5, high=nominal * 5
+            name=name,
+            kind=kind,
+            elements=(element,),
+            unit=unit,
+            nominal=nominal,
+            low=nominal / 5,
+            high=nominal * 5,
         )
 
     return ParameterSpace(
@@ -103,8 +109,8 @@ def parameter_space() -> ParameterSpace:
 def k9_space() -> ParameterSpace:
     """Return K9: pole length and pole mass measured with ruler and scale, the other nine searched.
 
-    Without that the model is structurally unidentifiable: scaling all masses, frictions, gains and the effort limit
-    together leaves every trajectory as it is.
+    Without that the model is structurally unidentifiable: scaling all masses, frictions, gains and the effort
+    limit together leaves every trajectory as it is.
     """
     return parameter_space().with_known({"pole.length": POLE_LENGTH_M, "pole.mass": POLE_MASS_KG})
 

@@ -46,7 +46,6 @@ class SerialTransport(Transport):
         self._adopted: int | None = None
         self._serial: serial.Serial | None = None
         self._fd = -1
-        self._poll = select.poll()
 
     @classmethod
     def from_fd(cls, fd: int, clock: Clock | None = None) -> SerialTransport:
@@ -60,8 +59,6 @@ class SerialTransport(Transport):
         if self._fd >= 0:
             return
         self._fd = self._open_port() if self._adopted is None else self._adopt(self._adopted)
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
 
     def close(self) -> None:
         """Close the port."""
@@ -92,8 +89,9 @@ class SerialTransport(Transport):
     def receive(self, timeout_s: float) -> Message:
         """Return all bytes at hand, waiting up to ``timeout_s`` for the first."""
         fd = self.fileno()
-        deadline_ms = max(0.0, timeout_s * 1e3)
-        if not self._poll.poll(deadline_ms):
+        # select, not poll: poll rounds its timeout up to whole milliseconds, and every cycle would start that
+        # late.
+        if not select.select([fd], [], [], max(0.0, timeout_s))[0]:
             raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s")
         try:
             data = os.read(fd, _READ_SIZE)

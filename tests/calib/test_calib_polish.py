@@ -33,14 +33,22 @@ class Near(CalibrationMethod[Problem]):
         self.runs = 0
 
     def run(
-        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
     ) -> CalibrationResult:
         """Return a point near the truth."""
         self.runs += 1
         theta = self._theta * np.exp(rng.normal(0.0, 0.05, len(self._theta)))
         interval = np.stack([problem.space.low, problem.space.high], axis=1)
         return CalibrationResult(
-            method="near", space=problem.space, estimate=theta, interval=interval, latency_s=self._latency_s + 1e-3
+            method="near",
+            space=problem.space,
+            estimate=theta,
+            interval=interval,
+            latency_s=self._latency_s + 1e-3,
         )
 
 
@@ -57,7 +65,7 @@ def noisy() -> Demonstration:
 
 
 def test_polish_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
-    """Truth recovery: from 10 % off, all nine parameters within 0.01 % and the latency within a microsecond."""
+    """Truth recovery: from 10 % off, all parameters within 0.01 % and the latency within a microsecond."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
     start = ideal.theta * np.exp(0.1 * np.cos(np.arange(9)))
     found = polish(problem, start, 1e-3)
@@ -67,7 +75,7 @@ def test_polish_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
 
 
 def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
-    """Truth recovery with sensor noise: mean error within 3 %, latency to the tick, at least 7 of 9 intervals hold."""
+    """Truth recovery with noise: mean error within 3 %, latency to the tick, 7 of 9 intervals hold."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     stages: list[str] = []
 
@@ -86,7 +94,7 @@ def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) ->
 
 
 def test_heldout_error_falls_far_below_nominal(noisy: Demonstration) -> None:
-    """On another motion family the true parameters predict at least four times better than the nominal ones."""
+    """On another motion family the true parameters predict four times better than the nominal ones."""
     errors = heldout_nrmse(
         noisy.robot, noisy.space, [noisy.heldout],
         {"nominal": (noisy.space.nominal, 0.0), "truth": (noisy.theta, noisy.truth.latency_s)},
@@ -97,7 +105,7 @@ def test_heldout_error_falls_far_below_nominal(noisy: Demonstration) -> None:
 
 
 def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal: Demonstration) -> None:
-    """With a wrong latency forced on it nothing explains the data: a second search, the same residual, then an alarm."""
+    """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
     search = Near(ideal.theta, 0.02)
     result = PolishedMethod(search).run(problem, Budget(), np.random.default_rng(0))
@@ -113,7 +121,7 @@ def test_white_noise_is_measured_under_motion() -> None:
 
 
 def test_timing_jitter_is_told_from_noise() -> None:
-    """Samples off by up to 2 ms (std 0.816 ms) beside 1 mrad of noise: both are found, and none where there is none."""
+    """Samples off by up to 2 ms (std 0.816 ms) beside 1 mrad of noise are found, and none where none is."""
     rng = np.random.default_rng(1)
     t = np.arange(1600) * 5e-3
     swing = lambda s: 1.5 * np.sin(2 * np.pi * 0.8 * s)  # noqa: E731
@@ -125,7 +133,9 @@ def test_timing_jitter_is_told_from_noise() -> None:
     assert found.position_std[0] == pytest.approx(1e-3, rel=0.4)
     still = noise_model([(swing(t) + noise)[:, None]], [speed], 1e-7)
     assert still.timing_std_s == 0.0
-    assert found.std(np.array([2.0]))[0] == pytest.approx(np.hypot(found.position_std[0], 2 * found.timing_std_s))
+    assert found.std(np.array([2.0]))[0] == pytest.approx(
+        np.hypot(found.position_std[0], 2 * found.timing_std_s)
+    )
 
 
 def test_correlation_time_by_hand() -> None:
@@ -144,7 +154,7 @@ def _two(low: float = 0.2, high: float = 5.0) -> ParameterSpace:
 
 
 def test_null_direction_names_the_common_factor() -> None:
-    """Information on ln a - ln b alone: a and b only up to a common factor; on ln a + ln b: one up, one down."""
+    """Information on ln a - ln b alone leaves a common factor open; on ln a + ln b: one up, one down."""
     (words,) = null_directions(_two(), 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
     assert "common factor" in words and "a" in words and "b" in words
     (words,) = null_directions(_two(), 1e6 * np.array([[1.0, 1.0], [1.0, 1.0]]))
@@ -231,7 +241,9 @@ def test_latency_scan_weighs_ticks_by_their_cost(ideal: Demonstration) -> None:
     at = polish(problem, ideal.theta, 0.0, (0.2,), iterations=1)
     import dataclasses
 
-    costs = [dataclasses.replace(at, chi2=1.0, normal=dataclasses.replace(at.normal, cost=c)) for c in (12.0, 10.0)]
+    costs = [
+        dataclasses.replace(at, chi2=1.0, normal=dataclasses.replace(at.normal, cost=c)) for c in (12.0, 10.0)
+    ]
     scan = LatencyScan((4, 5), tuple(costs))
     assert scan.best == 1
     assert scan.weights == pytest.approx(np.array([np.exp(-1), 1.0]) / (1 + np.exp(-1)))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole import protocol
@@ -16,7 +17,6 @@ from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import (
     ConfigurationError,

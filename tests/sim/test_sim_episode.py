@@ -31,8 +31,8 @@ def recorded() -> VirtualEpisode:
 def test_simulation_explains_the_recording_to_the_wire_resolution(recorded: VirtualEpisode) -> None:
     """With the true parameters and the summed latency, windows predict the recording to a few micrometres.
 
-    This is the equality that calibration rests on: driver, bytes, firmware, recorder, alignment and simulator agree
-    on what acted when, through changes of gains and limits.
+    This is the equality that calibration rests on: driver, bytes, firmware, recorder, alignment and simulator
+    agree on what acted when, through changes of gains and limits.
     """
     robot, space = load_model(DESCRIPTION), k9_space()
     episode = align(recorded.trajectory, DESCRIPTION)
@@ -61,7 +61,16 @@ def test_windows_leave_gaps_out(recorded: VirtualEpisode) -> None:
     """Ten lost frames end one window and another starts after them."""
     t = recorded.trajectory
     keep = np.r_[0:100, 110 : len(t.device_s)]
-    fields = ("receive_s", "device_s", "position", "velocity", "effort", "status", "command_sequence", "command_age_s")
+    fields = (
+        "receive_s",
+        "device_s",
+        "position",
+        "velocity",
+        "effort",
+        "status",
+        "command_sequence",
+        "command_age_s",
+    )
     torn = dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
     episode = align(torn, DESCRIPTION)
     windows = cut_windows(episode, 10)
@@ -86,10 +95,19 @@ def test_episode_shorter_than_one_window_is_refused(recorded: VirtualEpisode) ->
 
 
 def test_command_inside_a_gap_is_placed_by_the_clocks(recorded: VirtualEpisode) -> None:
-    """With 12 frames lost, three commands are never reported; each is placed within a period of where it acted."""
+    """With 12 frames lost, three commands are never reported; each is placed where it acted."""
     t = recorded.trajectory
     keep = np.r_[0:100, 112 : len(t.device_s)]
-    fields = ("receive_s", "device_s", "position", "velocity", "effort", "status", "command_sequence", "command_age_s")
+    fields = (
+        "receive_s",
+        "device_s",
+        "position",
+        "velocity",
+        "effort",
+        "status",
+        "command_sequence",
+        "command_age_s",
+    )
     torn = dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
     whole, mended = align(t, DESCRIPTION), align(torn, DESCRIPTION)
     # Three commands, each at most one period from where it was.
@@ -97,7 +115,7 @@ def test_command_inside_a_gap_is_placed_by_the_clocks(recorded: VirtualEpisode) 
 
 
 def test_command_that_never_arrived_is_not_placed(recorded: VirtualEpisode) -> None:
-    """When the command that carries a new target is lost on the wire, the target acts one control period later."""
+    """When the command with a new target is lost on the wire, the target acts one control period later."""
     t = recorded.trajectory
     i = int(np.flatnonzero(np.diff(t.position_target[:, 0]))[2]) + 1
     lost = int(t.sent_sequence[i])

@@ -34,7 +34,7 @@ def test_mass_takes_the_inertia_along() -> None:
 
 
 def test_length_moves_centre_and_inertia_and_mass_scales_what_it_set() -> None:
-    """A rod of 0.6 m and 0.2 kg: centre at 0.3 m, inertia 0.2 * 0.36 / 12 = 6e-3, whatever order they are named in."""
+    """A rod of 0.6 m and 0.2 kg: centre at 0.3 m, inertia 0.2 * 0.36 / 12 = 6e-3, in any order."""
     robot = load_model(DESCRIPTION)
     space = parameter_space().with_free(["pole.length", "pole.mass"])
     model = model_with(robot, space, np.array([0.6, 0.2]))
@@ -71,7 +71,7 @@ def test_every_parameter_can_be_seen(name: str) -> None:
 
 
 def test_k11_has_the_common_scale_as_exact_null_direction() -> None:
-    """Masses, frictions, damping, armature, gains and effort limit times two leave the trajectory as it is."""
+    """Masses, frictions, armature, gains and effort limit times two leave the trajectory as it is."""
     robot, space = load_model(DESCRIPTION), parameter_space()
     scaled = [n not in ("pole.length", "servo.speed_limit") for n in space.names]
     theta = np.repeat(space.nominal[None], 2, axis=0)
@@ -107,7 +107,14 @@ def test_kinds_write_batch_and_single_model_alike() -> None:
     batch = ServoBatch(robot, space, 3, threads=1)
     batch.set_parameters(np.repeat(theta[None], 3, axis=0))
     single, other = model_with(robot, space, theta), batch.batch.get_model(1)
-    for field in ("body_mass", "body_inertia", "body_ipos", "dof_damping", "dof_armature", "dof_frictionloss"):
+    for field in (
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "dof_damping",
+        "dof_armature",
+        "dof_frictionloss",
+    ):
         np.testing.assert_allclose(getattr(single, field), getattr(other, field), rtol=1e-12)
     assert set(KINDS) >= {p.kind for p in space if p.kind != "servo_speed_limit"}
 
@@ -124,7 +131,7 @@ def test_setting_parameters_again_and_again_does_not_drift() -> None:
 
 
 def test_calibrated_mjcf_compiles_to_the_calibrated_values(tmp_path: object) -> None:
-    """The written file holds the values, the speed limit and the latency, and simulates like the calibrated model."""
+    """The written file holds the values, the speed limit and the latency."""
     from pathlib import Path
 
     robot, space = load_model(DESCRIPTION), k9_space()
@@ -163,5 +170,7 @@ def test_apply_checks_kinds_before_it_writes() -> None:
 
     model = copy.copy(robot.model)
     with pytest.raises(UnknownNameError):
-        apply_parameters(ModelFields(model, robot.model), ParameterSpace([good, wrong]), np.array([[1.0, 1.0]]))
+        apply_parameters(
+            ModelFields(model, robot.model), ParameterSpace([good, wrong]), np.array([[1.0, 1.0]])
+        )
     assert model.body_mass[element_id(model, "body", "cart")] == pytest.approx(0.3)

@@ -1,7 +1,7 @@
 """Parameter kinds: how a physical parameter changes a MuJoCo model, one small function each.
 
-A kind is ``apply(fields, elements, values)``: it writes ``values`` (N,) for the named elements into the fields of N
-simulations. The table :data:`KINDS` is explicit; new kinds are added here.
+A kind is ``apply(fields, elements, values)``: it writes ``values`` (N,) for the named elements into the
+fields of N simulations. The table :data:`KINDS` is explicit; new kinds are added here.
 """
 
 from __future__ import annotations

@@ -22,10 +22,10 @@ def body_mass(fields: Fields, elements: Sequence[str], values: Array) -> None:
 
 
 def rod_length(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set the length of thin uniform rods along their body's z axis [m]: centre of mass and inertia move along.
+    """Set the length of thin uniform rods along their body's z axis [m]; centre and inertia move along.
 
-    For a rod of mass m and length l with one end at the body's origin: centre of mass l / 2, inertia m l^2 / 12.
-    Drawn geoms keep their size; they have no mass and no contact.
+    For a rod of mass m and length l with one end at the body's origin: centre of mass l / 2, inertia m l^2 /
+    12. Drawn geoms keep their size; they have no mass and no contact.
     """
     mass, inertia, ipos = fields.get("body_mass"), fields.get("body_inertia"), fields.get("body_ipos")
     for name in elements:

@@ -11,7 +11,8 @@ def _set_dof(fields: Fields, field: str, elements: Sequence[str], values: Array)
     target = fields.get(field)
     for name in elements:
         joint = element_id(fields.model, "joint", name)
-        # Fields of degrees of freedom are (N, nv) or, for polynomial coefficients, (N, nv, n): the first is the linear one.
+        # Fields of degrees of freedom are (N, nv) or, for polynomial coefficients, (N, nv, n): the first is
+        # the linear one.
         column = target[:, fields.model.jnt_dofadr[joint]]
         if column.ndim == 1:
             column[:] = values
