@@ -71,10 +71,10 @@ class Critic:
         self.settings = settings
         self.generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         first, second = settings.hidden
-        self._layers = [nn.Linear(inputs, first), nn.Linear(first, second), nn.Linear(second, 1)]
+        self.layers = [nn.Linear(inputs, first), nn.Linear(first, second), nn.Linear(second, 1)]
         self._parameters: list[nn.Parameter] = []
         with torch.no_grad():
-            for layer in self._layers:
+            for layer in self.layers:
                 # torch's default initialisation, but from our generator instead of the global one.
                 bound = layer.in_features**-0.5
                 for parameter in (layer.weight, layer.bias):
@@ -90,9 +90,9 @@ class Critic:
 
     def hidden(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the activations of both hidden layers and the output, (B, h1), (B, h2), (B, 1)."""
-        first = self._layers[0](x).relu_()
-        second = self._layers[1](first).relu_()
-        return first, second, self._layers[2](second)
+        first = self.layers[0](x).relu_()
+        second = self.layers[1](first).relu_()
+        return first, second, self.layers[2](second)
 
     def train(self, real: Samples, fake: Samples) -> float:
         """Make the settings' updates on minibatches drawn with replacement (Algorithm 1, lines 4-7).

@@ -39,8 +39,9 @@ class BalanceTask:
         position_weight: Cost of the squared cart position [1/m²].
         action_weight: Cost of the change of the action from tick to tick.
         fall_cost: Cost of falling or leaving the range, in ticks of the worst possible angle.
-        host_delay_s: Lowest and highest delay that the host adds to the robot's own latency: the newest of 200 state
-            samples a second is 0 to 5 ms old when the policy looks, and wire and computation take up to 2 ms.
+        host_delay_s: Lowest and highest delay that the host adds to the robot's own latency: the newest of
+            200 state samples a second is 0 to 5 ms old when the policy looks, and wire and computation take
+            up to 2 ms.
     """
 
     ticks: int = 250
@@ -64,7 +65,9 @@ class BalanceTask:
                 raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
         low, high = self.host_delay_s
         if not 0 <= low <= high:
-            raise ConfigurationError(f"host_delay_s must be (low, high) with 0 <= low <= high, got {self.host_delay_s}")
+            raise ConfigurationError(
+                f"host_delay_s must be (low, high) with 0 <= low <= high, got {self.host_delay_s}"
+            )
 
 
 def balance_spec(
@@ -75,15 +78,18 @@ def balance_spec(
 ) -> PolicySpec:
     """Return the layout of observation and action.
 
-    Positions now, velocities over 160 ms, actions over 280 ms. The velocities, differences of noisy reports, need
-    averaging. The set-point in the device is not reported, moves at a limited speed and drags a sticky cart behind it:
-    only the former actions tell where it is. With three of each, a truth with a slow set-point and strong friction was
-    not learned at all; with these it was within 10 000 steps.
+    Positions now, velocities over 160 ms, actions over 280 ms. The velocities, differences of noisy reports,
+    need averaging. The set-point in the device is not reported, moves at a limited speed and drags a sticky
+    cart along: only the former actions tell where it is. With three of each, a robot with a slow set-point
+    and strong friction was not learned at all; with these it was in 10 000 steps.
     """
     cart, pole = description.joint_names[CART], description.joint_names[POLE]
     terms = [ObservationTerm("position", cart, 5.0), ObservationTerm("sin_position", pole, 10.0)]
     for delay in range(VELOCITIES):
-        terms += [ObservationTerm("velocity", cart, 2.0, delay), ObservationTerm("velocity", pole, 0.3, delay)]
+        terms += [
+            ObservationTerm("velocity", cart, 2.0, delay),
+            ObservationTerm("velocity", pole, 0.3, delay),
+        ]
     terms += [ObservationTerm("action", cart, 1.0, delay) for delay in range(1, ACTIONS + 1)]
     return PolicySpec(
         robot=description.name,
@@ -107,13 +113,15 @@ class CartPoleEnv(ServoVectorEnv):
 
     The reward of a tick, from the true state after it, is::
 
-        exp(-angle_weight |angle| - speed_weight |cart speed| - position_weight cart² - action_weight (a - a_before)²) - 1
+        exp(-cost) - 1
+        cost = angle_weight |angle| + speed_weight |cart speed| + position_weight cart²
+               + action_weight (a - a_before)²
 
-    and -fall_cost in the tick in which the pole has fallen or the cart has left its range, which ends the episode. It
-    lies in (-1, 0], so near upright it is minus the weighted sum: among policies that stay up, the return falls with the
-    mean |angle|, which is what the paper's Table 2 judges. Zero for perfection instead of one spares the critics the
-    long way up to the value of staying up for ever; ending costs more than any way of staying up could within the
-    discount's horizon, which is the alive bonus by another name.
+    and -fall_cost in the tick in which the pole has fallen or the cart has left its range, which ends the
+    episode. It lies in (-1, 0], so near upright it is minus the weighted sum: among policies that stay up,
+    the return falls with the mean |angle|, which is what the paper's Table 2 judges. Zero for perfection
+    instead of one spares the critics the long way up to the value of staying up for ever; ending costs more
+    than any way of staying up could within the discount's horizon, which is the alive bonus by another name.
 
     Args:
         description: The robot.
@@ -146,7 +154,9 @@ class CartPoleEnv(ServoVectorEnv):
         reach = np.array([self.task.start_position_m, self.task.start_angle_rad])
         return rng.uniform(-1.0, 1.0, (count, 2)) * reach, np.zeros((count, 2))
 
-    def reward(self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray) -> FloatArray:
+    def reward(
+        self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
+    ) -> FloatArray:
         """Return the reward of one tick; the class says how it is made."""
         task = self.task
         cost = task.angle_weight * np.abs(position[:, POLE]) + task.speed_weight * np.abs(velocity[:, CART])

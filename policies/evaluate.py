@@ -1,7 +1,7 @@
 """How well a policy balances: the paper's Table 2, and a batched evaluation of many members at once.
 
-The task is frozen: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). Judged are the
-reported states, because on a robot there are no others.
+The task is frozen: 10 s of balancing from the home pose (cart in the middle, pole upright, at rest). Judged
+are the reported states, because on a robot there are no others.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class BalanceResult:
     """One run of the task.
 
     Attributes:
-        angle_error_rad: Mean |pole angle| [rad]. The angle is taken modulo a turn, so that after a fall it counts with
-            what is left to upright, pi at most; nothing is left out and nothing counts for more.
+        angle_error_rad: Mean |pole angle| [rad]. The angle is taken modulo a turn, so that after a fall it
+            counts with what is left to upright, pi at most; nothing is left out and nothing counts for more.
         cart_speed_m_s: Mean |cart velocity| [m/s].
         fell: Whether the pole was ever beyond :data:`FALLEN_RAD`.
         upright_s: Time until then, or the whole duration [s].

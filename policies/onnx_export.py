@@ -1,4 +1,4 @@
-"""Writes a torch network as an ONNX file that carries its policy spec, and the record of its training beside it."""
+"""Writes a torch network as an ONNX file with its policy spec inside and its training record beside it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def export_network(
 ) -> OnnxPolicy:
     """Write a network, compare the file with it, and return the file's policy.
 
-    The files are written under other names and then renamed: an interrupted export leaves nothing that could be deployed.
+    The files are written under other names and then renamed: an interrupted export leaves nothing that could
+    be deployed.
 
     Args:
         network: Observations (B, O) in, actions (B, A) out: a Sequential of linear layers and activations.
@@ -53,7 +54,9 @@ def export_network(
     finally:
         draft.unlink(missing_ok=True)
     if record is not None:
-        path.with_suffix(".json").write_text(json.dumps(dict(record), indent=2, sort_keys=True) + "\n", encoding="utf-8")
+        path.with_suffix(".json").write_text(
+            json.dumps(dict(record), indent=2, sort_keys=True) + "\n", encoding="utf-8"
+        )
     return OnnxPolicy(path)
 
 
@@ -66,8 +69,8 @@ def write_policy(model: onnx.ModelProto, spec: PolicySpec, path: Path) -> None:
 
 
 def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
-    # Built by hand: torch's exporter takes seconds, needs onnxscript, and writes the paths of this machine into every
-    # node. A policy network is a chain of a few known layers.
+    # Built by hand: torch's exporter takes seconds, needs onnxscript, and writes the paths of this machine
+    # into every node. A policy network is a chain of a few known layers.
     nodes: list[onnx.NodeProto] = []
     weights: list[onnx.TensorProto] = []
     width, value = observation, "observation"
@@ -99,7 +102,9 @@ def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
         weights,
     )
     opset = onnx.helper.make_opsetid("", OPSET)
-    return onnx.helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="deal-hw")
+    return onnx.helper.make_model(
+        graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="deal-hw"
+    )
 
 
 def _chain(network: torch.nn.Module) -> list[torch.nn.Module]:

@@ -19,8 +19,8 @@ SPEC_KEY = "deal_hw.policy_spec"
 class OnnxPolicy:
     """A policy read from an ONNX file that carries its spec.
 
-    One thread and no spinning: the control process shares its cores with nobody's surprise, and for a network of this
-    size a second thread costs more than it computes.
+    One thread and no spinning: the control process shares its cores with nobody's surprise, and for a network
+    of this size a second thread costs more than it computes.
 
     Args:
         path: The file.
@@ -36,7 +36,7 @@ class OnnxPolicy:
         if text is None:
             raise PolicyError(
                 f"{self.path} is an ONNX file without a policy spec (metadata {SPEC_KEY!r}); "
-                "export it with `deal-hw train`, or add the spec with deal_hw.policies.onnx_export.write_policy"
+                "export it with `deal-hw train`, or add one with deal_hw.policies.onnx_export.write_policy"
             )
         try:
             self._spec = PolicySpec.from_json(text)

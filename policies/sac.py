@@ -58,14 +58,24 @@ class SacConfig:
     lookahead: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("steps", "gradient_steps", "batch", "learning_rate", "final_learning_rate", "entropy", "buffer"):
+        for name in (
+            "steps",
+            "gradient_steps",
+            "batch",
+            "learning_rate",
+            "final_learning_rate",
+            "entropy",
+            "buffer",
+        ):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
         for name in ("gamma", "tau"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must lie in (0, 1], got {getattr(self, name)!r}")
         if not self.hidden or min(self.hidden) < 1:
-            raise ConfigurationError(f"hidden must name at least one layer of at least one unit, got {self.hidden!r}")
+            raise ConfigurationError(
+                f"hidden must name at least one layer of at least one unit, got {self.hidden!r}"
+            )
         if not 0 <= self.warmup < self.steps:
             raise ConfigurationError(f"warmup must lie in [0, steps = {self.steps}), got {self.warmup}")
 
@@ -98,7 +108,7 @@ class NetworkPolicy:
 
 
 class SacTrainer:
-    """Trains by soft actor-critic on one CPU core; the same generator state gives the same policy on one machine."""
+    """Trains on one CPU core; the same generator state gives the same policy on the same machine."""
 
     name = "sac"
 
@@ -114,15 +124,16 @@ class SacTrainer:
         Args:
             env: The environment; it is seeded from ``rng``.
             config: The settings.
-            rng: Where all randomness comes from. The global generators of random, numpy and torch are seeded from it,
-                as stable-baselines3 draws from them.
+            rng: Where all randomness comes from. The global generators of random, numpy and torch are seeded
+                from it, as stable-baselines3 draws from them.
             progress: Called about a hundred times.
 
         Returns:
             The mean action, without exploration.
         """
         threads = torch.get_num_threads()
-        # For networks of this size a second thread costs more than it computes; and one thread sums in one order.
+        # For networks of this size a second thread costs more than it computes; and one thread sums in one
+        # order.
         torch.set_num_threads(1)
         try:
             seed = int(rng.integers(2**31))
@@ -173,7 +184,7 @@ def _spec_of(env: ServoVectorEnv, config: SacConfig, seed: int) -> PolicySpec:
 
 
 class _Adapter(VecEnv):
-    """Shows a Gymnasium vector environment (SAME_STEP autoreset) to stable-baselines3, which predates those."""
+    """Shows a Gymnasium vector environment (SAME_STEP autoreset) to stable-baselines3, which is older."""
 
     def __init__(self, env: ServoVectorEnv, seed: int) -> None:
         # First, because VecEnv's constructor asks it for its render mode.
@@ -195,7 +206,10 @@ class _Adapter(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._return += reward
         for i in np.flatnonzero(over):
-            infos[i] = {"terminal_observation": info["final_obs"][i], "TimeLimit.truncated": bool(truncated[i])}
+            infos[i] = {
+                "terminal_observation": info["final_obs"][i],
+                "TimeLimit.truncated": bool(truncated[i]),
+            }
             self.recent_returns.append(float(self._return[i]))
         self._return[over] = 0.0
         return observation, reward, over, infos
@@ -216,7 +230,9 @@ class _Adapter(VecEnv):
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         raise NotImplementedError("members of the batch have no methods of their own")
 
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
+    ) -> list[bool]:
         return [False] * self.num_envs
 
 

@@ -1,7 +1,7 @@
-"""N simulated robots as a host sees them at the control rate: delayed targets, limited set-point, noisy reports.
+"""N simulated robots as a host sees them at the control rate: late targets, slow set-points, noisy reports.
 
-The environments of training and the evaluation stand on this one class. It does, batched, what the emulated device
-does frame by frame; the calibrator's :class:`~deal_hw.sim.batch.ServoBatch` is the physics below.
+The environments of training and the evaluation stand on this one class. It does, batched, what the emulated
+device does frame by frame; the calibrator's :class:`~deal_hw.sim.batch.ServoBatch` is the physics below.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ def delayed_setpoints(
 ) -> FloatArray:
     """Return the set-point at each step of one control period, in closed form.
 
-    A latency is a whole number of steps, so within a period the target changes at most once; towards a constant
-    target the slewed set-point is a clipped ramp. Equal to :func:`deal_hw.sim.servo.slew` on the same targets.
+    A latency is a whole number of steps, so within a period the target changes at most once; towards a
+    constant target the slewed set-point is a clipped ramp. Equal to :func:`deal_hw.sim.servo.slew` on the
+    same targets.
 
     Args:
         start: Set-point before the first step, (N, A).
@@ -130,7 +131,8 @@ class ServoLoop:
         longest = (len(self._targets) - 1) * self.steps
         if ticks.size and (ticks.min() < 0 or ticks.max() >= longest):
             raise ConfigurationError(
-                f"latencies must lie in [0, {longest * self._step_s:g}) s, got {latency_s.min():g}..{latency_s.max():g}"
+                f"latencies must lie in [0, {longest * self._step_s:g}) s, "
+                f"got {latency_s.min():g}..{latency_s.max():g}"
             )
         members = np.flatnonzero(where)
         self._theta[members] = theta
@@ -142,7 +144,8 @@ class ServoLoop:
         self._targets[:, members] = start
         period_s = 1.0 / self.description.control_rate_hz
         for age in range(self._window + 1):
-            # The host watched the robot before the episode, too: reports of the past differ by noise and motion.
+            # The host watched the robot before the episode, too: reports of the past differ by noise and
+            # motion.
             self._reports[age, members] = self._report(position - age * period_s * velocity, rng)
         self._publish(members, velocity)
 
@@ -160,10 +163,14 @@ class ServoLoop:
         self._targets[0] = target
         periods, switch = np.divmod(self._latency, self.steps)
         members = np.arange(self.count)
-        rate = self.batch.servo_factor("servo_speed_limit") * np.array(self.description.speed_limit) * self._step_s
+        rate = (
+            self.batch.servo_factor("servo_speed_limit")
+            * np.array(self.description.speed_limit)
+            * self._step_s
+        )
         setpoints = delayed_setpoints(
-            self._setpoint, self._targets[periods + 1, members], self._targets[periods, members], switch, rate,
-            self.steps,
+            self._setpoint, self._targets[periods + 1, members], self._targets[periods, members], switch,
+            rate, self.steps,
         )  # fmt: skip
         self._setpoint = setpoints[:, -1]
         position, velocity = (values[:, -1] for values in self.batch.advance(setpoints))
@@ -197,7 +204,7 @@ def _window_periods(sensor: SensorModel, description: RobotDescription) -> int:
     periods = sensor.velocity_window_s * description.control_rate_hz
     if abs(periods - round(periods)) > 1e-9:
         raise ConfigurationError(
-            f"velocity_window_s = {sensor.velocity_window_s:g} s must be a whole number of control periods of "
-            f"{1 / description.control_rate_hz:g} s"
+            f"velocity_window_s = {sensor.velocity_window_s:g} s must be a whole number of control periods "
+            f"of {1 / description.control_rate_hz:g} s"
         )
     return round(periods)

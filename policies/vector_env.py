@@ -1,4 +1,4 @@
-"""A vectorised Gymnasium environment of servo-driven robots: every member has its own physics, drawn anew each episode."""
+"""A vectorised Gymnasium environment of servo-driven robots, each with physics of its own."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from deal_hw.types import FloatArray
 
 
 class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
-    """N robots that follow a policy's position targets; a task says where they start, what is rewarded and what ends.
+    """N robots that follow a policy's position targets; a task says how they start and what is rewarded.
 
     Members that end are started anew in the same step (Gymnasium's SAME_STEP): what they saw last is in
-    ``info["final_obs"]``. Observations come from the class that the robot uses, so the two cannot drift apart.
+    ``info["final_obs"]``. Observations come from the class that the robot uses, so the two cannot drift
+    apart.
 
     Args:
         description: The robot.
@@ -30,8 +31,8 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         layout: What is observed and what an action means.
         count: Members N.
         ticks: Control periods after which an episode is cut off.
-        host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s]: the age of the
-            newest state sample when the policy looks, and the way over the wire.
+        host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s]: the age
+            of the newest state sample when the policy looks, and the way over the wire.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
 
@@ -78,7 +79,9 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         """Draw joint positions and velocities at the start of M episodes, (M, J) each."""
 
     @abc.abstractmethod
-    def reward(self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray) -> FloatArray:
+    def reward(
+        self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
+    ) -> FloatArray:
         """Return the reward of one tick, (N,), from the true state after it.
 
         Args:
@@ -101,19 +104,23 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self._restart(np.ones(self.num_envs, dtype=bool))
         return self._observe(), {}
 
-    def step(self, actions: FloatArray) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+    def step(
+        self, actions: FloatArray
+    ) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Apply actions, (N, A), for one control period.
 
         Returns:
-            Observations (N, O), rewards (N,), terminated (N,), truncated (N,), and infos: ``final_obs`` (N, O) with
-            the last observations of the members in ``_final_obs`` (N,).
+            Observations (N, O), rewards (N,), terminated (N,), truncated (N,), and infos: ``final_obs``
+            (N, O) with the last observations of the members in ``_final_obs`` (N,).
         """
         action = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
         self._builder.record_action(action)
         diverged = self.loop.step(self._default + self._scale * action, self.np_random)
         position, velocity = self.loop.position, self.loop.velocity
         terminated = self.ended(position, velocity) | diverged
-        reward = np.where(terminated, self.failure_reward, self.reward(position, velocity, action, self._last_action))
+        reward = np.where(
+            terminated, self.failure_reward, self.reward(position, velocity, action, self._last_action)
+        )
         self._last_action = action
         self._elapsed += 1
         truncated = (self._elapsed >= self.ticks) & ~terminated

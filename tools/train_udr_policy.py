@@ -2,10 +2,11 @@
 
     python tools/train_udr_policy.py
 
-writes policies/assets/cartpole_udr.onnx and, beside it, the record of its training and of what it can do: how it
-balances the hidden robots of the tuning seeds. Steps and settings are those of `deal-hw train`, as every comparison of
-policies is made at equal steps and settings. Of several training seeds the one that balances most robots is kept; a
-user who trains under a calibrated distribution takes one seed only, so the choice favours the policy to beat.
+writes policies/assets/cartpole_udr.onnx and, beside it, the record of its training and of what it can do: how
+it balances the hidden robots of the tuning seeds. Steps and settings are those of `deal-hw train`, as every
+comparison of policies is made at equal steps and settings. Of several training seeds the one that balances
+most robots is kept; a user who trains under a calibrated distribution takes one seed only, so the choice
+favours the policy to beat.
 """
 
 from __future__ import annotations
@@ -52,8 +53,12 @@ def judge(policy: BatchPolicy) -> dict[str, Any]:
 
 def main() -> None:
     """Train, judge, keep the best."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds to choose from")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds to choose from"
+    )
     parser.add_argument("--out", type=Path, default=ASSETS / "cartpole_udr.onnx")
     args = parser.parse_args()
     best: tuple[tuple[int, float], Path, dict[str, Any]] | None = None

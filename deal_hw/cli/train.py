@@ -17,6 +17,7 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 
 if TYPE_CHECKING:
+    from deal_hw.description import SensorModel
     from deal_hw.policies.onnx_runtime import OnnxPolicy
     from deal_hw.training import TrainingProgress
 
@@ -65,7 +66,7 @@ def train(config: Train) -> OnnxPolicy:
     """
     if (config.distribution is None) == (not config.udr):
         raise ConfigurationError(
-            "say under what to train: --distribution FILE (deal-hw calibrate writes distribution.json) or --udr"
+            "say under what to train: --distribution FILE (`deal-hw calibrate` writes it) or --udr"
         )
     distribution = (
         udr_distribution(config.robot)
@@ -91,6 +92,7 @@ def train_policy(
     seed: int = 0,
     steps: int | None = None,
     members: int | None = None,
+    sensor: SensorModel | None = None,
     progress: TrainingProgress | None = None,
 ) -> OnnxPolicy:
     """Train a policy by SAC and write it with its training record.
@@ -102,12 +104,14 @@ def train_policy(
         seed: Decides everything random.
         steps: Environment steps; None for the default.
         members: Robots simulated at once; None for the default.
+        sensor: The sensor model to train with; None for the description's.
         progress: Called as the training goes on.
 
     Returns:
         The policy, read back from its file.
     """
     import dataclasses
+    import inspect
 
     from deal_hw.drivers import robot_description
     from deal_hw.policies.cartpole_env import MEMBERS, CartPoleEnv
@@ -117,7 +121,7 @@ def train_policy(
     if robot not in ROBOTS:
         raise UnknownNameError("robot with a training environment", robot, ROBOTS)
     config = SacConfig() if steps is None else dataclasses.replace(SacConfig(), steps=steps)
-    env = CartPoleEnv(robot_description(robot), distribution, members or MEMBERS)
+    env = CartPoleEnv(robot_description(robot), distribution, members or MEMBERS, sensor=sensor)
     started, cpu = time.monotonic(), time.process_time()
     policy = SacTrainer().train(env, config, np.random.default_rng(seed), progress)
     record = {
@@ -126,7 +130,7 @@ def train_policy(
         "seed": seed,
         "training": dict(policy.spec.training),
         "task": dataclasses.asdict(env.task),
-        "reward": CartPoleEnv.__doc__,
+        "reward": inspect.cleandoc(CartPoleEnv.__doc__ or "").partition("\n\nArgs:")[0],
         "distribution": distribution.to_json(),
         "distribution_digest": distribution.digest(),
         "spec_digest": policy.spec.digest(),

@@ -7,6 +7,8 @@ latency only shifts it.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from deal_hw.types import FloatArray
@@ -24,16 +26,26 @@ def slew(start: FloatArray, target: FloatArray, rate: FloatArray) -> FloatArray:
         The set-point after each step, (N, S, A).
     """
     count, steps = start.shape[0], target.shape[-2]
-    targets = np.broadcast_to(target, (count, steps, start.shape[1]))
-    rates = rate if rate.ndim == 3 else np.broadcast_to(rate[:, None], targets.shape)
-    out = np.empty((steps, *start.shape))
+    targets = target if target.ndim == 3 else target[None]
+    rates = rate if rate.ndim == 3 else rate[:, None]
+    out = np.empty((count, steps, start.shape[1]))
     now = start
-    # Steps first in memory: each step then writes one contiguous row.
-    for s in range(steps):
-        limit = rates[:, s]
-        now = now + np.clip(targets[:, s] - now, -limit, limit)
-        out[s] = now
-    return np.moveaxis(out, 0, 1)
+    # Between changes of target and rate the set-point moves on a straight line until it is there.
+    for begin, end in itertools.pairwise(_changes(steps, targets, rates)):
+        reach = rates[:, min(begin, rates.shape[1] - 1), None] * np.arange(1, end - begin + 1)[:, None]
+        gap = (targets[:, begin] - now)[:, None]
+        out[:, begin:end] = now[:, None] + np.clip(gap, -reach, reach)
+        now = out[:, end - 1]
+    return out
+
+
+def _changes(steps: int, *series: FloatArray) -> list[int]:
+    """Return 0, every step at which any of the series changes, and the number of steps."""
+    changed = np.zeros(max(steps - 1, 0), dtype=bool)
+    for values in series:
+        if values.shape[1] > 1:
+            changed |= np.any(values[:, 1:] != values[:, :-1], axis=(0, 2))
+    return [0, *(np.flatnonzero(changed) + 1).tolist(), steps]
 
 
 def delay(setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray) -> FloatArray:

@@ -52,7 +52,7 @@ class TrainerCase:
 
 
 class TrainerSuite:
-    """Contract of a trainer; inherit it and override ``case``, with class scope, as training takes seconds."""
+    """Contract of a trainer; inherit it and override ``case``, in class scope: training takes seconds."""
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -75,7 +75,7 @@ class TrainerSuite:
         assert case.score(short) < case.learned
 
     def test_policy_carries_layout_and_digest(self, case: TrainerCase, short: Policy) -> None:
-        """The policy says what it observes, what its action means and under which distribution it was trained."""
+        """The policy says what it observes, what its action means and under what it was trained."""
         spec = short.spec
         assert spec.observation == case.layout.observation
         assert spec.action_scale == case.layout.action_scale

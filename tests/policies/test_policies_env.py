@@ -87,7 +87,7 @@ def test_a_fallen_member_starts_anew_and_shows_its_last_observation() -> None:
 
 
 def test_the_end_of_one_member_leaves_the_history_of_the_others() -> None:
-    """While others end and start anew, a member's observation is what the robot's own builder would make of it."""
+    """While others start anew, a member observes what the robot's own builder would make of its states."""
     env = exact_env(2, end_angle_rad=0.3)
     observation, _ = env.reset(seed=1)
     alone = ObservationBuilder(env.layout)
@@ -124,7 +124,8 @@ def test_host_delay_adds_to_the_latency() -> None:
     env = CartPoleEnv(DESCRIPTION, POINT, 1, task=task, sensor=EXACT_SENSOR)
     env.reset(seed=0)
     env.step(np.ones((1, 1)))
-    # In the 4 steps that are left the set-point moves 4 mm; P = 80 N/m then pulls with 0.32 N at most, against 0.3 N.
+    # In the 4 steps that are left the set-point moves 4 mm; P = 80 N/m then pulls with 0.32 N at most,
+    # against 0.3 N.
     assert 0.0 < env.loop.position[0, 0] < 1e-4
 
 

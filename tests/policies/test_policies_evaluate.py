@@ -53,7 +53,8 @@ def test_a_fallen_pole_counts_with_what_is_left_to_upright() -> None:
 def test_angles_are_taken_modulo_a_turn() -> None:
     """Upright is upright after any number of turns."""
     np.testing.assert_allclose(
-        wrapped_angle(np.array([0.1, 2 * math.pi + 0.1, -4 * math.pi - 0.1, 3.5])), [0.1, 0.1, -0.1, 3.5 - 2 * math.pi]
+        wrapped_angle(np.array([0.1, 2 * math.pi + 0.1, -4 * math.pi - 0.1, 3.5])),
+        [0.1, 0.1, -0.1, 3.5 - 2 * math.pi],
     )
 
 

@@ -83,7 +83,9 @@ def specs(draw: st.DrawFn) -> PolicySpec:
     actuated = joints[: draw(st.integers(1, len(joints)))]
     kinds = st.sampled_from(["position", "velocity", "sin_position", "cos_position"])
     terms = st.builds(ObservationTerm, kinds, st.sampled_from(joints), finite, st.integers(0, 5))
-    actions = st.builds(ObservationTerm, st.just("action"), st.sampled_from(actuated), finite, st.integers(1, 5))
+    actions = st.builds(
+        ObservationTerm, st.just("action"), st.sampled_from(actuated), finite, st.integers(1, 5)
+    )
     per_actuated = st.tuples(*[finite] * len(actuated))
     return PolicySpec(
         robot=draw(names),
@@ -121,7 +123,9 @@ def test_spec_survives_the_file(tmp_path: Path, spec: PolicySpec) -> None:
 
 def test_a_missing_file_is_an_error_with_advice(tmp_path: Path) -> None:
     """The message names the path and the verb that makes such a file."""
-    with pytest.raises(PolicyError, match=r"no such policy file: .*nothing\.onnx; train one with `deal-hw train`"):
+    with pytest.raises(
+        PolicyError, match=r"no such policy file: .*nothing\.onnx; train one with `deal-hw train`"
+    ):
         OnnxPolicy(tmp_path / "nothing.onnx")
 
 
@@ -156,20 +160,26 @@ def test_network_and_spec_that_disagree_are_refused(file: Path) -> None:
     """The message gives both shapes of what differs."""
     model = onnx.load(file)
     write_policy(model, dataclasses.replace(SPEC, observation=SPEC.observation[:4]), file)
-    with pytest.raises(PolicyError, match=r"input 'observation' has shape \['batch', 15\], the spec says \(batch, 4\)"):
+    with pytest.raises(
+        PolicyError, match=r"input 'observation' has shape \['batch', 32\], the spec says \(batch, 4\)"
+    ):
         OnnxPolicy(file)
 
 
 def test_an_observation_of_another_length_is_refused(file: Path) -> None:
     """The runtime does not guess which terms are missing."""
-    with pytest.raises(PolicyError, match=r"observation of shape \(3,\), expected \(15,\)"):
+    with pytest.raises(PolicyError, match=r"observation of shape \(3,\), expected \(32,\)"):
         OnnxPolicy(file).act(np.zeros(3, dtype=np.float32))
 
 
 def test_an_unknown_layer_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
     """The message names the layer and the known ones; nothing that could be deployed is left."""
-    with pytest.raises(PolicyError, match="cannot export a layer of type GELU; known inside Sequential: Linear, ReLU, Tanh"):
-        export_network(torch.nn.Sequential(torch.nn.Linear(15, 1), torch.nn.GELU()), SPEC, tmp_path / "x.onnx")
+    with pytest.raises(
+        PolicyError, match="cannot export a layer of type GELU; known inside Sequential: Linear, ReLU, Tanh"
+    ):
+        export_network(
+            torch.nn.Sequential(torch.nn.Linear(32, 1), torch.nn.GELU()), SPEC, tmp_path / "x.onnx"
+        )
     assert list(tmp_path.iterdir()) == []
 
 

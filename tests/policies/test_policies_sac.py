@@ -30,8 +30,8 @@ def upright_seconds(policy: Policy) -> float:
     start[:, 1] = np.linspace(-0.05, 0.05, 6)
     theta = np.repeat(SPACE.nominal[None], 6, axis=0)
     results = evaluate_batch(
-        policy, DESCRIPTION, SPACE, theta, np.zeros(6), np.random.default_rng(0), seconds=5.0, start_position=start,
-        sensor=EXACT_SENSOR,
+        policy, DESCRIPTION, SPACE, theta, np.zeros(6), np.random.default_rng(0), seconds=5.0,
+        start_position=start, sensor=EXACT_SENSOR,
     )  # fmt: skip
     return float(np.mean([r.upright_s for r in results]))
 

@@ -39,7 +39,7 @@ def test_setpoint_follows_the_older_target_and_then_the_newer_one() -> None:
 
 
 def test_setpoint_stops_at_a_near_target() -> None:
-    """A target closer than the limit is reached exactly, and the limit of one member is not that of another."""
+    """A target closer than the limit is reached exactly; the limit of one member is not another's."""
     got = delayed_setpoints(
         np.zeros((2, 1)), np.full((2, 1), 0.025), np.full((2, 1), 0.025), np.array([0, 4]),
         np.array([[0.01], [0.1]]), 4,
@@ -51,7 +51,13 @@ def test_setpoint_stops_at_a_near_target() -> None:
 numbers = st.floats(-0.4, 0.4)
 
 
-@given(st.lists(st.tuples(numbers, numbers, numbers, st.integers(0, 19), st.floats(1e-4, 5e-3)), min_size=1, max_size=4))
+@given(
+    st.lists(
+        st.tuples(numbers, numbers, numbers, st.integers(0, 19), st.floats(1e-4, 5e-3)),
+        min_size=1,
+        max_size=4,
+    )
+)
 def test_closed_form_equals_the_reference(members: list[tuple[float, float, float, int, float]]) -> None:
     """The closed form gives what stepping the reference through the same targets gives."""
     start, older, newer = (np.array([[m[i]] for m in members]) for i in range(3))
@@ -70,7 +76,9 @@ def test_loop_equals_an_open_loop_rollout(latency_ticks: int) -> None:
     start = np.array([[0.01, 0.02], [-0.03, 0.05]])
     targets = rng.uniform(-0.2, 0.2, (5, 2, 1))
     loop = make_loop(2)
-    loop.restart(np.ones(2, dtype=bool), theta, np.full(2, latency_ticks * 1e-3), start, np.zeros((2, 2)), rng)
+    loop.restart(
+        np.ones(2, dtype=bool), theta, np.full(2, latency_ticks * 1e-3), start, np.zeros((2, 2)), rng
+    )
     for target in targets:
         loop.step(target, rng)
 
@@ -91,7 +99,9 @@ def test_restart_of_one_member_leaves_the_others_alone() -> None:
     for restart in (False, True):
         rng = np.random.default_rng(0)
         loop = make_loop(2)
-        loop.restart(np.ones(2, dtype=bool), nominal(2), np.full(2, 0.01), np.zeros((2, 2)), np.zeros((2, 2)), rng)
+        loop.restart(
+            np.ones(2, dtype=bool), nominal(2), np.full(2, 0.01), np.zeros((2, 2)), np.zeros((2, 2)), rng
+        )
         for tick in range(6):
             if restart and tick == 3:
                 where = np.array([True, False])
@@ -103,7 +113,7 @@ def test_restart_of_one_member_leaves_the_others_alone() -> None:
 
 
 def test_reports_are_quantised_and_velocities_are_their_differences() -> None:
-    """Without noise a report is the nearest step, and the velocity is the change since the last period over 20 ms."""
+    """Without noise a report is the nearest step, and the velocity is the change over the last 20 ms."""
     sensor = SensorModel(noise=(0.0, 0.0), resolution=(0.5e-3, 2 * math.pi / 4096), velocity_window_s=0.02)
     loop, rng = make_loop(sensor=sensor), np.random.default_rng(0)
     loop.restart(ALL, nominal(), np.zeros(1), np.array([[0.0102, 0.01]]), REST, rng)
@@ -121,7 +131,14 @@ def test_noise_has_its_standard_deviation() -> None:
     sensor = SensorModel(noise=(1e-3, 5e-3), resolution=(0.0, 0.0), velocity_window_s=0.0)
     loop = make_loop(4000, sensor=sensor)
     where = np.ones(4000, dtype=bool)
-    loop.restart(where, nominal(4000), np.zeros(4000), np.zeros((4000, 2)), np.zeros((4000, 2)), np.random.default_rng(1))
+    loop.restart(
+        where,
+        nominal(4000),
+        np.zeros(4000),
+        np.zeros((4000, 2)),
+        np.zeros((4000, 2)),
+        np.random.default_rng(1),
+    )
     np.testing.assert_allclose(loop.reported_position.std(axis=0), [1e-3, 5e-3], rtol=5 / math.sqrt(8000))
 
 
@@ -134,5 +151,7 @@ def test_a_latency_that_the_loop_was_not_made_for_is_refused() -> None:
 
 def test_a_velocity_window_between_control_periods_is_refused() -> None:
     """The loop keeps one report a control period, so it cannot difference over half of one."""
-    with pytest.raises(ConfigurationError, match="velocity_window_s = 0.03 s must be a whole number of control periods"):
+    with pytest.raises(
+        ConfigurationError, match=r"velocity_window_s = 0\.03 s must be a whole number of control periods"
+    ):
         make_loop(sensor=SensorModel(noise=(0.0, 0.0), resolution=(0.0, 0.0), velocity_window_s=0.03))

@@ -1,0 +1,214 @@
+"""Every method in the table keeps the contract, and the searches find what they are said to find."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.deal import Deal
+from deal_hw.calib.methods import METHODS, NULL_METHODS, check_method, make_method
+from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.weki import Weki
+from deal_hw.calibration import Budget
+from deal_hw.cli.bench_loop import Demonstration, demonstrate
+from deal_hw.errors import UnknownNameError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.testing.method_suite import MethodCase, MethodSuite
+
+FREE = ("cart.frictionloss", "servo.damping")
+SECONDS = 1.2
+
+
+@functools.cache
+def recorded(profile: str, seed: int) -> Demonstration:
+    """Return a demonstration of a tuning seed; made once for all tests of this file."""
+    return demonstrate(profile, seed, 5.0)
+
+
+def two_parameters() -> tuple[ParameterSpace, np.ndarray[tuple[int], np.dtype[np.float64]]]:
+    """Return a space in which all but two parameters are known, and the two true values."""
+    d = recorded("ideal", 1)
+    truth = dict(zip(d.space.names, d.theta, strict=True))
+    space = d.space.with_known({name: value for name, value in truth.items() if name not in FREE})
+    return space, np.array([truth[name] for name in space.names])
+
+
+def small_problem() -> Problem:
+    """Return the first 1.2 s of a noise-free demonstration, two parameters free, latency given."""
+    d = recorded("ideal", 1)
+    samples, steps = int(SECONDS * 200) + 1, int(SECONDS * 1000)
+    fit = d.fit
+    short = dataclasses.replace(
+        fit,
+        sample=fit.sample[:samples],
+        position=fit.position[:samples],
+        velocity=fit.velocity[:samples],
+        usable=fit.usable[:samples],
+        target=fit.target[:steps],
+        stiffness=fit.stiffness[:steps],
+        damping=fit.damping[:steps],
+        effort_limit=fit.effort_limit[:steps],
+        speed_limit=fit.speed_limit[:steps],
+    )
+    return Problem(d.robot, two_parameters()[0], [short], threads=1, fixed_latency_s=0.0)
+
+
+def case_of(name: str, budget: Budget, tolerance: float | None) -> MethodCase:
+    """Return the suite's case of a method by name."""
+    return MethodCase(
+        method=make_method(name),
+        make_problem=small_problem,
+        truth=two_parameters()[1],
+        budget=budget,
+        short_budget=Budget(population=10, generations=2),
+        tolerance=tolerance,
+    )
+
+
+class TestWeki(MethodSuite):
+    """`weki`: within 0.1 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("weki", Budget(population=20, generations=25), 1e-3)
+
+
+class TestDeal(MethodSuite):
+    """`deal`: within 3 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal", Budget(population=30, generations=20), 0.03)
+
+
+class TestDealPaper(MethodSuite):
+    """`deal-paper`: nearer than the centre, no more."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-paper", Budget(population=40, generations=15), 0.4)
+
+
+class TestDealPaperFlat(MethodSuite):
+    """`deal-paper-flat` keeps the contract without reading the data."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-paper-flat", Budget(population=10, generations=3), None)
+
+
+class TestDealPaperWithoutNormalisation(MethodSuite):
+    """`deal-paper-pn` keeps the contract in raw units."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-paper-pn", Budget(population=10, generations=2), None)
+
+
+class TestRandom(MethodSuite):
+    """`random`: the best of 600 draws in two dimensions is within 25 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("random", Budget(population=60, generations=10), 0.25)
+
+
+class TestCentre(MethodSuite):
+    """`centre` keeps the contract without reading the data."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("centre", Budget(population=10, generations=1), None)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_name_in_the_table_makes_a_method(name: str) -> None:
+    """Each row imports, and names its result after itself; the default is one of the others."""
+    method = make_method(name)
+    assert method.name == name or name == "default"
+    polished = make_method(name, polish=True)
+    assert isinstance(polished, PolishedMethod) == (name not in NULL_METHODS)
+    assert polished.name == name
+
+
+def test_unknown_method_lists_the_names() -> None:
+    """The error of a mistyped name helps."""
+    for call in (check_method, make_method):
+        with pytest.raises(UnknownNameError, match="unknown calibration method 'dael'; known: default, weki, deal"):
+            call("dael")
+
+
+def test_nominal_and_centre_are_what_they_say() -> None:
+    """The null rows: the user's model, and the middle of the range on its own scale."""
+    problem = small_problem()
+    rng = np.random.default_rng(0)
+    nominal = make_method("nominal").run(problem, Budget(), rng)
+    centre = make_method("centre").run(problem, Budget(), rng)
+    np.testing.assert_array_equal(nominal.estimate, problem.space.nominal)
+    np.testing.assert_array_equal(centre.estimate, problem.space.center)
+    assert nominal.steps == centre.steps == 0
+
+
+def test_constant_fitness_does_not_find_the_truth() -> None:
+    """DEAL with constant fitness: its population's mean is, over 12 seeds, the centre within its own spread.
+
+    This is the control of every table: what this row scores, a search scores without having seen the data.
+    """
+    problem = small_problem()
+    units = []
+    for seed in range(12):
+        result = make_method("deal-paper-flat").run(
+            problem, Budget(population=30, generations=15), np.random.default_rng(seed)
+        )
+        units.append(problem.space.normalize(result.estimate))
+    values = np.array(units)
+    error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
+    assert problem.steps == 0
+    assert np.all(np.abs(values.mean(axis=0) - 0.5) < 3.5 * error)
+    assert np.all(values.std(axis=0) < 0.3)
+
+
+def test_weki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
+    """Tuning seed 0, profile sensor: mean |ln| within 0.05 where the centre is at 0.6, latency within 1 ms."""
+    d = recorded("sensor", 0)
+    problem = Problem(d.robot, d.space, [d.fit], threads=1)
+    result = Weki().run(problem, Budget(population=60, generations=15), np.random.default_rng(0))
+    assert np.mean(np.abs(np.log(result.estimate / d.theta))) < 0.05
+    assert abs(result.latency_s - d.truth.latency_s) < 1e-3
+    assert result.chi2 < 2.0
+
+
+def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
+    """Tuning seed 0, profile sensor: mean |ln| within 0.2 where the centre is at 0.6, latency within 3 ms."""
+    d = recorded("sensor", 0)
+    problem = Problem(d.robot, d.space, [d.fit], threads=1)
+    result = Deal().run(problem, Budget(population=60, generations=14), np.random.default_rng(0))
+    assert np.mean(np.abs(np.log(result.estimate / d.theta))) < 0.2
+    assert abs(result.latency_s - d.truth.latency_s) < 3e-3
+
+
+def test_weki_says_when_the_residual_is_not_explained() -> None:
+    """A budget of two generations leaves a residual, and the result carries an alarm that says so."""
+    d = recorded("sensor", 0)
+    problem = Problem(d.robot, d.space, [d.fit], threads=1)
+    result = Weki().run(problem, Budget(population=10, generations=2), np.random.default_rng(0))
+    assert result.chi2 > 3.0
+    assert "residual" in result.alarms[0]

@@ -1,0 +1,163 @@
+"""The paper's view: rollouts of a population from the recording's start, with its targets or with a policy."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.coordinates import Coordinates, Members, logistic, logit
+from deal_hw.calib.innovations import explained, linearise, predict
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.rollouts import (
+    TransitionScale,
+    control_ticks,
+    demonstration,
+    rollout_population,
+    transitions,
+)
+from deal_hw.cli.bench_loop import Demonstration, demonstrate
+from deal_hw.errors import InsufficientDataError
+from deal_hw.types import FloatArray
+
+
+@pytest.fixture(scope="module")
+def ideal() -> Demonstration:
+    """A noise-free demonstration of a tuning seed."""
+    return demonstrate("ideal", 1, 5.0)
+
+
+@pytest.fixture(scope="module")
+def problem(ideal: Demonstration) -> Problem:
+    """The problem of that demonstration."""
+    return Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
+
+
+def members(ideal: Demonstration, latency_s: FloatArray) -> Members:
+    """Return the truth and one wrong simulator."""
+    return Members(np.stack([ideal.theta, ideal.space.center]), latency_s)
+
+
+def test_replay_of_the_truth_follows_the_recording(ideal: Demonstration, problem: Problem) -> None:
+    """With the true parameters the first second of the unstable pole is reproduced to 0.1 mm and 0.1 mrad."""
+    ticks = control_ticks(problem, 0)
+    position, velocity, action = rollout_population(problem, members(ideal, np.zeros(2)), 0, ticks)
+    recorded = problem.starts[0].position[ticks.sample]
+    assert position.shape == (2, len(ticks) + 1, 2)
+    assert velocity.shape == position.shape
+    np.testing.assert_array_equal(action[0], ideal.fit.target[ticks.start[:-1]])
+    assert np.abs(position[0, :50] - recorded[:50]).max() < 1e-4
+    assert np.abs(position[1, :50] - recorded[:50]).max() > 1e-2
+
+
+def test_policy_in_the_loop_equals_the_replay(ideal: Demonstration, problem: Problem) -> None:
+    """A policy that answers with the recorded targets makes the rollouts of the replay, at any latency."""
+    ticks = control_ticks(problem, 0, 60)
+    population = members(ideal, np.array([0.0, 0.0125]))
+    target = ideal.fit.target[ticks.start[:-1]]
+
+    def answer(position: FloatArray, velocity: FloatArray, tick: int) -> FloatArray:
+        return np.repeat(target[tick][None], len(position), axis=0)
+
+    replayed = rollout_population(problem, population, 0, ticks)
+    closed = rollout_population(problem, population, 0, ticks, answer)
+    np.testing.assert_allclose(closed[0], replayed[0], atol=1e-9)
+    np.testing.assert_allclose(closed[2], replayed[2])
+
+
+def test_gains_change_where_the_recording_changed_them(ideal: Demonstration, problem: Problem) -> None:
+    """A change of the effort limit in the middle is sent at its tick and not before."""
+    effort = ideal.fit.effort_limit.copy()
+    effort[1000:] *= 1e-3
+    weak = dataclasses.replace(ideal.fit, effort_limit=effort)
+    other = Problem(ideal.robot, ideal.space, [weak], threads=1)
+    ticks = control_ticks(other, 0, 80)
+    assert ticks.changes[:2] == (0, 50)
+    one = rollout_population(problem, members(ideal, np.zeros(2)), 0, control_ticks(problem, 0, 80))[0]
+    two = rollout_population(other, members(ideal, np.zeros(2)), 0, ticks)[0]
+    np.testing.assert_array_equal(one[:, :51], two[:, :51])
+    assert np.abs(one[:, 80] - two[:, 80]).max() > 1e-3
+
+
+def test_ticks_stop_at_a_gap(ideal: Demonstration) -> None:
+    """A lost frame ends the rollout, and a recording without two whole ticks is refused."""
+    usable = ideal.fit.usable.copy()
+    usable[41] = False
+    broken = Problem(ideal.robot, ideal.space, [dataclasses.replace(ideal.fit, usable=usable)], threads=1)
+    assert len(control_ticks(broken, 0)) == 10
+    usable[3:] = False
+    useless = Problem(ideal.robot, ideal.space, [dataclasses.replace(ideal.fit, usable=usable)], threads=1)
+    with pytest.raises(InsufficientDataError, match="control periods"):
+        control_ticks(useless, 0)
+
+
+def test_transitions_hold_state_action_and_change(problem: Problem) -> None:
+    """(s, a, s' - s) in this order, standardised to mean 0 and variance 1 over the recording."""
+    position = np.array([[[1.0, 2.0], [1.5, 1.0], [1.5, 3.0]]])
+    velocity = 10 * position
+    made = transitions(position, velocity, np.array([[[7.0], [8.0]]]))
+    np.testing.assert_allclose(made[0, 0], [1, 2, 10, 20, 7, 0.5, -1, 5, -10])
+    np.testing.assert_allclose(made[0, 1], [1.5, 1, 15, 10, 8, 0, 2, 0, 20])
+    raw = demonstration(problem, 0, control_ticks(problem, 0))
+    scale = TransitionScale.of(raw.astype(np.float64))
+    scaled = scale.apply(raw.copy())
+    kept = np.abs(scaled).max(axis=0) < 5
+    np.testing.assert_allclose(scaled[:, kept].mean(axis=0), 0, atol=1e-3)
+    np.testing.assert_allclose(scaled[:, kept].std(axis=0), 1, atol=1e-3)
+
+
+def test_negative_latency_is_a_shift_the_other_way(ideal: Demonstration, problem: Problem) -> None:
+    """Predictions go smoothly through latency zero: -1, 0 and 1 ms are nearly on a line."""
+    data = problem.windows(40)[0]
+    theta = np.repeat(ideal.theta[None], 3, axis=0)
+    position, _ = predict(problem, Members(theta, np.array([-1e-3, 0.0, 1e-3])), data)
+    plain, _ = problem.predict(theta[:1], np.zeros(1), data)
+    np.testing.assert_allclose(position[1], plain[0], atol=1e-12)
+    slope = np.median(np.abs(position[2] - position[0]))
+    assert np.median(np.abs(position[0] + position[2] - 2 * position[1])) < 0.2 * slope
+
+
+def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Demonstration, problem: Problem) -> None:
+    """Whitened innovations have at most their expected size at the truth and a huge one at the range's centre."""
+    truth = Members(ideal.theta[None], np.zeros(1))
+    wrong = Members(ideal.space.center[None], np.zeros(1))
+    assert explained(problem, truth, 10) < 2.0
+    assert explained(problem, wrong, 10) > 1e3
+
+
+def test_whitening_takes_out_a_wrong_start_state(ideal: Demonstration, problem: Problem) -> None:
+    """What one standard deviation of start velocity does to a window is whitened to about one, not to hundreds."""
+    data = problem.windows(20)[0]
+    truth = Members(ideal.theta[None], np.zeros(1))
+    whitening = linearise(problem, truth, data)
+    velocity = data.start_velocity + [0.0, float(problem.starts[0].velocity_std[1])]
+    moved, _ = predict(problem, truth, data, data.start_position, velocity)
+    size = np.linalg.norm(whitening.apply(moved - whitening.reference)[0], axis=1)
+    raw = np.linalg.norm(((moved[0] - whitening.reference) / data.std).reshape(len(size), -1), axis=1)
+    assert np.median(size) < 1.1
+    assert np.median(raw) > 5 * np.median(size)
+
+
+def test_coordinates_map_the_cube_to_ranges_and_back(problem: Problem) -> None:
+    """Corners of the unit cube are the corners of the ranges; the latency reaches past its range by the margin."""
+    coordinates = Coordinates(problem)
+    assert coordinates.names[-1] == "latency_s"
+    corners = coordinates.members(np.stack([np.zeros(10), np.ones(10)]))
+    np.testing.assert_allclose(corners.theta, [problem.space.low, problem.space.high])
+    np.testing.assert_allclose(corners.latency_s, [-0.004, 0.044])
+    drawn = coordinates.members(coordinates.sample(np.random.default_rng(0), 500))
+    assert drawn.latency_s.min() >= 0.0
+    assert drawn.latency_s.max() <= 0.04
+    assert coordinates.clip_latency(-0.002) == 0.0
+    unit = np.array([[0.2, 0.9]])
+    np.testing.assert_allclose(logistic(logit(unit)), unit)
+
+
+def test_given_latency_is_not_searched(ideal: Demonstration) -> None:
+    """A latency that is known stays what it is."""
+    given = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.013)
+    coordinates = Coordinates(given)
+    assert coordinates.count == len(ideal.space)
+    np.testing.assert_array_equal(coordinates.members(np.full((3, 9), 0.5)).latency_s, 0.013)
+    assert coordinates.clip_latency(0.5) == 0.013

@@ -1,0 +1,144 @@
+"""The verb `calibrate`: what it refuses before any long work, and what it writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from deal_hw.calib.folder import read_result
+from deal_hw.cli.calibrate import Calibrate, calibrate, make_space
+from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.control.behaviours import Behaviour, HoldBehaviour
+from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
+from deal_hw.data.dataset import Dataset
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
+
+
+def record(folder: Path, runs: list[tuple[str, Behaviour, float]]) -> Path:
+    """Record runs of a nominal robot into a dataset, through driver, bytes and recorder, in virtual time."""
+    robot = VirtualCartpole(nominal_truth("sensor", 4, actuation_ticks=9))
+    with Dataset.create_or_open(folder, DESCRIPTION) as store:
+        for profile, behaviour, seconds in runs:
+            path = store.next_episode_path()
+            robot.run(
+                behaviour, seconds, path, {"profile": profile, "purpose": "collect", "robot": "cartpole"}
+            )
+            store.note_episode(path)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of random set-points and one second of a sweep."""
+    rich = RichBehaviour(DESCRIPTION, None, RichConfig(duration_s=2.6, balance_s=0.0), 1)
+    chirp = ChirpBehaviour(DESCRIPTION, ChirpConfig(duration_s=2.2))
+    return record(tmp_path_factory.mktemp("run") / "dataset", [("rich", rich, 2.6), ("chirp", chirp, 2.2)])
+
+
+def settings(folder: Path, **changes: object) -> Calibrate:
+    """Settings of a short calibration of two parameters."""
+    values: dict[str, object] = {
+        "dataset": folder, "free": ("cart.mass", "servo.stiffness"), "population": 30, "generations": 12,
+        "quiet": True,
+    }  # fmt: skip
+    return Calibrate(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_writes_everything_a_user_needs(dataset: Path, tmp_path: Path) -> None:
+    """Two parameters are found within 5 %; result, distribution and model are there and agree."""
+    report = calibrate(settings(dataset, out=tmp_path))
+    found = dict(zip(report.result.space.names, report.result.estimate, strict=True))
+    assert found["cart.mass"] == pytest.approx(0.3, rel=0.05)
+    assert found["servo.stiffness"] == pytest.approx(80.0, rel=0.05)
+    assert report.result.latency_s == pytest.approx(9e-3, abs=1.1e-3)
+    assert report.result.heldout_nrmse["calibrated"] < report.result.heldout_nrmse["null"]
+    again = read_result(tmp_path / "calibration")
+    np.testing.assert_allclose(again.estimate, report.result.estimate)
+    model = mujoco.MjModel.from_xml_path(str(report.files["calibrated.xml"]))
+    assert model.body("cart").mass[0] == pytest.approx(found["cart.mass"], rel=1e-4)
+    provenance = json.loads(report.files["result.json"].read_text())["provenance"]
+    assert provenance["episodes"] == [0] and provenance["holdout"] == [1]
+    assert provenance["seed"] == 0 and "mujoco" in provenance["versions"]
+    assert json.loads(report.files["distribution.json"].read_text())["latency_s"][0] <= 9e-3
+
+
+def test_same_seed_same_result(dataset: Path, tmp_path: Path) -> None:
+    """Everything random comes from the seed."""
+    a, b = (calibrate(settings(dataset, out=tmp_path / name)).result for name in ("a", "b"))
+    np.testing.assert_array_equal(a.estimate, b.estimate)
+    np.testing.assert_array_equal(a.interval, b.interval)
+
+
+def test_unknown_parameter_lists_the_names(dataset: Path) -> None:
+    """A wrong name is answered with the right ones."""
+    with pytest.raises(UnknownNameError, match=r"cart\.weight.*cart\.mass.*servo\.speed_limit"):
+        calibrate(settings(dataset, free=("cart.weight",)))
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.3, 0.3), (0.5, 0.1)])
+def test_equal_or_reversed_bounds_are_refused(dataset: Path, low: float, high: float) -> None:
+    """The error names the parameter and the range."""
+    with pytest.raises(ConfigurationError, match=r"cart\.mass.*low < high"):
+        calibrate(settings(dataset, range=(("cart.mass", low, high),)))
+
+
+def test_range_without_the_nominal_value_is_refused(dataset: Path) -> None:
+    """A range that leaves the nominal value out is a mistake until the user says otherwise."""
+    with pytest.raises(ConfigurationError, match=r"nominal value 0\.3 lies outside"):
+        calibrate(settings(dataset, range=(("cart.mass", 0.4, 0.9),)))
+
+
+def test_unknown_method_lists_the_methods(dataset: Path) -> None:
+    """A wrong method is answered with the right ones."""
+    with pytest.raises(UnknownNameError, match=r"gradient.*weki"):
+        calibrate(settings(dataset, method="gradient"))
+
+
+def test_ratio_of_one_is_refused(dataset: Path) -> None:
+    """The ratio must be above 1."""
+    with pytest.raises(ConfigurationError, match="xi must be above 1"):
+        calibrate(settings(dataset, xi=1.0))
+
+
+def test_robot_that_stood_still_is_refused(tmp_path: Path) -> None:
+    """The message says what to record instead."""
+    folder = record(tmp_path / "dataset", [("hold", HoldBehaviour(DESCRIPTION), 2.0)])
+    with pytest.raises(InsufficientDataError, match="collect"):
+        calibrate(settings(folder))
+
+
+def test_recording_that_is_too_short_is_refused(tmp_path: Path) -> None:
+    """Half a second is not enough, and the message says how much is."""
+    rich = RichBehaviour(DESCRIPTION, None, RichConfig(duration_s=0.5, balance_s=0.0), 1)
+    folder = record(tmp_path / "dataset", [("rich", rich, 0.5)])
+    with pytest.raises(InsufficientDataError, match="collect"):
+        calibrate(settings(folder))
+
+
+def test_episode_cannot_be_fitted_and_held_out(dataset: Path) -> None:
+    """A held-out episode must not be seen."""
+    with pytest.raises(ConfigurationError, match=r"episodes \[0\] are to be fitted and held out"):
+        calibrate(settings(dataset, episodes=(0,), holdout=(0,)))
+
+
+def test_dataset_of_held_out_episodes_only_is_refused(tmp_path: Path) -> None:
+    """A sweep alone leaves nothing to fit."""
+    chirp = ChirpBehaviour(DESCRIPTION, ChirpConfig(duration_s=2.2))
+    folder = record(tmp_path / "dataset", [("chirp", chirp, 2.2)])
+    with pytest.raises(ConfigurationError, match="nothing to fit"):
+        calibrate(settings(folder))
+
+
+def test_parameter_sets_and_known_values(dataset: Path) -> None:
+    """k11 frees everything; a weighed cart is known; an unknown set lists the sets."""
+    assert len(make_space("cartpole", settings(dataset, free=(), space="k11"))) == 11
+    space = make_space("cartpole", settings(dataset, free=(), known=(("cart.mass", 0.41),)))
+    assert space.known["cart.mass"] == 0.41 and len(space) == 8
+    with pytest.raises(UnknownNameError, match=r"k7.*k9, k11"):
+        make_space("cartpole", settings(dataset, free=(), space="k7"))

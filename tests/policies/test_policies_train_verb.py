@@ -1,0 +1,79 @@
+"""The verb `train`, called from Python."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.cli.train import Train, read_distribution, train, udr_distribution
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+STEPS = 1_200
+"""Enough for a few updates."""
+
+
+def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(tmp_path: Path) -> None:
+    """The policy lies in the run folder, fits the robot and names the distribution; the record holds all of it."""
+    space = k9_space()
+    distribution = ParameterDistribution(
+        space=space, mean=space.nominal, covariance=0.01 * np.eye(len(space)), latency_s=(0.01, 0.012)
+    )
+    file = tmp_path / "distribution.json"
+    file.write_text(json.dumps(distribution.to_json()), encoding="utf-8")
+    train(Train(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True))
+    policy = OnnxPolicy(tmp_path / "policies" / "policy.onnx")
+    policy.spec.check_fits(DESCRIPTION)
+    assert policy.spec.trained_under == distribution.digest()
+    record = json.loads((tmp_path / "policies" / "policy.json").read_text(encoding="utf-8"))
+    assert ParameterDistribution.from_json(record["distribution"]).digest() == distribution.digest()
+    assert record["training"]["config"]["steps"] == STEPS
+    assert record["training"]["members"] == 8
+    assert record["seed"] == 4
+    assert record["reward"].endswith("alive bonus by another name.")
+
+
+def test_udr_covers_a_factor_of_five_and_30_ms() -> None:
+    """Uniform domain randomisation is what calibration is compared with: its width is fixed."""
+    distribution = udr_distribution("cartpole")
+    np.testing.assert_allclose(distribution.space.high / distribution.space.nominal, 5.0)
+    np.testing.assert_allclose(distribution.space.nominal / distribution.space.low, 5.0)
+    assert distribution.covariance is None
+    assert distribution.latency_s == (0.0, 0.03)
+
+
+@pytest.mark.parametrize("config", [Train(), Train(udr=True, distribution=Path("x.json"))])
+def test_exactly_one_distribution_must_be_given(config: Train) -> None:
+    """Neither and both are refused, with what to give."""
+    with pytest.raises(ConfigurationError, match=r"--distribution FILE .* or --udr"):
+        train(config)
+
+
+def test_a_missing_distribution_names_the_verb_that_writes_it(tmp_path: Path) -> None:
+    """The message names the path and `deal-hw calibrate`."""
+    with pytest.raises(ConfigurationError, match=r"no such file: .*none\.json; `deal-hw calibrate` writes"):
+        read_distribution(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[1]", '{"format": "other"}', '{"format": "deal_hw.parameter_distribution/1"}']
+)
+def test_a_file_that_holds_no_distribution_is_refused(tmp_path: Path, text: str) -> None:
+    """No JSON, other JSON and half a distribution give one error."""
+    file = tmp_path / "bad.json"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=r"bad\.json holds no parameter distribution"):
+        read_distribution(file)
+
+
+def test_an_unknown_robot_is_refused_by_name() -> None:
+    """The message lists the robots that can be trained."""
+    with pytest.raises(
+        UnknownNameError, match=r"unknown robot with a training environment 'go3'; known: cartpole"
+    ):
+        train(Train(robot="go3", udr=True, quiet=True))
