@@ -1,4 +1,4 @@
-"""Coordinates in which the searches move: the parameters of a problem and, where it is not given, the latency."""
+"""Coordinates in which the searches move: a problem's parameters and, where it is not given, the latency."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deal_hw.calib.problem import Problem
 from deal_hw.types import FloatArray
 
 LATENCY_MARGIN_S = 0.004
-"""The latency's coordinate reaches this far beyond its range, or a true latency of zero would sit at infinity."""
+"""The latency's coordinate reaches so far beyond its range, or a latency of zero would sit at infinity."""
 
 _EDGE = 1e-9
 
@@ -64,7 +64,7 @@ class Coordinates:
         return Members(theta, latency)
 
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Draw unit coordinates, (count, C): parameters over their range, the latency over its own without margin."""
+        """Draw unit coordinates, (count, C), over all ranges; the latency's without its margin."""
         unit = rng.random((count, self.count))
         if self.fixed_latency_s is None:
             inner = self._range[0] + (self._range[1] - self._range[0]) * unit[:, -1]

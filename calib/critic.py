@@ -1,8 +1,9 @@
 """Critics: networks that tell recorded transitions from simulated ones.
 
-Two kinds share one interface. `ClippedCritic` is the paper's WGAN with weight clipping (eq. 5); `PenaltyCritic` holds
-its gradient near one instead (WGAN-GP, Gulrajani et al. 2017), which leaves it smooth enough for its hidden features
-to be regressed on. Both run on the CPU, in float32, and draw from one torch generator: the same seed, the same critic.
+Two kinds share one interface. `ClippedCritic` is the paper's WGAN with weight clipping (eq. 5);
+`PenaltyCritic` holds its gradient near one instead (WGAN-GP, Gulrajani et al. 2017), which leaves it smooth
+enough for its hidden features to be regressed on. Both run on the CPU, in float32, and draw from one torch
+generator: the same seed, the same critic.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class Critic:
         self.generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         first, second = settings.hidden
         self.layers = [nn.Linear(inputs, first), nn.Linear(first, second), nn.Linear(second, 1)]
-        self._parameters: list[nn.Parameter] = []
+        self._parameters: list[Tensor] = []
         with torch.no_grad():
             for layer in self.layers:
                 # torch's default initialisation, but from our generator instead of the global one.
@@ -102,14 +103,16 @@ class Critic:
             fake: Samples of the simulators, (m, inputs).
 
         Returns:
-            The estimate of the Wasserstein distance in the last update: mean output on real minus on fake samples.
+            The estimate of the Wasserstein distance in the last update: mean output on real minus on fake
+            samples.
         """
         return self.train_on_blocks(real, [fake])
 
     def train_on_blocks(self, real: Samples, fake: Sequence[Samples]) -> float:
         """Do the same with the simulators' samples in several blocks, which are never joined.
 
-        A replay of 50 generations of 200 x 200 transitions is 72 MB: rows are picked from the blocks by their index.
+        A replay of 50 generations of 200 x 200 transitions is 72 MB: rows are picked from the blocks by their
+        index.
         """
         settings = self.settings
         data = torch.from_numpy(real)

@@ -1,18 +1,19 @@
 """`deal`: the adversarial method that works; the paper's critic, another view of the data and another update.
 
-It keeps DEAL's idea (a critic learns what tells the recording from the population's rollouts, and the population moves
-to where it cannot tell) and deviates from the paper in three places, each for a measured reason:
+It keeps DEAL's idea (a critic learns what tells the recording from the population's rollouts, and the
+population moves to where it cannot tell) and deviates from the paper in three places, each for a measured
+reason:
 
-- What the critic sees: innovations of short windows that restart at recorded states, not whole rollouts. A replay of an
-  unstable robot says little of its parameters after the first second.
-- What a member is told: not one score, but the mean of every hidden activation and of the output. One number a member
-  and a softmax lose what the critic knows (with the paper's update even the exact prediction error as fitness ends
-  at 27-54 % error).
-- How the population moves: an ensemble Kalman step regresses parameters on those statistics towards the recording's own
-  statistics, instead of the denoising step of eqs. 1-3 and 8-10.
+- What the critic sees: innovations of short windows that restart at recorded states, not whole rollouts. A
+  replay of an unstable robot says little of its parameters after the first second.
+- What a member is told: not one score, but the mean of every hidden activation and of the output. One number
+  a member and a softmax lose what the critic knows (with the paper's update even the exact prediction error
+  as fitness ends at 27-54 % error).
+- How the population moves: an ensemble Kalman step regresses parameters on those statistics towards the
+  recording's own statistics, instead of the denoising step of eqs. 1-3 and 8-10.
 
-And the critic is a WGAN-GP of 64-64 units with Adam, not a clipped WGAN of 256-256 (section 3.1): clipped weights make
-hidden features that hardly depend on the parameters.
+And the critic is a WGAN-GP of 64-64 units with Adam, not a clipped WGAN of 256-256 (section 3.1): clipped
+weights make hidden features that hardly depend on the parameters.
 """
 
 from __future__ import annotations
@@ -42,19 +43,22 @@ class DealSettings:
     Attributes:
         critic: Size and training.
         generations: Search steps; never more than the budget's.
-        clean_ticks: Window length in control periods where positions carry no noise.
-        noisy_ticks: The same where they do.
+        clean_ticks: Window lengths in control periods of the stages where positions carry no noise.
+        noisy_ticks: The same where they do; a long window of a far simulator says nothing.
+        widen: Least spread of a coordinate at the start of each further stage, in logits.
         keep: Share of the statistics' residual that one step leaves (noise-free recordings).
         step_clip: Largest step of a coordinate, in logits.
-        noise_draws: Draws of the noise from which its effect on the statistics is estimated (noisy recordings).
+        noise_draws: Draws of the noise from which its effect on the statistics is estimated (noisy
+            recordings).
         smooth_draws: How many of these a member's statistics are averaged over.
         torch_threads: Threads of the critic's arithmetic.
     """
 
     critic: CriticSettings = field(default_factory=lambda: _CRITIC)
-    generations: int = 30
-    clean_ticks: int = 10
-    noisy_ticks: int = 20
+    generations: int = 40
+    clean_ticks: tuple[int, ...] = (10,)
+    noisy_ticks: tuple[int, ...] = (5, 20)
+    widen: float = 0.5
     keep: float = 0.25
     step_clip: float = 2.0
     noise_draws: int = 100
@@ -75,7 +79,11 @@ class Deal(CalibrationMethod[Problem]):
         self.settings = settings or DealSettings()
 
     def run(
-        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
     ) -> CalibrationResult:
         """Calibrate: one round of critic updates and one Kalman step a generation."""
         settings = self.settings
@@ -85,24 +93,16 @@ class Deal(CalibrationMethod[Problem]):
             logit(coordinates.sample(rng, budget.population)), rng, step_clip=settings.step_clip
         )
         noisy = is_noisy(problem)
-        view: _View = (_NoisyView if noisy else _CleanView)(problem, settings, rng)
-        # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise begins.
-        # Noise-free ones have no such end: each step takes a fixed share of what is left.
-        keep = None if noisy else settings.keep
+        lengths = settings.noisy_ticks if noisy else settings.clean_ticks
+        most = min(settings.generations, budget.generations)
         with torch_threads(settings.torch_threads):
-            for _ in range(min(settings.generations, budget.generations)):
-                if kalman.finished:
-                    break
-                z = kalman.ask()
-                members = coordinates.members(logistic(z))
-                centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-                residual, gap = view.residual(members, centre)
-                step = kalman.tell(residual, keep=keep)
-                run.note(
-                    f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
-                    members.theta,
-                    {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
-                )
+            for stage, ticks in enumerate(lengths):
+                if stage:
+                    kalman.widen(settings.widen)
+                view: _View = (_NoisyView if noisy else _CleanView)(problem, settings, ticks, rng, stage > 0)
+                end = most * (stage + 1) // len(lengths)
+                while len(run.trace) < end and not kalman.finished:
+                    self._generation(run, coordinates, kalman, view, noisy=noisy)
         z = kalman.ask()
         centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
         return run.result(
@@ -110,8 +110,27 @@ class Deal(CalibrationMethod[Problem]):
             centre,
             coordinates.members(logistic(z)),
             settings=settings,
-            chi2=explained(problem, centre, settings.noisy_ticks if noisy else settings.clean_ticks),
-            extra={"interval": "ensemble spread, uncalibrated", "view": "control periods" if noisy else "windows"},
+            chi2=explained(problem, centre, lengths[-1]),
+            extra={
+                "interval": "ensemble spread, uncalibrated",
+                "view": "control periods" if noisy else "windows",
+            },
+        )
+
+    def _generation(
+        self, run: Run, coordinates: Coordinates, kalman: EnsembleKalman, view: _View, *, noisy: bool
+    ) -> None:
+        z = kalman.ask()
+        members = coordinates.members(logistic(z))
+        centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
+        residual, gap = view.residual(members, centre)
+        # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise
+        # begins. Noise-free ones have no such end: each step takes a fixed share of what is left.
+        step = kalman.tell(residual, keep=None if noisy else self.settings.keep)
+        run.note(
+            f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
+            members.theta,
+            {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
         )
 
 
@@ -120,22 +139,29 @@ class _View(abc.ABC):
 
     Args:
         problem: Data and simulator.
-        settings: Window lengths, critic.
+        settings: Critic, noise draws.
+        ticks: Window length in control periods.
         rng: Seeds the critic and draws the noise.
+        move_starts: Linearise anew around each generation's most probable start states.
     """
 
-    def __init__(self, problem: Problem, settings: DealSettings, rng: np.random.Generator) -> None:
-        self._problem, self._settings, self._rng = problem, settings, rng
+    def __init__(
+        self,
+        problem: Problem,
+        settings: DealSettings,
+        ticks: int,
+        rng: np.random.Generator,
+        move_starts: bool,
+    ) -> None:
+        self._problem, self._settings, self._rng, self._ticks = problem, settings, rng, ticks
+        self._move_starts = move_starts
+        self._offsets: dict[int, FloatArray] = {}
         self._every = samples_per_tick(problem)
-        self._windows = problem.windows(self._ticks() * self._every)
+        self._windows = problem.windows(ticks * self._every)
         context = np.concatenate([self._make_context(data) for data in self._windows])
         spread = np.maximum(context.std(axis=0), 1e-9)
         self._context = np.asarray((context - context.mean(axis=0)) / spread, dtype=np.float32)
         self._critic = PenaltyCritic(self._width() + self._context.shape[1], settings.critic, rng)
-
-    @abc.abstractmethod
-    def _ticks(self) -> int:
-        """Return the window length in control periods."""
 
     @abc.abstractmethod
     def _width(self) -> int:
@@ -143,10 +169,12 @@ class _View(abc.ABC):
 
     @abc.abstractmethod
     def _make_context(self, data: WindowData) -> FloatArray:
-        """Return the state and action that belong to each sample of an episode, (n, C): the s and a of D(s, a, s')."""
+        """Return state and action of each sample of an episode, (n, C): the s and a of D(s, a, s')."""
 
     @abc.abstractmethod
-    def _innovations(self, members: Members, centre: Members, data: WindowData) -> tuple[FloatArray, FloatArray]:
+    def _innovations(
+        self, members: Members, centre: Members, data: WindowData
+    ) -> tuple[FloatArray, FloatArray]:
         """Return innovations of the recording, (n, width), and of the members, (N, n, width)."""
 
     @abc.abstractmethod
@@ -156,7 +184,7 @@ class _View(abc.ABC):
         """Train the critic; return whitened statistics of the recording, of the members, and the distance."""
 
     def residual(self, members: Members, centre: Members) -> tuple[FloatArray, float]:
-        """Return the recording's statistics minus each member's, (N, F), and the critic's Wasserstein estimate.
+        """Return the recording's statistics minus each member's, (N, F), and the Wasserstein estimate.
 
         Args:
             members: The population.
@@ -174,7 +202,8 @@ class _View(abc.ABC):
         return residual, gap
 
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
-        # Far members' windows run away by many scales; a critic that spends itself on them sees nothing in the middle.
+        # Far members' windows run away by many scales; a critic that spends itself on them sees nothing in
+        # the middle.
         limited = (5.0 * np.tanh(values / (5.0 * scale))).astype(np.float32)
         context = np.broadcast_to(self._context, (*values.shape[:-1], self._context.shape[1]))
         return np.concatenate([limited, context], axis=-1)
@@ -183,11 +212,8 @@ class _View(abc.ABC):
 class _CleanView(_View):
     """Noise-free recordings: one sample is one window of innovations at the control rate."""
 
-    def _ticks(self) -> int:
-        return self._settings.clean_ticks
-
     def _width(self) -> int:
-        return self._settings.clean_ticks * self._problem.joints
+        return self._ticks * self._problem.joints
 
     def _make_context(self, data: WindowData) -> FloatArray:
         episode = self._problem.episodes[data.episode]
@@ -196,10 +222,13 @@ class _CleanView(_View):
         target = np.stack([episode.target[k : k + span].mean(axis=0) for k in begin])
         return np.concatenate([data.start_position, data.start_velocity, target], axis=1)
 
-    def _innovations(self, members: Members, centre: Members, data: WindowData) -> tuple[FloatArray, FloatArray]:
+    def _innovations(
+        self, members: Members, centre: Members, data: WindowData
+    ) -> tuple[FloatArray, FloatArray]:
         at = slice(self._every - 1, None, self._every)
         both = Members(
-            np.concatenate([members.theta, centre.theta]), np.concatenate([members.latency_s, centre.latency_s])
+            np.concatenate([members.theta, centre.theta]),
+            np.concatenate([members.latency_s, centre.latency_s]),
         )
         predicted = predict(self._problem, both, data)[0][:, :, at]
         real = data.measured[:, at] - predicted[-1]
@@ -225,9 +254,6 @@ class _NoisyView(_View):
     Members are given simulated noise of the same whitened size, or the critic would tell them by its absence.
     """
 
-    def _ticks(self) -> int:
-        return self._settings.noisy_ticks
-
     def _width(self) -> int:
         return self._every * self._problem.joints
 
@@ -237,12 +263,17 @@ class _NoisyView(_View):
         target = episode.target[episode.sample[row]]
         return np.concatenate([starts.position[row], starts.velocity[row], target], axis=1)
 
-    def _innovations(self, members: Members, centre: Members, data: WindowData) -> tuple[FloatArray, FloatArray]:
-        whitening = linearise(self._problem, centre, data)
-        predicted, _ = predict(self._problem, members, data)
-        # The inverse Cholesky factor is lower triangular: each period's innovation is whitened by its past only.
+    def _innovations(
+        self, members: Members, centre: Members, data: WindowData
+    ) -> tuple[FloatArray, FloatArray]:
+        offset = self._offsets.get(data.episode)
+        whitening = linearise(self._problem, centre, data, offset)
+        predicted, _ = predict(self._problem, members, data, *whitening.starts(data))
+        if self._move_starts:
+            self._offsets[data.episode] = whitening.next_offset(data.measured)
+        # The inverse Cholesky factor is lower triangular: each period's innovation is whitened by its past.
         fake = whitening.apply(predicted - whitening.reference).reshape(len(predicted), -1, self._width())
-        real = whitening.apply((data.measured - whitening.reference)[None]).reshape(-1, self._width())
+        real = whitening.innovation(data.measured, whitening.reference[None]).reshape(-1, self._width())
         return real, fake
 
     def _statistics(
@@ -255,7 +286,9 @@ class _NoisyView(_View):
         data, imitation = self._join(real, scale), self._join(fake + noise, scale)
         gap = self._critic.train(data, imitation[good].reshape(-1, data.shape[1]))
         target = self._critic.statistics(data[None])[0]
-        repeats = [self._critic.statistics(self._join(fake + d, scale)) for d in draws[: settings.smooth_draws]]
+        repeats = [
+            self._critic.statistics(self._join(fake + d, scale)) for d in draws[: settings.smooth_draws]
+        ]
         found = np.mean(repeats, axis=0)
         covariance = np.cov(self._critic.statistics(self._join(draws, scale)), rowvar=False)
         variance = np.diag(covariance)

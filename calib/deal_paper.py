@@ -1,7 +1,7 @@
 """`deal-paper`: DEAL's Algorithm 1, with every choice that the paper leaves open noted where it is made.
 
-Generation t: roll every member out, train the critic (eq. 5), score each member's own rollout, turn scores into
-probabilities and take one denoising step (eqs. 1, 2, 9, 10: :mod:`deal_hw.calib.diffusion_evolution`).
+Generation t: roll every member out, train the critic (eq. 5), score each member's own rollout, turn scores
+into probabilities and take one denoising step (eqs. 1, 2, 9, 10: :mod:`deal_hw.calib.diffusion_evolution`).
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from deal_hw.types import FloatArray
 HALF_WIDTH = 3.0**0.5
 """The box is [-HALF_WIDTH, HALF_WIDTH]: a uniform start then has unit variance, as eq. 12 has it at t = T.
 
-In [-1, 1] the unit noise of eq. 10 puts a third of all coordinates outside the range, where they are simulated at its
-edge, and the search is drawn into the corners.
+In [-1, 1] the unit noise of eq. 10 puts a third of all coordinates outside the range, where they are
+simulated at its edge, and the search is drawn into the corners.
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperSettings:
-    """Choices of `deal-paper`; the paper names those that are marked with a section.
+    r"""Choices of `deal-paper`; the paper names those that are marked with a section.
 
     Attributes:
-        critic: Size (section 3.1: two layers of 256) and training of the critic. Learning rate, clip, updates n and
-            batch M are not in the paper.
+        critic: Size (section 3.1: two layers of 256) and training of the critic. Learning rate, clip, updates
+            n and batch M are not in the paper.
         diffusion: The search's choices; its number of generations is the budget's.
-        normalise: Whether the search moves in the normalised range (section 3.2); off is the ablation DEAL\\PN, which
-            moves in raw SI units.
+        normalise: Whether the search moves in the normalised range (section 3.2); off is the ablation
+            DEAL\PN, which moves in raw SI units.
         constant_fitness: Score every member 0: a search that cannot see the data.
         replay_generations: How many generations D_S holds. Algorithm 1 stores every rollout and forgets none.
         ticks: Most transitions of a rollout (Table 4: 200).
@@ -65,7 +65,8 @@ class PaperSettings:
 class DealPaper(CalibrationMethod[Problem]):
     """DEAL as published.
 
-    The latency, of which the paper knows nothing, is one more searched coordinate unless the problem gives it.
+    The latency, of which the paper knows nothing, is one more searched coordinate unless the problem gives
+    it.
 
     Args:
         settings: How to run.
@@ -123,8 +124,8 @@ class DealPaper(CalibrationMethod[Problem]):
                     },
                 )
         final = search.ask()
-        # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best member
-        # differ from it by less than the population's own error.
+        # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best
+        # member differ from it by less than the population's own error.
         return run.result(
             box.coordinates,
             box.members(final.mean(axis=0, keepdims=True)),
@@ -140,18 +141,18 @@ def paper() -> DealPaper:
 
 
 def literal() -> DealPaper:
-    """Return Algorithm 1 to the letter where it has letters: raw softmax (eq. 22), distance summed over K (eq. 1)."""
+    """Return Algorithm 1 to the letter: raw softmax (eq. 22), distance summed over K (eq. 1)."""
     diffusion = DiffusionSettings(temperature=None, divide_distance=False)
     return DealPaper(PaperSettings(diffusion=diffusion), name="deal-paper-literal")
 
 
 def without_noise_adaptation() -> DealPaper:
-    """Return the paper's ablation DEAL\\FN: no eq. 9."""
+    r"""Return the paper's ablation DEAL\FN: no eq. 9."""
     return DealPaper(PaperSettings(diffusion=DiffusionSettings(adapt_noise=False)), name="deal-paper-fn")
 
 
 def without_normalisation() -> DealPaper:
-    """Return the paper's ablation DEAL\\PN: the search moves in raw units."""
+    r"""Return the paper's ablation DEAL\PN: the search moves in raw units."""
     return DealPaper(PaperSettings(normalise=False), name="deal-paper-pn")
 
 
@@ -181,7 +182,7 @@ class _Box:
         return np.concatenate([members.theta, members.latency_s[:, None]], axis=1)
 
     def members(self, x: FloatArray) -> Members:
-        """Map the box to physical values; what left the box is simulated at its edge (the paper does not say)."""
+        """Map the box to physical values; what left it is simulated at its edge (the paper does not say)."""
         if self._normalise:
             return self.coordinates.members(np.clip((x / HALF_WIDTH + 1) / 2, 0.0, 1.0))
         space = self.coordinates.space
@@ -230,4 +231,5 @@ class _PaperView:
             moved = rollout_population(self._problem, members, index, ticks, self._policy)
             blocks.append(transitions(*moved))
         raw = blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
-        return self._scale.apply(raw), np.isfinite(raw).all(axis=(1, 2))
+        usable = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
+        return self._scale.apply(raw), usable

@@ -1,11 +1,12 @@
-"""Diffusion evolution (DEAL, section 3 and appendix A.1): a population moves by denoising towards its fitter members.
+"""Diffusion evolution (DEAL, section 3 and appendix A.1): a population denoised towards its fitter members.
 
-Knows no simulator: it is asked for a population and told the fitness of each member. Equation numbers are those of the
-DEAL paper, and the symbols are its symbols: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
+Knows no simulator: it is asked for a population and told the fitness of each member. Equation numbers are
+those of the DEAL paper, and the symbols are its symbols: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
 
-The coordinates are a box that is centred on zero, [-1, 1]. The paper says "normalised within the search range" and not
-which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any data (a flat
-fitness drifts to 0.37-0.45 of the range), in the centred box they pull towards the centre, where the search starts.
+The coordinates are a box that is centred on zero, [-1, 1]. The paper says "normalised within the search
+range" and not which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner
+without any data (a flat fitness drifts to 0.37-0.45 of the range), in the centred box they pull towards the
+centre, where the search starts.
 """
 
 from __future__ import annotations
@@ -27,18 +28,19 @@ _ALPHA_LAST = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiffusionSettings:
-    """What the paper leaves open, and what it says.
+    r"""What the paper leaves open, and what it says.
 
     Attributes:
         generations: Search steps T.
         schedule: How alpha_t falls from 1 to about 0; the paper names none.
         eta: sigma_t in units of the full DDPM noise; 0 is deterministic DDIM. The paper names no schedule.
-        divide_distance: Whether the kernel's squared distance is divided by K. The paper's N(.; ., 1 - alpha) is a sum
-            over coordinates, which at high K underflows: each member then has no neighbour but itself.
-        temperature: None is the paper's g, a softmax of the raw fitness (eq. 22). A number standardises the fitness
-            within the generation and divides it by this: a critic's scale is arbitrary, and the raw softmax either
-            selects nobody or one.
-        adapt_noise: Whether eq. 9 scales the noise; off is the paper's ablation DEAL\\FN.
+        divide_distance: Whether the kernel's squared distance is divided by K. The paper's N(.; ., 1 - alpha)
+            is a sum over coordinates, which at high K underflows: each member then has no neighbour but
+            itself.
+        temperature: None is the paper's g, a softmax of the raw fitness (eq. 22). A number standardises the
+            fitness within the generation and divides it by this: a critic's scale is arbitrary, and the raw
+            softmax either selects nobody or one.
+        adapt_noise: Whether eq. 9 scales the noise; off is the paper's ablation DEAL\FN.
         influence: lambda in eq. 9; the paper gives no value.
     """
 
@@ -46,7 +48,7 @@ class DiffusionSettings:
     schedule: Schedule = "cosine"
     eta: float = 1.0
     divide_distance: bool = True
-    temperature: float | None = 0.5
+    temperature: float | None = 1.0
     adapt_noise: bool = True
     influence: float = 1.0
 
@@ -79,7 +81,8 @@ class DiffusionStep:
 
     Attributes:
         effective_size: Effective sample size of the probabilities p, 1 / sum p^2: N is no selection at all.
-        effective_neighbours: The same for p times the kernel, mean over members: 1 is a member that sees only itself.
+        effective_neighbours: The same for p times the kernel, mean over members: 1 is a member that sees only
+            itself.
         delta: The factor of eq. 9 as computed.
         sigma: The noise that was used, after the clamp.
         clamped: Whether the noise that eq. 9 asked for was more than eq. 10 can hold.
@@ -121,32 +124,36 @@ class DiffusionEvolution:
         """Take the step t -> t - 1.
 
         Args:
-            fitness: Mean critic output of each member, (N,); higher is better. Members whose simulation diverged are
-                -inf and get probability 0.
+            fitness: Mean critic output of each member, (N,); higher is better. Members whose simulation
+                diverged are -inf and get probability 0.
         """
         settings, theta, t = self._settings, self._theta, self.t
         p = probabilities(fitness, settings.temperature)
         alpha, alpha_next = self.alpha[t], self.alpha[t - 1]
-        # Eq. 1, 19 and 20 (Algorithm 1, lines 12-13): theta_0 = sum_i p_i N(theta_j; sqrt(a) theta_i, 1 - a) theta_i / Z.
+        # Eq. 1, 19 and 20 (Algorithm 1, lines 12-13): theta_0 = sum_i p_i N(theta_j; sqrt(a) theta_i, 1 - a)
+        # theta_i / Z.
         weights = neighbour_weights(theta, p, alpha, divide=settings.divide_distance)
         estimate = weights @ theta
         # Eq. 2 (line 14). alpha_t < 1 for every t >= 1.
         noise = (theta - np.sqrt(alpha) * estimate) / np.sqrt(1 - alpha)
-        # sigma_t: the DDPM posterior's standard deviation times eta, as in DDIM (paper's reference 25, its eq. 16).
+        # sigma_t: the DDPM posterior's standard deviation times eta, as in DDIM (paper's reference 25, its
+        # eq. 16).
         sigma = (
             settings.eta * np.sqrt((1 - alpha_next) / (1 - alpha)) * np.sqrt(max(1 - alpha / alpha_next, 0.0))
         )
         delta = 1.0
         if settings.adapt_noise:
             finite = fitness[np.isfinite(fitness)]
-            # Eq. 9 (line 10). exp is unbounded, so it is cut before it overflows; the clamp below decides anyway.
+            # Eq. 9 (line 10). exp is unbounded, so it is cut before it overflows; the clamp below decides
+            # anyway.
             delta = (
                 settings.influence * float(np.exp(np.clip(-finite.mean(), -50.0, 50.0)))
                 if finite.size
                 else 1.0
             )
         wanted = delta * sigma
-        # Eq. 10 needs 1 - alpha_{t-1} - sigma^2 >= 0, which eq. 9 does not guarantee: clamp. The paper does not say.
+        # Eq. 10 needs 1 - alpha_{t-1} - sigma^2 >= 0, which eq. 9 does not guarantee: clamp. The paper does
+        # not say.
         sigma_hat = min(wanted, np.sqrt(1 - alpha_next))
         keep = np.sqrt(max(1 - alpha_next - sigma_hat**2, 0.0))
         omega = self._rng.standard_normal(theta.shape)
@@ -191,7 +198,8 @@ def neighbour_weights(theta: FloatArray, p: FloatArray, alpha: float, *, divide:
         theta: Population, (N, K).
         p: Probabilities, (N,).
         alpha: alpha_t.
-        divide: Whether the squared distance is divided by K; the constant in front of the density cancels in Z.
+        divide: Whether the squared distance is divided by K; the constant in front of the density cancels in
+            Z.
     """
     centres = np.sqrt(alpha) * theta
     squared = np.sum(theta**2, axis=1)[:, None] - 2 * theta @ centres.T + np.sum(centres**2, axis=1)

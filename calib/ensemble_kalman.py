@@ -1,9 +1,10 @@
 """Ensemble Kalman inversion: a population moves by the regression of its coordinates on its residuals.
 
-Knows no simulator: it is asked for an ensemble and told that ensemble's whitened residuals. Perturbed observations and
-the tempered update are those of Iglesias, Law and Stuart (2013); the data-misfit controller is that of Iglesias and
-Yang (2021), the discrepancy rule for the regularisation that of Iglesias (2016). On a linear model with a Gaussian
-prior the ensemble is, for large N, a sample of the exact posterior once the tempering reaches 1.
+Knows no simulator: it is asked for an ensemble and told that ensemble's whitened residuals. Perturbed
+observations and the tempered update are those of Iglesias, Law and Stuart (2013); the data-misfit controller
+is that of Iglesias and Yang (2021), the discrepancy rule for the regularisation that of Iglesias (2016). On a
+linear model with a Gaussian prior the ensemble is, for large N, a sample of the exact posterior once the
+tempering reaches 1.
 """
 
 from __future__ import annotations
@@ -58,11 +59,11 @@ class EnsembleKalman:
         """Move the ensemble.
 
         Args:
-            residual: Observed minus predicted, (N, M), whitened: unit variance where the model is right. Rows that
-                are not finite are members whose simulation diverged; they restart from another member.
-            keep: None tempers by the misfit controller until ``finished``. A number in (0, 1) instead inflates the
-                noise until that share of the mean residual remains after the step (discrepancy rule): for residuals
-                whose meaning changes from step to step, where tempering has no end.
+            residual: Observed minus predicted, (N, M), whitened: unit variance where the model is right. Rows
+                that are not finite are members whose simulation diverged; they restart from another member.
+            keep: None tempers by the misfit controller until ``finished``. A number in (0, 1) instead
+                inflates the noise until that share of the mean residual remains after the step (discrepancy
+                rule): for residuals whose meaning changes from step to step, where tempering has no end.
         """
         residual = self._replace_diverged(residual)
         N, M = residual.shape
@@ -76,9 +77,10 @@ class EnsembleKalman:
             inflation = 1.0 / self._misfit_step(misfit, M)
             self.tempering += 1.0 / inflation
         else:
-            inflation = _discrepancy(scale, right @ residual.mean(axis=0), residual.mean(axis=0), keep)
-        # z + C_zg (C_gg + a I)^-1 (y + sqrt(a) xi - g): the singular vectors make it N x N, and the perturbations are
-        # drawn in the span of the ensemble, the only part of them that acts.
+            mean = residual.mean(axis=0)
+            inflation = _discrepancy(scale, right @ mean, mean, keep)
+        # z + C_zg (C_gg + a I)^-1 (y + sqrt(a) xi - g): the singular vectors make it N x N, and the
+        # perturbations are drawn in the span of the ensemble, the only part of them that acts.
         projected = residual @ right.T + np.sqrt(inflation) * self._rng.standard_normal((N, len(scale)))
         deviation = (self._members - self._members.mean(axis=0)) / np.sqrt(N - 1)
         gain = (scale / (scale**2 + inflation))[:, None] * (left.T @ deviation)
@@ -89,7 +91,7 @@ class EnsembleKalman:
         )
 
     def widen(self, spread: float) -> None:
-        """Scale deviations so that no coordinate's standard deviation is below ``spread``; the tempering restarts."""
+        """Scale deviations so that no coordinate's spread is below ``spread``; the tempering restarts."""
         mean = self._members.mean(axis=0)
         std = np.maximum(self._members.std(axis=0, ddof=1), 1e-12)
         self._members = mean + (self._members - mean) * np.maximum(spread / std, 1.0)
@@ -118,8 +120,8 @@ class EnsembleKalman:
 
 
 def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray, keep: float) -> float:
-    # The smallest a = 2^i with ||a (C + a I)^-1 d|| >= keep ||d||; the part of d outside the ensemble's span always
-    # stays, so it is counted too.
+    # The smallest a = 2^i with ||a (C + a I)^-1 d|| >= keep ||d||; the part of d outside the ensemble's span
+    # always stays, so it is counted too.
     total = float(residual @ residual)
     outside = max(total - float(projected @ projected), 0.0)
     inflation = 1e-12 * max(float(scale[0]) ** 2, 1e-300) if scale.size else 1.0

@@ -1,9 +1,9 @@
-"""Window innovations: what the recording shows beyond a simulator's prediction, whitened for noise and start states.
+"""Window innovations: recording minus prediction, whitened for sensor noise and for start-state error.
 
-A window restarts the simulation at a smoothed state. The error of that state enters the prediction, so each window's
-innovation has the covariance Sigma = sensor variance + J P0 J', with J the derivative of the prediction by the
-start state and P0 the uncertainty of that state. Multiplying by the inverse Cholesky factor of Sigma leaves unit
-variance where the model is right, and takes out what a wrong start state explains.
+A window restarts the simulation at a smoothed state. The error of that state enters the prediction, so each
+window's innovation has the covariance Sigma = sensor variance + J P0 J', with J the derivative of the
+prediction by the start state and P0 the uncertainty of that state. Multiplying by the inverse Cholesky factor
+of Sigma leaves unit variance where the model is right, and takes out what a wrong start state explains.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from deal_hw.sim.windows import predict_windows, setpoints
 from deal_hw.types import FloatArray
 
 ADVANCE_S = 0.008
-"""Set-points are computed late by this much and moved back, so that latencies down to minus this are possible."""
+"""Set-points are computed late by so much and moved back: latencies down to minus this are possible."""
 
 
 def is_noisy(problem: Problem) -> bool:
@@ -67,54 +67,94 @@ class Whitening:
     Attributes:
         reference: Prediction of the simulator around which was linearised, (W, H, J).
         factor: Inverse Cholesky factors of Sigma, (W, H J, H J).
+        root: J sqrt(P0): what one standard deviation of each start coordinate does, (W, H J, 2 J).
+        std: Standard deviations of a start state, (2 J,).
+        offset: Start states relative to the smoothed ones around which was linearised, in units of ``std``,
+            (W, 2 J).
     """
 
     reference: FloatArray
     factor: FloatArray
+    root: FloatArray
+    std: FloatArray
+    offset: FloatArray
 
     def apply(self, difference: FloatArray) -> FloatArray:
         """Whiten differences of positions, (N, W, H, J); returns (N, W, H J)."""
         flat = difference.reshape(*difference.shape[:2], -1)
         return np.asarray(np.einsum("wij,nwj->nwi", self.factor, flat, optimize=True))
 
+    def innovation(self, measured: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Whiten recording minus prediction, the latter moved to the smoothed start states, (N, W, H J).
 
-def linearise(problem: Problem, centre: Members, data: WindowData) -> Whitening:
+        Args:
+            measured: (W, H, J).
+            predicted: From the start states that :meth:`starts` gives, (N, W, H, J).
+        """
+        moved = np.einsum("wis,ws->wi", self.root, self.offset).reshape(measured.shape)
+        return self.apply(measured + moved - predicted)
+
+    def starts(self, data: WindowData) -> tuple[FloatArray, FloatArray]:
+        """Return the start positions and velocities around which was linearised, (W, J) each."""
+        J = data.start_position.shape[1]
+        moved = self.offset * self.std
+        return data.start_position + moved[:, :J], data.start_velocity + moved[:, J:]
+
+    def next_offset(self, measured: FloatArray) -> FloatArray:
+        """Return the most probable start states under the linearisation's simulator: the next ``offset``."""
+        whitened = self.innovation(measured, self.reference[None])[0]
+        response = np.einsum("wij,wjs->wis", self.factor, self.root)
+        found = np.einsum("wis,wi->ws", response, whitened)
+        return np.asarray(np.clip(found, -OFFSET_LIMIT, OFFSET_LIMIT))
+
+
+OFFSET_LIMIT = 3.0
+"""Start states move by so many standard deviations at most, or a wrong simulator would explain itself."""
+
+
+def linearise(
+    problem: Problem, centre: Members, data: WindowData, offset: FloatArray | None = None
+) -> Whitening:
     """Linearise the prediction by the start states around one simulator.
 
     Args:
         problem: Data and simulator.
         centre: One member, the mean of the population.
         data: The windows.
+        offset: Start states to linearise around, in standard deviations from the smoothed ones, (W, 2 J).
     """
-    starts = problem.starts[data.episode]
+    states = problem.starts[data.episode]
     W, J = data.start_position.shape
-    std = np.concatenate([starts.position_std, starts.velocity_std])
-    # Central differences at half the uncertainty: friction makes predictions kinked, and a secant of the size of the
-    # error itself says more about them than a derivative.
+    std = np.concatenate([states.position_std, states.velocity_std])
+    around = np.zeros((W, 2 * J)) if offset is None else offset
+    # Central differences at half the uncertainty: friction makes predictions kinked, and a secant of the size
+    # of the error itself says more about them than a derivative.
     count = 1 + 4 * J
-    position = np.repeat(data.start_position[None], count, axis=0)
-    velocity = np.repeat(data.start_velocity[None], count, axis=0)
-    width = 0.5 * std
+    position = np.repeat(data.start_position[None] + around[:, :J] * std[:J], count, axis=0)
+    velocity = np.repeat(data.start_velocity[None] + around[:, J:] * std[J:], count, axis=0)
     for s in range(2 * J):
         state, j = (position, s) if s < J else (velocity, s - J)
-        state[1 + 2 * s, :, j] += width[s]
-        state[2 + 2 * s, :, j] -= width[s]
+        state[1 + 2 * s, :, j] += 0.5 * std[s]
+        state[2 + 2 * s, :, j] -= 0.5 * std[s]
     members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
     predicted, _ = predict(problem, members, data, position, velocity)
     predicted = np.where(np.isfinite(predicted), predicted, predicted[:1])
     flat = predicted.reshape(count, W, -1)
-    # (W, H J, 2 J), already multiplied by the standard deviations: J sqrt(P0).
-    root = np.moveaxis((flat[1::2] - flat[2::2]), 0, -1) * (std / (2 * width))
+    root = np.moveaxis(flat[1::2] - flat[2::2], 0, -1)
     sigma = root @ np.swapaxes(root, 1, 2)
     noise = data.std.reshape(W, -1) ** 2
     diagonal = np.arange(noise.shape[1])
     sigma[:, diagonal, diagonal] += noise
     factor = np.linalg.inv(np.linalg.cholesky(sigma))
-    return Whitening(predicted[0], factor)
+    return Whitening(predicted[0], factor, root, std, around)
 
 
 def whitened_residual(
-    problem: Problem, members: Members, centre: Members, windows: list[WindowData]
+    problem: Problem,
+    members: Members,
+    centre: Members,
+    windows: list[WindowData],
+    offsets: list[FloatArray] | None = None,
 ) -> FloatArray:
     """Return recording minus prediction of every window, whitened around one simulator.
 
@@ -123,16 +163,20 @@ def whitened_residual(
         members: The N simulators.
         centre: The simulator to linearise around, such as the population's mean.
         windows: The windows.
+        offsets: Start states to linearise around, one array for each of ``windows``; replaced by the next
+            ones to use. None for the smoothed states.
 
     Returns:
         (N, M); not finite in rows of members that diverged.
     """
     parts = []
-    for data in windows:
-        whitening = linearise(problem, centre, data)
-        predicted, _ = predict(problem, members, data)
-        whitened = whitening.apply(data.measured - predicted)
+    for i, data in enumerate(windows):
+        whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
+        predicted, _ = predict(problem, members, data, *whitening.starts(data))
+        whitened = whitening.innovation(data.measured, predicted)
         parts.append(whitened.reshape(len(whitened), -1))
+        if offsets is not None:
+            offsets[i] = whitening.next_offset(data.measured)
     return np.concatenate(parts, axis=1)
 
 

@@ -59,8 +59,9 @@ class Run:
     ) -> CalibrationResult:
         """Return the result.
 
-        The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT calibrated:
-        a searcher's population shrinks as its step rule says, too far where the ensemble is small, and to nothing
+        The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
+        calibrated: a searcher's population shrinks as its step rule says, too far where the ensemble is
+            small, and to nothing
         for diffusion evolution. The polish computes intervals from the data.
 
         Args:
@@ -91,7 +92,8 @@ class Run:
             population=population.theta,
             latency_s=latency,
             latency_interval_s=(
-                coordinates.clip_latency(latency - Z90 * spread), coordinates.clip_latency(latency + Z90 * spread)
+                coordinates.clip_latency(latency - Z90 * spread),
+                coordinates.clip_latency(latency + Z90 * spread),
             ),
             chi2=chi2,
             alarms=tuple(alarms),
@@ -99,4 +101,4 @@ class Run:
             steps=self.problem.steps - self._steps,
             seconds=time.perf_counter() - self._start,
             provenance={"settings": asdict(settings), "budget": asdict(self.budget), **(extra or {})},
-        )  # fmt: skip
+        )

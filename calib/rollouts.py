@@ -1,4 +1,4 @@
-"""The paper's view of a population: each member's own rollout as transitions (s, a, s') at the control rate."""
+"""The paper's view of a population: each member's rollout as transitions (s, a, s') at the control rate."""
 
 from __future__ import annotations
 
@@ -42,6 +42,11 @@ class Ticks:
     def __len__(self) -> int:
         return len(self.start) - 1
 
+    @property
+    def action(self) -> IntArray:
+        """Grid index at which each tick's action is read, (T,): commands arrive some periods into a tick."""
+        return np.asarray((self.start[:-1] + self.start[1:]) // 2)
+
 
 def control_ticks(problem: Problem, index: int, most: int | None = None) -> Ticks:
     """Divide an episode into control periods, from its first usable sample to the first gap.
@@ -73,7 +78,7 @@ def control_ticks(problem: Problem, index: int, most: int | None = None) -> Tick
             break
     if len(start) < 3:
         raise InsufficientDataError(
-            f"episode {index} has {max(len(start) - 1, 0)} unbroken control periods; a rollout needs at least 2"
+            f"episode {index} has {max(len(start) - 1, 0)} whole control periods; a rollout needs 2 or more"
         )
     sent = np.concatenate([episode.stiffness, episode.damping, episode.effort_limit], axis=1)[start[:-1]]
     changes = [0, *(np.flatnonzero(np.any(sent[1:] != sent[:-1], axis=1)) + 1).tolist()]
@@ -93,7 +98,8 @@ def rollout_population(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Roll all members out from the recording's initial state (Algorithm 1, line 3).
 
-    Without a policy the recorded targets are sent: pi_0's actions on the robot. Closed loop needs pi_0 itself.
+    Without a policy the recorded targets are sent: pi_0's actions on the robot. Closed loop needs pi_0
+    itself.
 
     Args:
         problem: Data and simulator; its physics step may be longer than the device's period.
@@ -103,8 +109,8 @@ def rollout_population(
         policy: pi_0, or None.
 
     Returns:
-        Positions and velocities at the ticks, (N, T + 1, J) each, and the action of each tick, (N, T, A). Members
-        that diverged are NaN from there on.
+        Positions and velocities at the ticks, (N, T + 1, J) each, and the action of each tick, (N, T, A).
+        Members that diverged are NaN from there on.
     """
     episode = problem.episodes[index]
     batch = problem.batch(len(members.theta))
@@ -117,7 +123,8 @@ def rollout_population(
 
 
 def _physics_steps(batch: ServoBatch, episode: Episode, path: FloatArray) -> FloatArray:
-    # A physics step may be several device periods (the paper's 5 ms) or a part of one; the set-point is sampled.
+    # A physics step may be several device periods (the paper's 5 ms) or a part of one; the set-point is
+    # sampled.
     ratio = batch.robot.step_s / episode.step_s
     if ratio >= 1:
         return path[:, :: round(ratio)]
@@ -142,7 +149,7 @@ def _replay(
         # `advance` sees a divergence only in the stretch in which it happens.
         bad = ~np.isfinite(position[:, begin]).all(axis=1)
         position[bad, begin + 1 :], velocity[bad, begin + 1 :] = np.nan, np.nan
-    action = np.broadcast_to(episode.target[ticks.start[:-1]], (N, T, episode.target.shape[1]))
+    action = np.broadcast_to(episode.target[ticks.action], (N, T, episode.target.shape[1]))
     return position, velocity, action
 
 
@@ -186,9 +193,9 @@ def _closed_loop(
 class TransitionScale:
     """Standardises transitions by the recording's statistics.
 
-    The paper feeds (s, a, s'). This feeds (s, a, s' - s), each with mean 0 and variance 1 over the recording: the same
-    information in coordinates in which a first layer can see the change at all, as s and s' differ by a hundredth of
-    their range. The paper says nothing of input scaling.
+    The paper feeds (s, a, s'). This feeds (s, a, s' - s), each with mean 0 and variance 1 over the recording:
+    the same information in coordinates in which a first layer can see the change at all, as s and s' differ
+    by a hundredth of their range. The paper says nothing of input scaling.
 
     Attributes:
         mean: (2 J + A + 2 J,).
@@ -233,8 +240,9 @@ def transitions(position: FloatArray, velocity: FloatArray, action: FloatArray) 
 def demonstration(problem: Problem, index: int, ticks: Ticks) -> npt.NDArray[np.float32]:
     """Return the recording's own transitions D_T, (T, inputs), not yet standardised.
 
-    Noisy positions are smoothed first (:func:`deal_hw.calib.problem.smooth_states`), which helps the paper's method.
+    Noisy positions are smoothed first (:func:`deal_hw.calib.problem.smooth_states`), which helps the paper's
+    method.
     """
     starts, episode = problem.starts[index], problem.episodes[index]
     position, velocity = starts.position[ticks.sample][None], starts.velocity[ticks.sample][None]
-    return transitions(position, velocity, episode.target[ticks.start[:-1]][None])[0]
+    return np.asarray(transitions(position, velocity, episode.target[ticks.action][None])[0])

@@ -1,7 +1,8 @@
 """`weki`: ensemble Kalman inversion on window innovations that are whitened for noise and start-state error.
 
-No critic: the vector of all whitened innovations itself is regressed on. Short windows come first, because over a
-long one the unstable pole makes the prediction of a wrong simulator meaningless; long ones then hold the information.
+No critic: the vector of all whitened innovations itself is regressed on. Short windows come first, because
+over a long one the unstable pole makes the prediction of a wrong simulator meaningless; long ones then hold
+the information.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class WekiSettings:
         stage_generations: Most generations of one stage.
     """
 
-    noisy_ticks: tuple[int, ...] = (5, 20)
+    noisy_ticks: tuple[int, ...] = (5, 20, 20)
     clean_ticks: tuple[int, ...] = (5, 10)
     step_clip: float = 2.0
     widen: float = 0.5
@@ -77,8 +78,9 @@ class Weki(CalibrationMethod[Problem]):
         alarms = []
         if not chi2 <= self.settings.restart_chi2:
             alarms.append(
-                f"the search left a residual of {chi2:.1f} times its expected variance after {len(run.trace)} "
-                "generations; allow more generations, widen the ranges, or suspect the model"
+                f"the search left a residual of {chi2:.1f} times its expected variance after "
+                f"{len(run.trace)} generations; "
+                "allow more generations, widen the ranges, or suspect the model"
             )
         return run.result(
             coordinates,
@@ -101,15 +103,20 @@ class Weki(CalibrationMethod[Problem]):
         lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
         for stage, ticks in enumerate(lengths):
             windows = problem.windows(ticks * tick)
+            offsets: list[FloatArray] | None = None
             if stage:
                 kalman.widen(settings.widen)
+                # From the second stage on the population is near enough to say better than a smoother where
+                # each window began: start states are linearised anew around the last generation's most
+                # probable ones.
+                offsets = [np.zeros((len(d.windows), 2 * problem.joints)) for d in windows]
             for _ in range(settings.stage_generations):
                 if kalman.finished or len(run.trace) >= budget.generations:
                     break
                 z = kalman.ask()
                 members = coordinates.members(logistic(z))
                 centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-                step = kalman.tell(whitened_residual(problem, members, centre, windows))
+                step = kalman.tell(whitened_residual(problem, members, centre, windows, offsets))
                 run.note(
                     f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
                     members.theta,

@@ -23,6 +23,9 @@ FALLEN_RAD = 0.5
 """A pole beyond this angle has fallen: no cart of this size brings it back."""
 
 
+_SLACK_S = 0.1
+
+
 class BatchPolicy(Protocol):
     """A policy that acts for many members at once."""
 
@@ -59,14 +62,23 @@ def wrapped_angle(angle: FloatArray) -> FloatArray:
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
-def balance_result(position: FloatArray, velocity: FloatArray, period_s: float) -> BalanceResult:
+def balance_result(
+    position: FloatArray, velocity: FloatArray, period_s: float, duration_s: float | None = None
+) -> BalanceResult:
     """Judge one run.
 
     Args:
         position: Reported joint positions (cart, pole), (T, 2).
         velocity: Reported joint velocities, (T, 2).
         period_s: Time between samples [s].
+        duration_s: How long the run should have lasted [s]. Where the safety module ended it before, the
+            time that is missing counts as a hanging pole and a cart at rest; None: as it is.
     """
+    missing = 0 if duration_s is None else max(0, round(duration_s / period_s) - len(position))
+    # A recording has a sample less or more than its duration, depending on where its first one falls.
+    if missing * period_s > _SLACK_S:
+        position = np.concatenate([position, np.tile([0.0, np.pi], (missing, 1))])
+        velocity = np.concatenate([velocity, np.zeros((missing, 2))])
     angle = np.abs(wrapped_angle(position[:, POLE]))
     fallen = angle > FALLEN_RAD
     fell = bool(fallen.any())

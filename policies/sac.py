@@ -40,10 +40,11 @@ class SacConfig:
         target_entropy: Entropy of the policy that the temperature is tuned for [nat].
         warmup: Environment steps with random actions before the first update.
         buffer: Transitions kept.
-        lookahead: Rewards that are summed up before the critics are asked (n-step returns).
+        averaged: Share of the steps, at the end, over which the actor's weights are averaged. The last actor
+            is off by its last few updates, which differ from seed to seed; their mean less so.
     """
 
-    steps: int = 40_000
+    steps: int = 48_000
     hidden: tuple[int, ...] = (64, 64)
     gradient_steps: int = 8
     batch: int = 512
@@ -55,7 +56,7 @@ class SacConfig:
     target_entropy: float = -1.5
     warmup: int = 1_000
     buffer: int = 200_000
-    lookahead: int = 1
+    averaged: float = 0.25
 
     def __post_init__(self) -> None:
         for name in (
@@ -69,7 +70,7 @@ class SacConfig:
         ):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
-        for name in ("gamma", "tau"):
+        for name in ("gamma", "tau", "averaged"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must lie in (0, 1], got {getattr(self, name)!r}")
         if not self.hidden or min(self.hidden) < 1:
@@ -139,10 +140,11 @@ class SacTrainer:
             seed = int(rng.integers(2**31))
             adapter = _Adapter(env, seed)
             model = _model(adapter, config, seed)
-            model.learn(config.steps, callback=_Report(adapter, config.steps, progress))
+            mean = _MeanActor(config.steps * (1.0 - config.averaged))
+            model.learn(config.steps, callback=[_Report(adapter, config.steps, progress), mean])
         finally:
             torch.set_num_threads(threads)
-        actor = model.policy.actor
+        actor = mean.apply()
         network = torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh())
         return NetworkPolicy(network, _spec_of(env, config, seed))
 
@@ -164,7 +166,6 @@ def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
         gradient_steps=config.gradient_steps,
         ent_coef=f"auto_{config.entropy:g}",
         target_entropy=config.target_entropy,
-        n_steps=config.lookahead,
         policy_kwargs={"net_arch": list(config.hidden), "optimizer_kwargs": {"fused": True}},
         seed=seed,
         device="cpu",
@@ -234,6 +235,38 @@ class _Adapter(VecEnv):
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
     ) -> list[bool]:
         return [False] * self.num_envs
+
+
+def _actor(model: Any) -> Any:
+    return model.policy.actor
+
+
+class _MeanActor(BaseCallback):
+    """Averages the actor's weights from some step on."""
+
+    def __init__(self, start: float) -> None:
+        super().__init__()
+        self._start, self._count = start, 0
+        self._sum: list[torch.Tensor] = []
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps > self._start:
+            now = [p.detach() for p in _actor(self.model).parameters()]
+            self._sum = (
+                [a + b for a, b in zip(self._sum, now, strict=True)]
+                if self._sum
+                else [p.clone() for p in now]
+            )
+            self._count += 1
+        return True
+
+    def apply(self) -> Any:
+        """Give the actor its mean weights and return it."""
+        actor = _actor(self.model)
+        with torch.no_grad():
+            for parameter, total in zip(actor.parameters(), self._sum, strict=True):
+                parameter.copy_(total / self._count)
+        return actor
 
 
 class _Report(BaseCallback):

@@ -28,7 +28,11 @@ class Centre(CalibrationMethod[Problem]):
     name = "centre"
 
     def run(
-        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
     ) -> CalibrationResult:
         """Look at nothing; the population is a uniform draw, so that the interval is the range's."""
         return _ignorant(self.name, problem, budget, rng, progress, problem.space.center)
@@ -40,7 +44,11 @@ class Nominal(CalibrationMethod[Problem]):
     name = "nominal"
 
     def run(
-        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
     ) -> CalibrationResult:
         """Look at nothing."""
         return _ignorant(self.name, problem, budget, rng, progress, problem.space.nominal)
@@ -87,7 +95,11 @@ class RandomSearch(CalibrationMethod[Problem]):
         self.settings = settings or RandomSettings()
 
     def run(
-        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None = None
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
     ) -> CalibrationResult:
         """Use the budget's population times generations as draws."""
         run = Run(self.name, problem, budget, progress)
@@ -99,11 +111,14 @@ class RandomSearch(CalibrationMethod[Problem]):
         for _ in range(max(budget.generations, 1)):
             unit = coordinates.sample(rng, budget.population)
             members = coordinates.members(unit)
-            # One metric for all draws, that of the range's centre: scores of different metrics do not compare.
+            # One metric for all draws, that of the range's centre: scores of different metrics do not
+            # compare.
             score = np.mean(np.abs(whitened_residual(problem, members, middle, windows)), axis=1)
             kept.append(unit)
             scores.append(np.where(np.isfinite(score), score, np.inf))
-            run.note(f"best {min(s.min() for s in scores):.3g}", members.theta, {"best": float(scores[-1].min())})
+            run.note(
+                f"best {min(s.min() for s in scores):.3g}", members.theta, {"best": float(scores[-1].min())}
+            )
         order = np.argsort(np.concatenate(scores))[: max(self.settings.elite, 2)]
         elite = coordinates.members(np.concatenate(kept)[order])
         best = Members(elite.theta[:1], elite.latency_s[:1])

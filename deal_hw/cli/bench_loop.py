@@ -156,12 +156,8 @@ def task_score(truth: Truth, policy: Policy, episodes: int = TASK_EPISODES) -> t
     angles, speeds = [], []
     for _ in range(episodes):
         run = virtual.run(PolicyBehaviour(policy, DESCRIPTION), TASK_SECONDS)
-        recorded = run.trajectory
-        due = round(TASK_SECONDS * DESCRIPTION.state_rate_hz)
-        missing = max(due - len(recorded.device_s), 0) if run.report.outcome.value == "tripped" else 0
-        position = np.concatenate([recorded.position, np.tile([0.0, np.pi], (missing, 1))])
-        velocity = np.concatenate([recorded.velocity, np.zeros((missing, 2))])
-        result = balance_result(position, velocity, 1 / DESCRIPTION.state_rate_hz)
+        recorded, period_s = run.trajectory, 1 / DESCRIPTION.state_rate_hz
+        result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
         angles.append(result.angle_error_rad)
         speeds.append(result.cart_speed_m_s)
     return float(np.mean(angles)), float(np.mean(speeds))

@@ -182,10 +182,7 @@ def task_scores(dataset: Path, episodes: int) -> FloatArray:
     for index in range(len(store.episodes)):
         recorded = store.read(index).trajectory
         period_s = float(np.median(np.diff(recorded.device_s)))
-        missing = max(round((TASK_SECONDS - 0.1 - recorded.duration_s) / period_s), 0)
-        position = np.concatenate([recorded.position, np.tile([0.0, np.pi], (missing, 1))])
-        velocity = np.concatenate([recorded.velocity, np.zeros((missing, 2))])
-        result = balance_result(position, velocity, period_s)
+        result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
         scores.append((result.angle_error_rad, result.cart_speed_m_s))
     # Episodes that were not run any more, because an earlier one was tripped, count like that one's worst.
     scores += [(np.pi, 0.0)] * (episodes - len(scores))

@@ -25,8 +25,8 @@ class MethodCase:
         truth: The parameters' true values, (K,).
         budget: Enough to recover them.
         short_budget: As little as makes a generation.
-        tolerance: Largest mean |ln(estimate / truth)| that counts as recovered; None for methods that do not read
-            the data.
+        tolerance: Largest mean |ln(estimate / truth)| that counts as recovered; None for methods that do not
+            read the data.
     """
 
     method: CalibrationMethod[Any]

@@ -20,7 +20,7 @@ SMALL = CriticSettings(hidden=(32, 32), learning_rate=2e-3, updates=100, batch=6
 
 @pytest.mark.parametrize("kind", [ClippedCritic, PenaltyCritic])
 def test_separates_two_clouds(kind: type[Critic]) -> None:
-    """After training, fresh samples of the recording's cloud score higher than the simulator's nearly always."""
+    """After training, fresh samples of the recording's cloud nearly always score higher."""
     critic = kind(2, SMALL, np.random.default_rng(0))
     with torch_threads(1):
         gap = critic.train(cloud(1, 0.7), cloud(2, -0.7))

@@ -23,9 +23,10 @@ def test_step_for_two_members_by_hand() -> None:
     """Eqs. 1, 2 and 10 for theta = (1, -1), p = (3/4, 1/4), alpha_2 = 0.001, alpha_1 = 0.5005, no noise."""
     search = DiffusionEvolution(np.array([[1.0], [-1.0]]), LITERAL, np.random.default_rng(0))
     step = search.tell(np.array([np.log(3.0), 0.0]))
-    # Member 1: weights 3/4 exp(-(1 - sqrt .001)^2 / 1.998) = 0.469058 and 1/4 exp(-(1 + sqrt .001)^2 / 1.998) =
-    # 0.146761; theta_0 = (0.469058 - 0.146761) / 0.615819 = 0.523363; eps = (1 - 0.0316228 * 0.523363) / 0.9995 =
-    # 0.983942; next = 0.707460 * 0.523363 + 0.706753 * 0.983942. Member 2: theta_0 = 0.475886, eps = -1.015557.
+    # Member 1: weights 3/4 exp(-(1 - sqrt .001)^2 / 1.998) = 0.469058 and 1/4 exp(-(1 + sqrt .001)^2 / 1.998)
+    # = 0.146761; theta_0 = (0.469058 - 0.146761) / 0.615819 = 0.523363; eps = (1 - 0.0316228 * 0.523363) /
+    # 0.9995 = 0.983942; next = 0.707460 * 0.523363 + 0.706753 * 0.983942. Member 2: theta_0 = 0.475886, eps =
+    # -1.015557.
     np.testing.assert_allclose(search.ask()[:, 0], [1.065663, -0.381078], atol=2e-6)
     assert step.effective_size == pytest.approx(1 / (0.75**2 + 0.25**2))
     assert search.t == 1
@@ -109,7 +110,7 @@ def test_finds_the_optimum_of_a_quadratic() -> None:
 
 
 def test_flat_fitness_stays_at_the_start() -> None:
-    """A search that cannot see the data stays, within its Monte-Carlo spread, where the centred box starts it."""
+    """A search that cannot see the data stays, within its Monte-Carlo spread, at the box's centre."""
     finals = []
     for seed in range(60):
         rng = np.random.default_rng(seed)

@@ -9,7 +9,7 @@ from deal_hw.calib.ensemble_kalman import EnsembleKalman
 
 
 def test_tempered_ensemble_samples_the_linear_gaussian_posterior() -> None:
-    """Prior N(0, I), y = A z + noise: mean and covariance are those of the exact posterior, for a large ensemble."""
+    """Prior N(0, I), y = A z + noise: a large ensemble has the exact posterior's mean and covariance."""
     rng = np.random.default_rng(1)
     A = rng.standard_normal((6, 3))
     y = A @ np.array([1.0, -2.0, 0.5]) + rng.standard_normal(6)
@@ -42,7 +42,7 @@ def test_single_step_by_hand() -> None:
 
 
 def test_discrepancy_rule_leaves_the_asked_share() -> None:
-    """With keep = 0.3 the mean of a linear, noise-free problem moves to where about 0.3 of the residual is left."""
+    """With keep = 0.3 about 0.3 of a linear, noise-free problem's mean residual is left."""
     rng = np.random.default_rng(2)
     A = np.linalg.qr(rng.standard_normal((4, 4)))[0]
     kalman = EnsembleKalman(rng.standard_normal((3000, 4)), rng, step_clip=np.inf)
@@ -50,7 +50,8 @@ def test_discrepancy_rule_leaves_the_asked_share() -> None:
     before = np.linalg.norm((target - kalman.ask() @ A.T).mean(axis=0))
     kalman.tell(target - kalman.ask() @ A.T, keep=0.3)
     after = np.linalg.norm((target - kalman.ask() @ A.T).mean(axis=0))
-    # The inflation is the first power of two that keeps at least 0.3, so at most a little less than twice the odds.
+    # The inflation is the first power of two that keeps at least 0.3, so at most a little less than twice the
+    # odds.
     assert 0.28 < after / before < 0.48
     assert not kalman.finished
 

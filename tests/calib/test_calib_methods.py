@@ -40,8 +40,9 @@ def two_parameters() -> tuple[ParameterSpace, np.ndarray[tuple[int], np.dtype[np
 def small_problem() -> Problem:
     """Return the first 1.2 s of a noise-free demonstration, two parameters free, latency given."""
     d = recorded("ideal", 1)
-    samples, steps = int(SECONDS * 200) + 1, int(SECONDS * 1000)
     fit = d.fit
+    samples = int(SECONDS * 200) + 1
+    steps = int(fit.sample[samples - 1])
     short = dataclasses.replace(
         fit,
         sample=fit.sample[:samples],
@@ -152,7 +153,9 @@ def test_every_name_in_the_table_makes_a_method(name: str) -> None:
 def test_unknown_method_lists_the_names() -> None:
     """The error of a mistyped name helps."""
     for call in (check_method, make_method):
-        with pytest.raises(UnknownNameError, match="unknown calibration method 'dael'; known: default, weki, deal"):
+        with pytest.raises(
+            UnknownNameError, match="unknown calibration method 'dael'; known: default, weki, deal"
+        ):
             call("dael")
 
 
@@ -187,13 +190,13 @@ def test_constant_fitness_does_not_find_the_truth() -> None:
 
 
 def test_weki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
-    """Tuning seed 0, profile sensor: mean |ln| within 0.05 where the centre is at 0.6, latency within 1 ms."""
+    """Tuning seed 0, profile sensor: mean |ln| below 0.05 where the centre has 0.6, latency within 1 ms."""
     d = recorded("sensor", 0)
     problem = Problem(d.robot, d.space, [d.fit], threads=1)
     result = Weki().run(problem, Budget(population=60, generations=15), np.random.default_rng(0))
     assert np.mean(np.abs(np.log(result.estimate / d.theta))) < 0.05
     assert abs(result.latency_s - d.truth.latency_s) < 1e-3
-    assert result.chi2 < 2.0
+    assert result.chi2 < 3.0
 
 
 def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:

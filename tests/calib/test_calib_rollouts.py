@@ -1,4 +1,4 @@
-"""The paper's view: rollouts of a population from the recording's start, with its targets or with a policy."""
+"""The paper's view: rollouts from the recording's start, with its targets or with a policy."""
 
 from __future__ import annotations
 
@@ -46,16 +46,22 @@ def test_replay_of_the_truth_follows_the_recording(ideal: Demonstration, problem
     recorded = problem.starts[0].position[ticks.sample]
     assert position.shape == (2, len(ticks) + 1, 2)
     assert velocity.shape == position.shape
-    np.testing.assert_array_equal(action[0], ideal.fit.target[ticks.start[:-1]])
+    np.testing.assert_array_equal(action[0], ideal.fit.target[ticks.start[:-1] + 10])
     assert np.abs(position[0, :50] - recorded[:50]).max() < 1e-4
     assert np.abs(position[1, :50] - recorded[:50]).max() > 1e-2
 
 
 def test_policy_in_the_loop_equals_the_replay(ideal: Demonstration, problem: Problem) -> None:
     """A policy that answers with the recorded targets makes the rollouts of the replay, at any latency."""
+    target = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 1))
+    # Commands of the recording arrive within a tick; those of a policy in the loop at its start.
+    steps = ideal.fit.target.copy()
     ticks = control_ticks(problem, 0, 60)
+    steps[: ticks.start[0]] = ideal.fit.start_setpoint
+    steps[ticks.start[0] : ticks.start[-1]] = np.repeat(target, 20, axis=0)
+    held = dataclasses.replace(ideal.fit, target=steps)
+    problem = Problem(ideal.robot, ideal.space, [held], threads=1)
     population = members(ideal, np.array([0.0, 0.0125]))
-    target = ideal.fit.target[ticks.start[:-1]]
 
     def answer(position: FloatArray, velocity: FloatArray, tick: int) -> FloatArray:
         return np.repeat(target[tick][None], len(position), axis=0)
@@ -119,7 +125,7 @@ def test_negative_latency_is_a_shift_the_other_way(ideal: Demonstration, problem
 
 
 def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Demonstration, problem: Problem) -> None:
-    """Whitened innovations have at most their expected size at the truth and a huge one at the range's centre."""
+    """Whitened innovations have at most their expected size at the truth, a huge one at the centre."""
     truth = Members(ideal.theta[None], np.zeros(1))
     wrong = Members(ideal.space.center[None], np.zeros(1))
     assert explained(problem, truth, 10) < 2.0
@@ -127,11 +133,11 @@ def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Demonstration, p
 
 
 def test_whitening_takes_out_a_wrong_start_state(ideal: Demonstration, problem: Problem) -> None:
-    """What one standard deviation of start velocity does to a window is whitened to about one, not to hundreds."""
+    """What one standard deviation of start velocity does to a window is whitened to about one."""
     data = problem.windows(20)[0]
     truth = Members(ideal.theta[None], np.zeros(1))
     whitening = linearise(problem, truth, data)
-    velocity = data.start_velocity + [0.0, float(problem.starts[0].velocity_std[1])]
+    velocity = data.start_velocity + np.array([0.0, problem.starts[0].velocity_std[1]])
     moved, _ = predict(problem, truth, data, data.start_position, velocity)
     size = np.linalg.norm(whitening.apply(moved - whitening.reference)[0], axis=1)
     raw = np.linalg.norm(((moved[0] - whitening.reference) / data.std).reshape(len(size), -1), axis=1)
@@ -140,7 +146,7 @@ def test_whitening_takes_out_a_wrong_start_state(ideal: Demonstration, problem: 
 
 
 def test_coordinates_map_the_cube_to_ranges_and_back(problem: Problem) -> None:
-    """Corners of the unit cube are the corners of the ranges; the latency reaches past its range by the margin."""
+    """Corners of the unit cube are those of the ranges; the latency reaches past its own by the margin."""
     coordinates = Coordinates(problem)
     assert coordinates.names[-1] == "latency_s"
     corners = coordinates.members(np.stack([np.zeros(10), np.ones(10)]))

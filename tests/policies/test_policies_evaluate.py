@@ -50,6 +50,19 @@ def test_a_fallen_pole_counts_with_what_is_left_to_upright() -> None:
     assert result.angle_error_rad == pytest.approx((0.0 + 0.4 + 0.6 + math.pi) / 4)
 
 
+def test_a_run_that_was_ended_counts_to_its_end() -> None:
+    """0.2 s of 0.1 rad at 1 m/s, then 0.8 s hanging at rest: 0.2 * 0.1 + 0.8 * pi, and 0.2 m/s."""
+    position, velocity = np.tile([0.3, 0.1], (10, 1)), np.tile([1.0, 0.0], (10, 1))
+    result = balance_result(position, velocity, 0.02, duration_s=1.0)
+    assert result.angle_error_rad == pytest.approx(0.2 * 0.1 + 0.8 * math.pi)
+    assert result.cart_speed_m_s == pytest.approx(0.2)
+    assert result.fell
+    assert result.upright_s == pytest.approx(0.2)
+    whole = balance_result(position[:9], velocity[:9], 0.02, duration_s=0.2)
+    assert whole.angle_error_rad == pytest.approx(0.1)
+    assert not whole.fell
+
+
 def test_angles_are_taken_modulo_a_turn() -> None:
     """Upright is upright after any number of turns."""
     np.testing.assert_allclose(

@@ -53,7 +53,7 @@ class TestSac(TrainerSuite):
             make_env=lambda: CartPoleEnv(DESCRIPTION, TOY, 16, task=TASK, sensor=EXACT_SENSOR),
             layout=balance_spec(DESCRIPTION, TASK),
             distribution=TOY,
-            config=SacConfig(steps=10_000, hidden=(32, 32), warmup=500),
+            config=SacConfig(steps=8_000, hidden=(32, 32), warmup=500),
             short_config=SacConfig(steps=800, hidden=(32, 32), warmup=500),
             score=upright_seconds,
             learned=3.5,

@@ -19,7 +19,7 @@ STEPS = 1_200
 
 
 def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(tmp_path: Path) -> None:
-    """The policy lies in the run folder, fits the robot and names the distribution; the record holds all of it."""
+    """The policy lies in the run folder, fits the robot and names the distribution; so does the record."""
     space = k9_space()
     distribution = ParameterDistribution(
         space=space, mean=space.nominal, covariance=0.01 * np.eye(len(space)), latency_s=(0.01, 0.012)

@@ -1,0 +1,111 @@
+"""Wall clock of the searches over the wall clock of the same number of steps in the bare engine.
+
+Both sides run in one process, alternating, with the same number of threads; medians are reported. The paper's
+budget is the default: 50 generations x 200 members x 200 ticks, 4 substeps of 5 ms, a critic of 256-256 with
+20 updates of 1024.
+
+    python tools/measure_calibration_speed.py --out speed.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.methods import make_method
+from deal_hw.calib.problem import Problem
+from deal_hw.calibration import Budget
+from deal_hw.cli.bench_loop import demonstrate
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.sim.batch import bare_steps_per_second
+from deal_hw.sim.model import load_model
+
+PAPER_STEP_S = 0.005
+BARE_STEPS = 4000
+
+
+def machine() -> dict[str, Any]:
+    """Return what the numbers depend on."""
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
+        ]
+        model = names[0] if names else model
+    return {
+        "cpu": model,
+        "cpus_usable": len(os.sched_getaffinity(0)),
+        "load": os.getloadavg(),
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in ("mujoco", "torch", "numpy")},
+    }
+
+
+def measure(method: str, budget: Budget, threads: int, repeats: int, seed: int) -> dict[str, Any]:
+    """Time a search and, before and after each run, the bare engine with the same model and members."""
+    demonstration = demonstrate("ideal", seed, 5.0)
+    paper = method.startswith("deal-paper")
+    robot = load_model(DESCRIPTION, step_s=PAPER_STEP_S if paper else None)
+    rows = []
+    for _ in range(repeats):
+        before = bare_steps_per_second(robot, budget.population, BARE_STEPS, threads)
+        problem = Problem(robot, demonstration.space, [demonstration.fit], threads=threads)
+        start = time.perf_counter()
+        result = make_method(method).run(problem, budget, np.random.default_rng(seed))
+        seconds = time.perf_counter() - start
+        after = bare_steps_per_second(robot, budget.population, BARE_STEPS, threads)
+        bare = result.steps / statistics.mean((before, after))
+        rows.append(
+            {"seconds": seconds, "steps": result.steps, "bare_seconds": bare, "ratio": seconds / bare}
+        )
+        print(
+            f"{method:12s} {seconds:7.1f} s  {result.steps:.2e} steps  bare {bare:6.1f} s  "
+            f"ratio {rows[-1]['ratio']:.2f}"
+        )
+    return {
+        "method": method,
+        "step_s": robot.step_s,
+        "population": budget.population,
+        "generations": budget.generations,
+        "threads": threads,
+        "runs": rows,
+        "seconds": statistics.median(r["seconds"] for r in rows),
+        "ratio": statistics.median(r["ratio"] for r in rows),
+    }
+
+
+def main() -> int:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    parser.add_argument("--methods", default="deal-paper,deal,weki")
+    parser.add_argument("--threads", type=int, default=1, help="of simulation, engine and critic alike")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--generations", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    report: dict[str, Any] = {"machine": machine(), "rows": []}
+    for method in options.methods.split(","):
+        population = 200 if method.startswith("deal-paper") else 100
+        budget = Budget(population=population, generations=options.generations)
+        report["rows"].append(measure(method, budget, options.threads, options.repeats, options.seed))
+    report["machine"]["load_after"] = os.getloadavg()
+    if options.out is not None:
+        options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
