@@ -125,12 +125,11 @@ class Critic:
         for i, block in enumerate(fake):
             mine = np.flatnonzero(owner == i)
             imitation[mine] = block[other[mine] - (ends[i] - len(block))]
-        pairs = zip(
-            data[rows].split(settings.batch), torch.from_numpy(imitation).split(settings.batch), strict=True
-        )
+        shape = (settings.updates, settings.batch, real.shape[1])
+        batches, copies = data[rows].reshape(shape), torch.from_numpy(imitation).reshape(shape)
         gap = 0.0
-        for batch, copy in pairs:
-            gap = self._update(batch, copy)
+        for k in range(settings.updates):
+            gap = self._update(batches[k], copies[k])
         return gap
 
     @torch.no_grad()
@@ -195,10 +194,10 @@ class PenaltyCritic(Critic):
         mix = torch.rand(len(real), 1, generator=self.generator)
         between = (mix * real + (1 - mix) * fake).requires_grad_(True)
         output = self.hidden(torch.cat([real, fake, between]))[2][:, 0]
-        on_real, on_fake, on_between = output.split([len(real), len(fake), len(between)])
-        (slope,) = torch.autograd.grad(on_between.sum(), between, create_graph=True)
+        ends = len(real), len(real) + len(fake)
+        (slope,) = torch.autograd.grad(output[ends[1] :].sum(), between, create_graph=True)
         penalty = ((slope.norm(dim=1) - 1) ** 2).mean()
-        gap = on_real.mean() - on_fake.mean()
-        (-gap + self.settings.penalty * penalty).backward()  # type: ignore[no-untyped-call]
+        gap = output[: ends[0]].mean() - output[ends[0] : ends[1]].mean()
+        (-gap + self.settings.penalty * penalty).backward()
         self.optimiser.step()
         return float(gap.detach())

@@ -46,6 +46,7 @@ class DealSettings:
         clean_ticks: Window lengths in control periods of the stages where positions carry no noise.
         noisy_ticks: The same where they do; a long window of a far simulator says nothing.
         widen: Least spread of a coordinate at the start of each further stage, in logits.
+        least_spread: Spread in logits below which members cannot be told apart and the search ends.
         keep: Share of the statistics' residual that one step leaves (noise-free recordings).
         step_clip: Largest step of a coordinate, in logits.
         noise_draws: Draws of the noise from which its effect on the statistics is estimated (noisy
@@ -59,6 +60,7 @@ class DealSettings:
     clean_ticks: tuple[int, ...] = (10,)
     noisy_ticks: tuple[int, ...] = (5, 20)
     widen: float = 0.5
+    least_spread: float = 1e-4
     keep: float = 0.25
     step_clip: float = 2.0
     noise_draws: int = 100
@@ -101,8 +103,9 @@ class Deal(CalibrationMethod[Problem]):
                     kalman.widen(settings.widen)
                 view: _View = (_NoisyView if noisy else _CleanView)(problem, settings, ticks, rng, stage > 0)
                 end = most * (stage + 1) // len(lengths)
-                while len(run.trace) < end and not kalman.finished:
-                    self._generation(run, coordinates, kalman, view, noisy=noisy)
+                spread = np.inf
+                while len(run.trace) < end and not kalman.finished and spread > settings.least_spread:
+                    spread = self._generation(run, coordinates, kalman, view, noisy=noisy)
         z = kalman.ask()
         centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
         return run.result(
@@ -119,7 +122,7 @@ class Deal(CalibrationMethod[Problem]):
 
     def _generation(
         self, run: Run, coordinates: Coordinates, kalman: EnsembleKalman, view: _View, *, noisy: bool
-    ) -> None:
+    ) -> float:
         z = kalman.ask()
         members = coordinates.members(logistic(z))
         centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
@@ -132,6 +135,7 @@ class Deal(CalibrationMethod[Problem]):
             members.theta,
             {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
         )
+        return step.spread
 
 
 class _View(abc.ABC):

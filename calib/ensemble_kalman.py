@@ -71,7 +71,8 @@ class EnsembleKalman:
         # Rows of `left` span members, rows of `right` span observations.
         centred = (residual.mean(axis=0) - residual) / np.sqrt(N - 1)
         left, scale, right = np.linalg.svd(centred, full_matrices=False)
-        rank = scale > 1e-10 * scale[0] if scale[0] > 0 else np.zeros(len(scale), dtype=bool)
+        # Members that predict alike leave no rank, and nothing moves.
+        rank = scale > 1e-10 * max(float(scale.max(initial=0.0)), 1e-300)
         left, scale, right = left[:, rank], scale[rank], right[rank]
         if keep is None:
             inflation = 1.0 / self._misfit_step(misfit, M)
@@ -87,7 +88,7 @@ class EnsembleKalman:
         step = projected @ gain
         self._members += np.clip(step, -self._clip, self._clip)
         return KalmanStep(
-            inflation, float(2 * misfit.mean() / M), float(self._members.std(axis=0, ddof=1).mean())
+            inflation, float(2 * misfit.mean() / max(M, 1)), float(self._members.std(axis=0, ddof=1).mean())
         )
 
     def widen(self, spread: float) -> None:

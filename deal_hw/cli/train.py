@@ -116,14 +116,15 @@ def train_policy(
     from deal_hw.drivers import robot_description
     from deal_hw.policies.cartpole_env import MEMBERS, CartPoleEnv
     from deal_hw.policies.onnx_export import export_network
-    from deal_hw.policies.sac import SacConfig, SacTrainer
+    from deal_hw.policies.sac import SacConfig
+    from deal_hw.policies.trainers import make_trainer
 
     if robot not in ROBOTS:
         raise UnknownNameError("robot with a training environment", robot, ROBOTS)
     config = SacConfig() if steps is None else dataclasses.replace(SacConfig(), steps=steps)
     env = CartPoleEnv(robot_description(robot), distribution, members or MEMBERS, sensor=sensor)
     started, cpu = time.monotonic(), time.process_time()
-    policy = SacTrainer().train(env, config, np.random.default_rng(seed), progress)
+    policy = make_trainer("sac").train(env, config, np.random.default_rng(seed), progress)
     record = {
         "format": "deal_hw.training/1",
         "robot": robot,

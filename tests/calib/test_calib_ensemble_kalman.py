@@ -89,3 +89,12 @@ def test_widening_keeps_the_mean_and_restarts_the_tempering() -> None:
     np.testing.assert_allclose(kalman.ask().mean(axis=0), start.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(kalman.ask().std(axis=0, ddof=1), [0.5, start[:, 1].std(ddof=1)])
     assert not kalman.finished
+
+
+def test_members_that_predict_alike_stay() -> None:
+    """Without differences there is nothing to regress on, and nothing divides by zero."""
+    start = np.random.default_rng(6).standard_normal((10, 2))
+    for width in (0, 3):
+        kalman = EnsembleKalman(start, np.random.default_rng(0))
+        kalman.tell(np.ones((10, width)), keep=0.3)
+        np.testing.assert_array_equal(kalman.ask(), start)
