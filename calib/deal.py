@@ -27,7 +27,7 @@ import numpy.typing as npt
 from deal_hw.calib.coordinates import Coordinates, Members, logistic, logit
 from deal_hw.calib.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
 from deal_hw.calib.ensemble_kalman import EnsembleKalman
-from deal_hw.calib.innovations import explained, is_noisy, linearise, predict, samples_per_tick
+from deal_hw.calib.innovations import cut, explained, is_noisy, linearise, predict, samples_per_tick
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem, WindowData
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
@@ -161,7 +161,7 @@ class _View(abc.ABC):
         self._move_starts = move_starts
         self._offsets: dict[int, FloatArray] = {}
         self._every = samples_per_tick(problem)
-        self._windows = problem.windows(ticks * self._every)
+        self._windows = cut(problem, ticks)
         context = np.concatenate([self._make_context(data) for data in self._windows])
         spread = np.maximum(context.std(axis=0), 1e-9)
         self._context = np.asarray((context - context.mean(axis=0)) / spread, dtype=np.float32)

@@ -48,7 +48,10 @@ class PaperSettings:
         normalise: Whether the search moves in the normalised range (section 3.2); off is the ablation
             DEAL\PN, which moves in raw SI units.
         constant_fitness: Score every member 0: a search that cannot see the data.
-        replay_generations: How many generations D_S holds. Algorithm 1 stores every rollout and forgets none.
+        replay_generations: How many generations' rollouts D_S holds, None for all. Algorithm 1 stores
+            rollouts and does not say whether it forgets; a critic that is still trained against populations
+            of long ago pushes the present one along with them (measured: no better than the centre), so the
+            default forgets.
         ticks: Most transitions of a rollout (Table 4: 200).
         torch_threads: Threads of the critic's arithmetic.
     """
@@ -57,7 +60,7 @@ class PaperSettings:
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     normalise: bool = True
     constant_fitness: bool = False
-    replay_generations: int | None = None
+    replay_generations: int | None = 1
     ticks: int = 200
     torch_threads: int = 1
 

@@ -3,10 +3,10 @@
 Knows no simulator: it is asked for a population and told the fitness of each member. Equation numbers are
 those of the DEAL paper, and the symbols are its symbols: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
 
-The coordinates are a box that is centred on zero, [-1, 1]. The paper says "normalised within the search
-range" and not which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner
-without any data (a flat fitness drifts to 0.37-0.45 of the range), in the centred box they pull towards the
-centre, where the search starts.
+The coordinates are a box that is centred on zero. The paper says "normalised within the search range" and not
+which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any data
+(a flat fitness drifts to 0.37-0.45 of the range), in a centred box they pull towards the centre, where the search
+starts.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class DiffusionSettings:
     schedule: Schedule = "cosine"
     eta: float = 1.0
     divide_distance: bool = True
-    temperature: float | None = 1.0
+    temperature: float | None = 0.3
     adapt_noise: bool = True
     influence: float = 1.0
 
@@ -96,7 +96,7 @@ class DiffusionStep:
 
 
 class DiffusionEvolution:
-    """A population (N, K) in the box [-1, 1].
+    """A population (N, K) in a box that is centred on zero; a uniform start of unit variance fits eq. 12 best.
 
     Args:
         population: The start theta^T, (N, K); the paper draws it uniformly from the search range.

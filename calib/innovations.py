@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.coordinates import Members
-from deal_hw.calib.problem import NOISE_FREE_STD, Problem, WindowData
+from deal_hw.calib.problem import NOISE_FREE_STD, SMOOTHING_S, Problem, WindowData
 from deal_hw.sim.windows import predict_windows, setpoints
 from deal_hw.types import FloatArray
 
@@ -30,6 +30,19 @@ def samples_per_tick(problem: Problem) -> int:
     """Return how many state samples one control period has."""
     description = problem.robot.description
     return max(round(description.state_rate_hz / description.control_rate_hz), 1)
+
+
+def cut(problem: Problem, ticks: int) -> list[WindowData]:
+    """Cut the recordings into windows of so many control periods.
+
+    Noisy recordings are used from half a smoothing width on: before that the smoother sees one side only, and
+    a start state that is off by more than it admits costs more than the window tells.
+    """
+    per_tick = samples_per_tick(problem)
+    if not is_noisy(problem):
+        return problem.windows(ticks * per_tick)
+    margin = round(0.5 * SMOOTHING_S * problem.robot.description.state_rate_hz)
+    return problem.windows(ticks * per_tick, offset=margin)
 
 
 def predict(
@@ -188,6 +201,6 @@ def explained(problem: Problem, centre: Members, ticks: int) -> float:
         centre: One member.
         ticks: Window length in control periods.
     """
-    windows = problem.windows(ticks * samples_per_tick(problem))
+    windows = cut(problem, ticks)
     chi2 = float(np.mean(whitened_residual(problem, centre, centre, windows) ** 2))
     return chi2 if np.isfinite(chi2) else float("inf")

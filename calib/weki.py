@@ -13,7 +13,7 @@ import numpy as np
 
 from deal_hw.calib.coordinates import Coordinates, logistic, logit
 from deal_hw.calib.ensemble_kalman import EnsembleKalman
-from deal_hw.calib.innovations import explained, is_noisy, samples_per_tick, whitened_residual
+from deal_hw.calib.innovations import cut, explained, is_noisy, whitened_residual
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
@@ -96,13 +96,12 @@ class Weki(CalibrationMethod[Problem]):
         self, run: Run, coordinates: Coordinates, rng: np.random.Generator
     ) -> tuple[float, FloatArray]:
         problem, budget, settings = run.problem, run.budget, self.settings
-        tick = samples_per_tick(problem)
         kalman = EnsembleKalman(
             logit(coordinates.sample(rng, budget.population)), rng, step_clip=settings.step_clip
         )
         lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
         for stage, ticks in enumerate(lengths):
-            windows = problem.windows(ticks * tick)
+            windows = cut(problem, ticks)
             offsets: list[FloatArray] | None = None
             if stage:
                 kalman.widen(settings.widen)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.innovations import explained, samples_per_tick, whitened_residual
+from deal_hw.calib.innovations import cut, explained, whitened_residual
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
@@ -104,7 +104,7 @@ class RandomSearch(CalibrationMethod[Problem]):
         """Use the budget's population times generations as draws."""
         run = Run(self.name, problem, budget, progress)
         coordinates = Coordinates(problem)
-        windows = problem.windows(self.settings.ticks * samples_per_tick(problem))
+        windows = cut(problem, self.settings.ticks)
         middle = coordinates.members(np.full((1, coordinates.count), 0.5))
         kept: list[FloatArray] = []
         scores: list[FloatArray] = []

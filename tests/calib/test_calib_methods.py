@@ -97,7 +97,7 @@ class TestDealPaper(MethodSuite):
     @classmethod
     def case(cls) -> MethodCase:
         """Return the method under test."""
-        return case_of("deal-paper", Budget(population=40, generations=15), 0.4)
+        return case_of("deal-paper", Budget(population=60, generations=15), 0.4)
 
 
 class TestDealPaperFlat(MethodSuite):
@@ -203,7 +203,7 @@ def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
     """Tuning seed 0, profile sensor: mean |ln| within 0.2 where the centre is at 0.6, latency within 3 ms."""
     d = recorded("sensor", 0)
     problem = Problem(d.robot, d.space, [d.fit], threads=1)
-    result = Deal().run(problem, Budget(population=60, generations=14), np.random.default_rng(0))
+    result = Deal().run(problem, Budget(population=60, generations=20), np.random.default_rng(0))
     assert np.mean(np.abs(np.log(result.estimate / d.theta))) < 0.2
     assert abs(result.latency_s - d.truth.latency_s) < 3e-3
 
