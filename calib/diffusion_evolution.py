@@ -4,9 +4,9 @@ Knows no simulator: it is asked for a population and told the fitness of each me
 those of the DEAL paper, and the symbols are its symbols: theta (N, K), alpha_t, sigma_t, delta, omega, p, Z.
 
 The coordinates are a box that is centred on zero. The paper says "normalised within the search range" and not
-which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any data
-(a flat fitness drifts to 0.37-0.45 of the range), in a centred box they pull towards the centre, where the search
-starts.
+which box; in [0, 1] the factors sqrt(alpha) pull the whole population towards the lower corner without any
+data (a flat fitness drifts to 0.37-0.45 of the range), in a centred box they pull towards the centre, where
+the search starts.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class DiffusionStep:
 
 
 class DiffusionEvolution:
-    """A population (N, K) in a box that is centred on zero; a uniform start of unit variance fits eq. 12 best.
+    """A population (N, K) in a box around zero; a uniform start of unit variance fits eq. 12 best.
 
     Args:
         population: The start theta^T, (N, K); the paper draws it uniformly from the search range.

@@ -1,0 +1,128 @@
+"""Parameter spaces and distributions: the unit cube, known values, ranges, JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
+
+
+def parameter(name: str, low: float = 0.1, high: float = 10.0, **changes: object) -> Parameter:
+    """Return a parameter with nominal 1."""
+    values: dict[str, object] = {
+        "name": name, "kind": "body_mass", "elements": ("cart",), "unit": "kg", "nominal": 1.0, "low": low,
+        "high": high,
+    }  # fmt: skip
+    return Parameter(**{**values, **changes})  # type: ignore[arg-type]
+
+
+SPACE = ParameterSpace(
+    [
+        parameter("mass"),
+        parameter("offset", -1.0, 3.0, scale="linear"),
+        parameter("weighed", known=True),
+    ]
+)
+
+
+def test_cube_by_hand() -> None:
+    """Log range 0.1 to 10: 1 is the middle, 10^0.5 three quarters; linear range -1 to 3: 0 is a quarter."""
+    np.testing.assert_allclose(SPACE.normalize(np.array([10**0.5, 0.0])), [0.75, 0.25])
+    np.testing.assert_allclose(SPACE.unnormalize(np.array([0.5, 0.5])), [1.0, 1.0])
+    np.testing.assert_allclose(SPACE.width, [np.log(100.0), 4.0])
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=2))
+def test_cube_there_and_back(unit: list[float]) -> None:
+    """Normalising undoes unnormalising, and what comes out of the cube lies in the range."""
+    theta = SPACE.unnormalize(np.array(unit))
+    np.testing.assert_allclose(SPACE.normalize(theta), unit, atol=1e-12)
+    assert np.all(theta >= SPACE.low * (1 - 1e-12) - 1e-12) and np.all(theta <= SPACE.high * (1 + 1e-12))
+
+
+def test_known_parameters_are_not_searched() -> None:
+    """Known values are kept beside the free ones, and measuring one takes it out of the search."""
+    assert SPACE.names == ("mass", "offset") and SPACE.known == {"weighed": 1.0}
+    assert SPACE.with_known({"mass": 20.0}).known == {"mass": 20.0, "weighed": 1.0}
+    assert SPACE.with_free(["weighed"]).names == ("weighed",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"low": 2.0, "high": 2.0}, "low < high"),
+        ({"low": 3.0, "high": 2.0}, "low < high"),
+        ({"low": float("nan")}, "low < high"),
+        ({"low": -1.0}, "log scale needs a positive range"),
+        ({"nominal": 50.0}, "lies outside"),
+    ],
+)
+def test_useless_ranges_are_refused(changes: dict[str, float], words: str) -> None:
+    """The error names the parameter and what is wrong with its range."""
+    with pytest.raises(ConfigurationError, match=words):
+        parameter("mass", **changes)
+
+
+def test_unknown_names_list_the_names() -> None:
+    """Every way to name a parameter answers a wrong name with the right ones."""
+    for use in (
+        lambda: SPACE["weight"],
+        lambda: SPACE.with_free(["weight"]),
+        lambda: SPACE.with_known({"weight": 1.0}),
+        lambda: SPACE.with_range("weight", 1.0, 2.0),
+    ):
+        with pytest.raises(UnknownNameError, match=r"weight.*mass, offset, weighed"):
+            use()
+
+
+def test_json_there_and_back() -> None:
+    """A space and a distribution come back from their JSON text with the same digest."""
+    known = ParameterDistribution(
+        space=SPACE, mean=np.array([2.0, 0.5]), covariance=np.diag([0.01, 0.04]), latency_s=(0.01, 0.02)
+    )
+    again = ParameterDistribution.from_json(json.loads(json.dumps(known.to_json())))
+    assert again.digest() == known.digest()
+    assert ParameterSpace.from_json(json.loads(json.dumps(SPACE.to_json()))).names == SPACE.names
+    with pytest.raises(ConfigurationError, match="not a parameter distribution"):
+        ParameterDistribution.from_json({"format": "something else"})
+
+
+def test_distributions_draw_what_they_say() -> None:
+    """A Gaussian in log space has the stated spread; uniform fills the range; a point is a point."""
+    rng = np.random.default_rng(0)
+    gauss = ParameterDistribution(
+        space=SPACE, mean=np.array([1.0, 0.0]), covariance=np.diag([0.04, 0.01]), latency_s=(0.0, 0.02)
+    )
+    draws = gauss.sample(rng, 20_000)
+    assert np.std(np.log(draws[:, 0])) == pytest.approx(0.2, rel=0.03)
+    assert np.std(draws[:, 1]) == pytest.approx(0.1, rel=0.03)
+    flat = ParameterDistribution.uniform(SPACE, (0.0, 0.02)).sample(rng, 20_000)
+    np.testing.assert_allclose(SPACE.normalize(flat).mean(axis=0), 0.5, atol=0.01)
+    point = ParameterDistribution.point(SPACE, np.array([3.0, 1.5]), 0.01)
+    np.testing.assert_allclose(point.sample(rng, 3), [[3.0, 1.5]] * 3)
+    np.testing.assert_array_equal(point.sample_latency(rng, 2), [0.01, 0.01])
+    assert gauss.sample_latency(rng, 1000).max() <= 0.02
+
+
+def test_result_there_and_back() -> None:
+    """A result comes back from its JSON text; intervals make a distribution where no covariance is."""
+    result = CalibrationResult(
+        method="weki", space=SPACE, estimate=np.array([2.0, 0.5]),
+        interval=np.array([[1.8, 2.2], [0.4, 0.6]]), verdicts=("identifiable", "weak"), latency_s=0.012,
+        latency_interval_s=(0.0115, 0.0125), alarms=("x",), heldout_nrmse={"nominal": 0.3},
+    )  # fmt: skip
+    again = CalibrationResult.from_json(json.loads(json.dumps(result.to_json())))
+    np.testing.assert_array_equal(again.interval, result.interval)
+    assert again.verdicts == result.verdicts and again.alarms == ("x",) and again.latency_s == 0.012
+    covariance = again.distribution().covariance
+    assert covariance is not None
+    # The linear one: (0.6 - 0.4) / 2 / 1.645 = 0.0608.
+    assert np.sqrt(covariance[1, 1]) == pytest.approx(0.0608, abs=1e-4)
