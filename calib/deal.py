@@ -56,7 +56,7 @@ class DealSettings:
     """
 
     critic: CriticSettings = field(default_factory=lambda: _CRITIC)
-    generations: int = 40
+    generations: int = 50
     clean_ticks: tuple[int, ...] = (10,)
     noisy_ticks: tuple[int, ...] = (5, 20)
     widen: float = 0.5
@@ -102,7 +102,8 @@ class Deal(CalibrationMethod[Problem]):
                 if stage:
                     kalman.widen(settings.widen)
                 view: _View = (_NoisyView if noisy else _CleanView)(problem, settings, ticks, rng, stage > 0)
-                end = most * (stage + 1) // len(lengths)
+                # Earlier stages bring the population near; a third of the budget is kept for the last.
+                end = most if stage == len(lengths) - 1 else 2 * most // 3
                 spread = np.inf
                 while len(run.trace) < end and not kalman.finished and spread > settings.least_spread:
                     spread = self._generation(run, coordinates, kalman, view, noisy=noisy)

@@ -17,6 +17,9 @@ from deal_hw.types import FloatArray
 
 RESTARTS = 2
 SAME_CHI2 = 0.2
+FEWEST_GENERATIONS = 15
+"""With fewer generations left in the budget another search would not get anywhere."""
+
 SCAN_TICKS = 2
 SCAN_ITERATIONS = 6
 SCAN_MOST = 15
@@ -117,9 +120,10 @@ class PolishedMethod(CalibrationMethod[Problem]):
         self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None
     ) -> tuple[CalibrationResult, Polished, int]:
         best: tuple[CalibrationResult, Polished] | None = None
-        attempt = 0
+        attempt, left = 0, budget.generations
         for attempt in range(1 + RESTARTS):  # noqa: B007
-            searched = self.search.run(problem, budget, rng, progress)
+            searched = self.search.run(problem, dataclasses.replace(budget, generations=left), rng, progress)
+            left -= len(searched.trace)
             polished = polish_from(problem, searched, progress)
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or _better(polished, best[1]):
@@ -127,7 +131,7 @@ class PolishedMethod(CalibrationMethod[Problem]):
             # Two searches that end at the same unexplained residual say that the model is wrong, not the
             # search.
             same = abs(polished.chi2 - previous) < SAME_CHI2 * previous
-            if best[1].chi2 < MISMATCH_CHI2 or same:
+            if best[1].chi2 < MISMATCH_CHI2 or same or left < FEWEST_GENERATIONS:
                 break
         if best is None:
             raise RuntimeError("unreachable: at least one search is run")

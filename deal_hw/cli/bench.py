@@ -151,7 +151,9 @@ def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         "versions": versions(),
         "git_commit": git_commit(),
     }
-    write_json(path, {"format": FORMAT, "machine": machine, "argv": sys.argv, "rows": list(rows)})
+    write_json(
+        path, {"format": FORMAT, "machine": machine, "argv": ["deal-hw", *sys.argv[1:]], "rows": list(rows)}
+    )
     names = sorted({k for row in rows for k, v in row.items() if not isinstance(v, dict | list)})
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore")
@@ -182,6 +184,7 @@ def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         values = [row[f"angle_error_{name}"] for name in ("udr", "retrained", "oracle")]
         right.plot(range(3), values, "o-", alpha=0.5, color="C0", linewidth=0.8)
     right.set_xticks(range(3), ["UDR", "retrained", "oracle"])
+    right.set_yscale("log")
     right.set_title("pole-angle error [rad]" if trained else "no policies trained", fontsize=10)
     figure.savefig(path, dpi=130)
 
