@@ -49,6 +49,7 @@ class DealSettings:
         least_spread: Spread in logits below which members cannot be told apart and the search ends.
         keep: Share of the statistics' residual that one step leaves (noise-free recordings).
         step_clip: Largest step of a coordinate, in logits.
+        alarm_chi2: A noisy recording's residual above this is not explained, and the result says so.
         noise_draws: Draws of the noise from which its effect on the statistics is estimated (noisy
             recordings).
         smooth_draws: How many of these a member's statistics are averaged over.
@@ -63,6 +64,7 @@ class DealSettings:
     least_spread: float = 1e-4
     keep: float = 0.25
     step_clip: float = 2.0
+    alarm_chi2: float = 3.0
     noise_draws: int = 100
     smooth_draws: int = 4
     torch_threads: int = 1
@@ -109,12 +111,21 @@ class Deal(CalibrationMethod[Problem]):
                     spread = self._generation(run, coordinates, kalman, view, noisy=noisy)
         z = kalman.ask()
         centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
+        chi2 = explained(problem, centre, lengths[-1])
+        alarms = []
+        # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
+        if noisy and not chi2 <= settings.alarm_chi2:
+            alarms.append(
+                f"the search left a residual of {chi2:.1f} times its expected variance after "
+                f"{len(run.trace)} generations; polish it, search again with another seed, or use weki"
+            )
         return run.result(
             coordinates,
             centre,
             coordinates.members(logistic(z)),
             settings=settings,
-            chi2=explained(problem, centre, lengths[-1]),
+            chi2=chi2,
+            alarms=alarms,
             extra={
                 "interval": "ensemble spread, uncalibrated",
                 "view": "control periods" if noisy else "windows",
