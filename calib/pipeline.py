@@ -21,7 +21,10 @@ FEWEST_GENERATIONS = 15
 """With fewer generations left in the budget another search would not get anywhere."""
 
 SCAN_TICKS = 2
-SCAN_ITERATIONS = 6
+SCAN_ITERATIONS = 10
+SCAN_WORSE = 9.0
+"""Whole ticks that all cost this much more than the free latency did not converge: the free one is kept."""
+
 SCAN_MOST = 15
 
 
@@ -75,10 +78,11 @@ class PolishedMethod(CalibrationMethod[Problem]):
         check_excitation(problem)
         searched, polished, restarts = self._until_explained(problem, budget, rng, progress)
         scan = None if problem.fixed_latency_s is not None else scan_latency(problem, polished, progress)
-        if scan is not None:
+        whole = scan is not None and scan.polished[scan.best].normal.cost < polished.normal.cost + SCAN_WORSE
+        if scan is not None and whole:
             polished = scan.polished[scan.best]
-        known = _uncertainty(problem, polished)
-        if scan is not None:
+        known = _uncertainty(problem, polished, fixed_latency=whole or scan is None)
+        if scan is not None and whole:
             known = _average(problem, scan, known)
         provenance = dict(searched.provenance) | {
             "search": searched.method,
@@ -200,7 +204,7 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
     return LatencyScan(ticks, tuple(found[t] for t in ticks))
 
 
-def _uncertainty(problem: Problem, polished: Polished) -> Uncertainty:
+def _uncertainty(problem: Problem, polished: Polished, fixed_latency: bool) -> Uncertainty:
     return uncertainty(
         problem.space,
         polished.theta,
@@ -209,7 +213,7 @@ def _uncertainty(problem: Problem, polished: Polished) -> Uncertainty:
         polished.chi2,
         polished.normal.residual,
         problem.latency_range_s,
-        fixed_latency=True,
+        fixed_latency=fixed_latency,
         timing_std_s=problem.noise.timing_std_s,
     )
 
