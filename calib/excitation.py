@@ -17,9 +17,7 @@ def check_excitation(problem: Problem) -> None:
     Raises:
         InsufficientDataError: They do not; the message says what was found and what to record.
     """
-    seconds = sum(
-        float(np.sum(e.usable)) * float(np.median(np.diff(e.sample))) * e.step_s for e in problem.episodes
-    )
+    seconds = sum(float(np.sum(e.usable)) * e.period_s for e in problem.episodes)
     advice = "record again with `deal-hw collect --profile rich` (4 s are enough)"
     if seconds < SHORTEST_S:
         raise InsufficientDataError(

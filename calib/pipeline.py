@@ -90,7 +90,7 @@ class PolishedMethod(CalibrationMethod[Problem]):
             "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
             "search_latency_s": searched.latency_s,
             "restarts": restarts,
-            "window_s": polished.shooting.length * _period(problem),
+            "window_s": polished.shooting.length * problem.episodes[0].period_s,
             "noise_std": problem.noise.position_std.tolist(),
             "timing_std_s": problem.noise.timing_std_s,
             "inflation": known.inflation,
@@ -149,11 +149,6 @@ def _better(a: Polished, b: Polished) -> bool:
     return a.chi2 < b.chi2
 
 
-def _period(problem: Problem) -> float:
-    episode = problem.episodes[0]
-    return float(np.median(np.diff(episode.sample))) * episode.step_s
-
-
 def polish_from(problem: Problem, searched: CalibrationResult, progress: ProgressCallback | None) -> Polished:
     """Polish a search's estimate."""
     fixed = problem.fixed_latency_s is not None
@@ -175,7 +170,7 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
     tick = problem.episodes[0].step_s
     centre = round(polished.latency_s / tick)
     low, high = (round(v / tick) for v in problem.latency_range_s)
-    length_s = polished.shooting.length * _period(problem)
+    length_s = polished.shooting.length * problem.episodes[0].period_s
     states = polished.shooting.states(polished.point)
     found: dict[int, Polished] = {}
     waiting = [t for t in range(centre - SCAN_TICKS, centre + SCAN_TICKS + 1) if low <= t <= high]

@@ -214,7 +214,7 @@ def smooth_states(episode: Episode, noise_std: FloatArray) -> StartStates:
         return StartStates(
             episode.position, episode.velocity, np.maximum(noise_std, 1e-7), np.full_like(noise_std, 1e-4)
         )
-    period = float(np.median(np.diff(episode.sample))) * episode.step_s
+    period = episode.period_s
     length = max(2 * round(SMOOTHING_S / period / 2) + 1, SMOOTHING_ORDER + 2)
     half = length // 2
     T = len(episode.sample)

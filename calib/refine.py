@@ -52,9 +52,7 @@ class Polished:
 
 def samples_in(problem: Problem, seconds: float) -> int:
     """Return how many samples a time holds, at least 4 and at most the longest usable episode."""
-    episode = problem.episodes[0]
-    period = float(np.median(np.diff(episode.sample))) * episode.step_s
-    return max(round(seconds / period), 4)
+    return max(round(seconds / problem.episodes[0].period_s), 4)
 
 
 def polish(

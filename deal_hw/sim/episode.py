@@ -55,6 +55,16 @@ class Episode:
         """Periods S on the grid."""
         return int(self.target.shape[0])
 
+    @property
+    def stride(self) -> int:
+        """Device periods from one sample to the next, lost ones aside."""
+        return int(np.median(np.diff(self.sample)))
+
+    @property
+    def period_s(self) -> float:
+        """Time from one sample to the next [s]."""
+        return self.stride * self.step_s
+
 
 def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
     """Put a recording on the device's time grid.
@@ -127,7 +137,7 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
         episode: The episode.
         longest_s: Longest gap that is bridged [s].
     """
-    stride = int(np.median(np.diff(episode.sample)))
+    stride = episode.stride
     if not np.any(np.diff(episode.sample) > stride):
         return episode
     regular = np.arange(episode.sample[0], episode.sample[-1] + 1, stride)

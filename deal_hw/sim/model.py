@@ -27,7 +27,6 @@ class RobotModel:
         qpos: Index into qpos of each joint, (J,).
         qvel: Index into qvel of each joint, (J,).
         actuator: Index of each actuated joint's actuator, (A,).
-        speed_limit: Index of the space's speed-limit parameters is found by name; see :class:`ServoBatch`.
     """
 
     description: RobotDescription

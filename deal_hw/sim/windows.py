@@ -56,7 +56,7 @@ def cut_windows(episode: Episode, length: int, hop: int | None = None, first: in
     Raises:
         InsufficientDataError: There is none.
     """
-    stride = int(np.median(np.diff(episode.sample)))
+    stride = episode.stride
     sent = np.concatenate([episode.stiffness, episode.damping, episode.effort_limit], axis=1)
     changed = np.concatenate([[0], np.cumsum(np.any(sent[1:] != sent[:-1], axis=1))])
     last_step = len(changed) - 1

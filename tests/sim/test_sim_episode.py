@@ -16,6 +16,7 @@ from deal_hw.sim.batch import ServoBatch
 from deal_hw.sim.episode import align
 from deal_hw.sim.model import load_model
 from deal_hw.sim.windows import cut_windows, predict_windows, setpoints
+from deal_hw.types import Trajectory
 
 SEGMENT = Segment(start=0.5, stop=1.0, effort_limit=0.4, speed_limit=2.0)
 
@@ -26,6 +27,22 @@ def recorded() -> VirtualEpisode:
     truth = nominal_truth("ideal", 3, actuation_ticks=7, sensing_ticks=4)
     config = RichConfig(duration_s=2.0, balance_s=0.0, segments=(SEGMENT,))
     return VirtualCartpole(truth).run(RichBehaviour(DESCRIPTION, None, config, 5), 2.0)
+
+
+def without(t: Trajectory, first: int, stop: int) -> Trajectory:
+    """Return the recording without the state samples from ``first`` up to ``stop``."""
+    keep = np.r_[0:first, stop : len(t.device_s)]
+    fields = (
+        "receive_s",
+        "device_s",
+        "position",
+        "velocity",
+        "effort",
+        "status",
+        "command_sequence",
+        "command_age_s",
+    )
+    return dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
 
 
 def test_simulation_explains_the_recording_to_the_wire_resolution(recorded: VirtualEpisode) -> None:
@@ -60,18 +77,7 @@ def test_windows_keep_clear_of_changes_of_what_is_sent(recorded: VirtualEpisode)
 def test_windows_leave_gaps_out(recorded: VirtualEpisode) -> None:
     """Ten lost frames end one window and another starts after them."""
     t = recorded.trajectory
-    keep = np.r_[0:100, 110 : len(t.device_s)]
-    fields = (
-        "receive_s",
-        "device_s",
-        "position",
-        "velocity",
-        "effort",
-        "status",
-        "command_sequence",
-        "command_age_s",
-    )
-    torn = dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
+    torn = without(t, 100, 110)
     episode = align(torn, DESCRIPTION)
     windows = cut_windows(episode, 10)
     spans = episode.sample[windows.start + 10] - episode.sample[windows.start]
@@ -97,18 +103,7 @@ def test_episode_shorter_than_one_window_is_refused(recorded: VirtualEpisode) ->
 def test_command_inside_a_gap_is_placed_by_the_clocks(recorded: VirtualEpisode) -> None:
     """With 12 frames lost, three commands are never reported; each is placed where it acted."""
     t = recorded.trajectory
-    keep = np.r_[0:100, 112 : len(t.device_s)]
-    fields = (
-        "receive_s",
-        "device_s",
-        "position",
-        "velocity",
-        "effort",
-        "status",
-        "command_sequence",
-        "command_age_s",
-    )
-    torn = dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
+    torn = without(t, 100, 112)
     whole, mended = align(t, DESCRIPTION), align(torn, DESCRIPTION)
     # Three commands, each at most one period from where it was.
     assert np.count_nonzero(whole.target != mended.target) <= 3
