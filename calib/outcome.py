@@ -38,6 +38,7 @@ class Run:
         self._progress = progress
         self._steps = problem.steps
         self._start = time.perf_counter()
+        self._earlier_steps, self._earlier_seconds = 0, 0.0
 
     def note(self, message: str, population: FloatArray, values: Mapping[str, float]) -> None:
         """Write one generation into the trace and call the callback, which may raise to stop the run."""
@@ -45,6 +46,26 @@ class Run:
         if self._progress is not None:
             total = max(self.budget.generations, len(self.trace))
             self._progress(Progress("search", len(self.trace), total, message, population))
+
+    @property
+    def steps(self) -> int:
+        """Physics steps simulated so far, before a resume too."""
+        return self._earlier_steps + self.problem.steps - self._steps
+
+    @property
+    def seconds(self) -> float:
+        """Wall clock so far, before a resume too [s]."""
+        return self._earlier_seconds + time.perf_counter() - self._start
+
+    def save(self) -> dict[str, Any]:
+        """Return the state of the book-keeping as plain values."""
+        return {"trace": self.trace, "steps": self.steps, "seconds": self.seconds}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state."""
+        self.trace[:] = state["trace"]
+        self._earlier_steps, self._earlier_seconds = state["steps"], state["seconds"]
+        self._steps, self._start = self.problem.steps, time.perf_counter()
 
     def result(
         self,
@@ -98,7 +119,7 @@ class Run:
             chi2=chi2,
             alarms=tuple(alarms),
             trace=tuple(self.trace),
-            steps=self.problem.steps - self._steps,
-            seconds=time.perf_counter() - self._start,
+            steps=self.steps,
+            seconds=self.seconds,
             provenance={"settings": asdict(settings), "budget": asdict(self.budget), **(extra or {})},
         )

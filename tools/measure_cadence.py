@@ -4,6 +4,11 @@
 
 The whole path is measured: supervisor, control process, recorder, serial line (a pty). With --port the robot
 or emulator on that port is used instead of one of our own.
+
+Beside it runs a witness on each processor: a thread of the highest real-time priority that does nothing but
+sleep for a millisecond and look at the clock. Where it wakes late, too, no program could have been on time:
+the machine itself stood still (a virtual machine that the host took off its processor). Each overrun beyond a
+period is listed with the witness's account.
 """
 
 from __future__ import annotations
@@ -15,15 +20,21 @@ import platform
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import tyro
 
 from deal_hw.cli.collect import Collect, collect
+from deal_hw.control.realtime import become_realtime
 from deal_hw.data.dataset import Dataset
+from deal_hw.data.reader import Episode
+
+RATE_HZ = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,23 +51,95 @@ class MeasureCadence:
     """What the robot does meanwhile; balance includes the policy's network."""
 
 
+_WITNESS_PERIOD_NS = 1_000_000
+_PAUSE_NS = 3_000_000
+_TOP_PRIORITY = 99
+
+
+def witness(processor: int) -> None:
+    """Print for each time this processor's most urgent thread woke late when it was due and woke [ns]."""
+    os.sched_setaffinity(0, {processor})
+    become_realtime()
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_TOP_PRIORITY))
+    print("ready", flush=True)
+    due = time.monotonic_ns()
+    while True:
+        due += _WITNESS_PERIOD_NS
+        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+        now = time.monotonic_ns()
+        if now - due > _PAUSE_NS:
+            print(processor, due, now, flush=True)
+            due = now
+
+
+@contextlib.contextmanager
+def _witnesses() -> Iterator[list[dict[str, int]]]:
+    """Watch every processor; the list is filled at the end."""
+    pauses: list[dict[str, int]] = []
+    with contextlib.ExitStack() as stack:
+        running = []
+        for processor in sorted(os.sched_getaffinity(0)):
+            command = [sys.executable, __file__, "--witness", str(processor)]
+            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            stack.callback(process.kill)
+            if process.stdout is None or process.stdout.readline() != "ready\n":
+                raise SystemExit("the witness was refused SCHED_FIFO: run this where it is granted")
+            running.append(process)
+        yield pauses
+        for process in running:
+            process.kill()
+            out, _ = process.communicate()
+            for line in out.splitlines():
+                number, due, woke = (int(word) for word in line.split())
+                pauses.append({"processor": number, "from_ns": due, "until_ns": woke})
+
+
+def _late_cycles(recording: Episode) -> list[tuple[int, int]]:
+    """Return each cycle that started a period late or more as (due, started) on the host's clock [ns]."""
+    cycles = recording.cycles
+    skipped = np.diff(cycles.cycle) - 1
+    late = []
+    for index in np.flatnonzero(skipped) + 1:
+        # The recorded deadline is that of the grid's cycle that was run; the skipped ones were due before it.
+        due_s = cycles.deadline_s[index] - skipped[index - 1] / RATE_HZ
+        late.append(tuple(recording.start_ns + round(float(t) * 1e9) for t in (due_s, cycles.start_s[index])))
+    return late
+
+
+def _judge(overruns: list[tuple[int, int]], pauses: list[dict[str, int]]) -> list[dict[str, Any]]:
+    """Return each overrun (due, started) [ns] with the longest pause of any processor while it was late."""
+    rows = []
+    for due, started in overruns:
+        paused = [
+            p["until_ns"] - p["from_ns"] for p in pauses if p["from_ns"] < started and p["until_ns"] > due
+        ]
+        rows.append(
+            {"late_ms": (started - due) * 1e-6, "witness_paused_ms": max(paused, default=0) * 1e-6}
+        )  # fmt: skip
+    return rows
+
+
 def measure(config: MeasureCadence) -> dict[str, Any]:
     """Run and return the report with the machine it was measured on."""
     load_before = os.getloadavg()
-    with tempfile.TemporaryDirectory() as folder, _port(config.port) as port:
+    with tempfile.TemporaryDirectory() as folder, _witnesses() as pauses, _port(config.port) as port:
         report = collect(
             Collect(
                 robot="cartpole", port=port, dataset=Path(folder), profile=config.profile,
                 seconds=config.minutes * 60.0, quiet=True,
             )
         )  # fmt: skip
-        info = Dataset.open(Path(folder), notify=lambda text: None).episodes[0]
+        dataset = Dataset.open(Path(folder), notify=lambda text: None)
+        info, recording = dataset.episodes[0], dataset.read(0)
     episode = report.episodes[0]
     return {
         "minutes": config.minutes,
         "outcome": episode.outcome.value,
         "reason": episode.reason,
         "cadence": episode.cadence.to_json() if episode.cadence is not None else None,
+        "beyond_period": _judge(_late_cycles(recording), pauses),
+        "witness_pauses": len(pauses),
+        "witness_longest_ms": max((p["until_ns"] - p["from_ns"] for p in pauses), default=0) * 1e-6,
         "states_recorded": info.states,
         "cycles_recorded": info.cycles,
         "warnings": list(episode.warnings),
@@ -89,5 +172,12 @@ def _port(given: str | None) -> Iterator[str]:
         process.communicate()
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Measure, or be a witness."""
+    if sys.argv[1:2] == ["--witness"]:
+        witness(int(sys.argv[2]))
     print(json.dumps(measure(tyro.cli(MeasureCadence)), indent=1))
+
+
+if __name__ == "__main__":
+    main()

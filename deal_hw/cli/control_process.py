@@ -17,7 +17,13 @@ from typing import Any
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.handover import RecordSender, StatusSender
-from deal_hw.control.realtime import Granted, become_realtime, die_with_parent, kill_self_after
+from deal_hw.control.realtime import (
+    PARENT_DIED,
+    Granted,
+    become_realtime,
+    die_with_parent,
+    kill_self_after,
+)
 
 _START_SILENCE_S = 30.0
 _ORPHAN_S = 2.0
@@ -29,12 +35,12 @@ class _Stopper:
     def __init__(self, parent_pid: int) -> None:
         self._parent_pid = parent_pid
         self.loop: Any = None
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, PARENT_DIED):
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         reason = "stopped by the operator"
-        if os.getppid() != self._parent_pid:
+        if number == PARENT_DIED or os.getppid() != self._parent_pid:
             # Nobody is left to kill this process if its passive route hangs.
             kill_self_after(_ORPHAN_S)
             reason = "the supervisor died"

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
+PARENT_DIED = signal.SIGUSR1
+"""Sent by the kernel when the parent dies; nobody else sends it, so the record names the true reason."""
 _FIFO_PRIORITY = 50
 
 
@@ -70,7 +72,10 @@ def _lock_memory() -> str | None:
 
 
 def die_with_parent(parent_pid: int) -> None:
-    """Have the kernel send SIGTERM when the parent dies, so that the loop ends by its passive route.
+    """Have the kernel send ``PARENT_DIED`` when the parent dies, so that the loop ends by its passive route.
+
+    The signal's number is the only safe news: where the parent has several threads, the first of them to end
+    sends it, and ``getppid`` still names the parent then.
 
     Args:
         parent_pid: The parent's process id, as the parent gave it.
@@ -79,7 +84,7 @@ def die_with_parent(parent_pid: int) -> None:
         ProcessLookupError: The parent is gone already.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0) != 0:
+    if libc.prctl(_PR_SET_PDEATHSIG, PARENT_DIED, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
     # The parent may have died before the call above: then no signal ever comes.
     if os.getppid() != parent_pid:
