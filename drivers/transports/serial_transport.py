@@ -13,6 +13,7 @@ import serial
 from serial.tools import list_ports
 
 from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.drivers.transports.read_ahead import ReadAhead
 from deal_hw.errors import (
     ConfigurationError,
     PortBusyError,
@@ -45,11 +46,15 @@ class SerialTransport(Transport):
         self._clock = clock or MonotonicClock()
         self._adopted: int | None = None
         self._serial: serial.Serial | None = None
+        self._ahead: ReadAhead | None = None
         self._fd = -1
 
     @classmethod
     def from_fd(cls, fd: int, clock: Clock | None = None) -> SerialTransport:
-        """Return a transport over a port that a parent process opened; it closes ``fd`` when closed."""
+        """Return a transport over a port that a parent process opened; it closes ``fd`` when closed.
+
+        It is made for the process with the deadlines, so it reads ahead in a thread.
+        """
         transport = cls(f"inherited descriptor {fd}", clock=clock)
         transport._adopted = fd
         return transport
@@ -58,11 +63,18 @@ class SerialTransport(Transport):
         """Open the port and forget what it had received before."""
         if self._fd >= 0:
             return
-        self._fd = self._open_port() if self._adopted is None else self._adopt(self._adopted)
+        if self._adopted is None:
+            self._fd = self._open_port()
+        else:
+            self._fd = self._adopt(self._adopted)
+            self._ahead = ReadAhead(self._fd, self._clock)
 
     def close(self) -> None:
         """Close the port."""
         fd, self._fd = self._fd, -1
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None:
+            ahead.stop()
         if self._serial is not None:
             with contextlib.suppress(OSError):
                 self._serial.close()
@@ -89,6 +101,8 @@ class SerialTransport(Transport):
     def receive(self, timeout_s: float) -> Message:
         """Return all bytes at hand, waiting up to ``timeout_s`` for the first."""
         fd = self.fileno()
+        if self._ahead is not None:
+            return self._receive_ahead(self._ahead, timeout_s)
         # select, not poll: poll rounds its timeout up to whole milliseconds, and every cycle would start that
         # late.
         if not select.select([fd], [], [], max(0.0, timeout_s))[0]:
@@ -102,6 +116,17 @@ class SerialTransport(Transport):
         if not data:
             raise self._lost(None)
         return Message("", data, self._clock.now_ns())
+
+    def _receive_ahead(self, ahead: ReadAhead, timeout_s: float) -> Message:
+        arrived = ahead.take(timeout_s)
+        if arrived is None:
+            raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s")
+        stamp_ns, data = arrived
+        if isinstance(data, OSError):
+            raise self._lost(data) from data
+        if not data:
+            raise self._lost(None)
+        return Message("", data, stamp_ns)
 
     def fileno(self) -> int:
         """Return the descriptor of the open port, for ``select`` and for child processes."""

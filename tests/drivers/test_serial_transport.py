@@ -66,6 +66,33 @@ class TestSerialTransport(TransportSuite):
         transport.close()
 
 
+class TestReadingAhead(TransportSuite):
+    """The same contract where a thread reads ahead: over a descriptor that a parent opened."""
+
+    @pytest.fixture
+    def pair(self, pty: Pty) -> Iterator[TransportPair]:
+        with SerialTransport(pty.port) as parent:
+            transport = SerialTransport.from_fd(os.dup(parent.fileno()))
+            yield TransportPair(near=transport, write=pty.write, read=pty.read, unplug=pty.close)
+            transport.close()
+
+    @pytest.mark.skip(reason="an inherited descriptor is closed for good")
+    def test_a_closed_transport_refuses(self, pair: TransportPair) -> None:
+        """Not of this kind: it cannot be opened again."""
+
+    @pytest.mark.skip(reason="an inherited descriptor is closed for good")
+    def test_open_and_close_may_be_repeated(self, pair: TransportPair) -> None:
+        """Not of this kind: it cannot be opened again."""
+
+    def test_a_vanished_port_stays_vanished(self, pair: TransportPair) -> None:
+        """Every receive after the loss says so, not only the first."""
+        with pair.near as near:
+            pair.unplug()
+            for _ in range(3):
+                with pytest.raises(TransportLostError):
+                    near.receive(5.0)
+
+
 def test_a_missing_port_lists_the_ports_at_hand() -> None:
     """The message names the port that was given and what there is."""
     with pytest.raises(PortNotFoundError, match=r"no serial port '/dev/ttyNOPE'; ports at hand: "):

@@ -1,0 +1,72 @@
+"""A thread that reads a tty, so that who waits for a deadline never waits inside the tty layer."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import select
+import threading
+
+from deal_hw.clock import Clock
+
+_READ_SIZE = 4096
+
+
+class ReadAhead:
+    """Reads a descriptor in a thread of its own and keeps what came, with its stamps.
+
+    Linux hands received bytes to a tty through a kernel worker of ordinary priority, and ``select`` and
+    ``read`` on a tty wait for that worker. On a busy machine that is tens of milliseconds, whatever the
+    priority of the process that reads. Here only this thread waits; who takes from the queue wakes up at the
+    time it asked for.
+
+    Args:
+        fd: The descriptor; stays open.
+        clock: Gives the stamps.
+    """
+
+    def __init__(self, fd: int, clock: Clock) -> None:
+        self._fd, self._clock = fd, clock
+        self._arrived: queue.SimpleQueue[tuple[int, bytes | OSError]] = queue.SimpleQueue()
+        self._wake_read, self._wake_write = os.pipe()
+        self._thread = threading.Thread(target=self._run, name="tty read-ahead", daemon=True)
+        self._thread.start()
+
+    def take(self, timeout_s: float) -> tuple[int, bytes | OSError] | None:
+        """Return what came next, stamp [ns] and bytes (none: hung up) or the error; None after the time."""
+        try:
+            arrived = self._arrived.get(timeout=timeout_s) if timeout_s > 0 else self._arrived.get_nowait()
+        except queue.Empty:
+            return None
+        if _is_last(arrived[1]):
+            # The thread has ended: whoever asks again shall hear it again.
+            self._arrived.put(arrived)
+        return arrived
+
+    def stop(self) -> None:
+        """End the thread; what came and was not taken is lost."""
+        with contextlib.suppress(OSError):
+            os.write(self._wake_write, b"x")
+        self._thread.join()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _run(self) -> None:
+        while True:
+            try:
+                ready, _, _ = select.select([self._fd, self._wake_read], [], [])
+                if self._wake_read in ready:
+                    return
+                data: bytes | OSError = os.read(self._fd, _READ_SIZE)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                data = error
+            self._arrived.put((self._clock.now_ns(), data))
+            if _is_last(data):
+                return
+
+
+def _is_last(data: bytes | OSError) -> bool:
+    return not isinstance(data, bytes) or not data
