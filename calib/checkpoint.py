@@ -39,28 +39,34 @@ def restore_generator(rng: np.random.Generator, state: State) -> None:
 
 
 def pack(state: State) -> bytes:
-    """Return a state as the bytes of an NPZ file: a JSON tree whose leaves name arrays beside it."""
+    """Return a state as the bytes of an NPZ file: a JSON tree whose leaves name arrays beside it.
+
+    Raises:
+        TypeError: It holds something else than plain values, lists, mappings by text, and arrays of numbers.
+    """
     arrays: dict[str, np.ndarray[Any, Any]] = {}
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            if value.dtype.hasobject:
-                raise TypeError("a checkpoint holds arrays of numbers only")
-            key = f"a{len(arrays)}"
-            arrays[key] = value
-            return {_ARRAY: key}
-        if isinstance(value, Mapping):
-            return {str(k): plain(v) for k, v in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(v) for v in value]
-        if isinstance(value, np.generic):
-            return value.item()
-        return value
-
-    header = json.dumps({"format": FORMAT, "state": plain(state)})
+    tree = {"format": FORMAT, "state": _plain(state, arrays)}
+    header = np.frombuffer(json.dumps(tree).encode("ascii"), dtype=np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{_HEADER: np.array(header), **arrays})
+    entries: dict[str, Any] = {_HEADER: header, **arrays}
+    np.savez(buffer, **entries)
     return buffer.getvalue()
+
+
+def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "biufc":
+            raise TypeError(f"a checkpoint holds arrays of numbers only, not of {value.dtype}")
+        key = f"a{len(arrays)}"
+        arrays[key] = value
+        return {_ARRAY: key}
+    if isinstance(value, Mapping):
+        if any(not isinstance(key, str) or key == _ARRAY for key in value):
+            raise TypeError(f"a checkpoint's keys are text other than {_ARRAY!r}, got {list(value)}")
+        return {key: _plain(v, arrays) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v, arrays) for v in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def unpack(data: bytes) -> dict[str, Any]:
@@ -71,13 +77,14 @@ def unpack(data: bytes) -> dict[str, Any]:
     """
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            header = json.loads(str(file[_HEADER]))
-            arrays = {key: file[key] for key in file.files if key != _HEADER}
+            arrays = {key: file[key] for key in file.files}
+        header = json.loads(arrays.pop(_HEADER).tobytes())
         if header["format"] != FORMAT:
             raise ValueError(f"format {header['format']!r}")
         state: dict[str, Any] = _restored(header["state"], arrays)
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as err:
-        raise DatasetError(f"this is no checkpoint of {FORMAT}: {err}") from err
+    # Damaged bytes make the ZIP, NPY and JSON readers raise nearly anything; nothing of ours is called here.
+    except Exception as err:
+        raise DatasetError(f"this is no checkpoint of {FORMAT}: {err or type(err).__name__}") from err
     return state
 
 
@@ -92,34 +99,53 @@ def _restored(value: Any, arrays: Mapping[str, Any]) -> Any:
 
 
 class Checkpoint:
-    """A checkpoint file of one run; written whole or not at all.
+    """A checkpoint file of one run; written whole or not at all. A :class:`deal_hw.calibration.StateStore`.
 
     Args:
         path: The file.
         identity: Digest of everything that decides the run's numbers; a file of another run is refused.
+        fresh: Begin anew: a file that is there is not read, and is replaced by the first state.
     """
 
-    def __init__(self, path: Path, identity: str) -> None:
+    def __init__(self, path: Path, identity: str, *, fresh: bool = False) -> None:
         self.path = path
         self.identity = identity
+        self._fresh = fresh
 
     def save(self, state: State) -> None:
-        """Replace the file by this state."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        """Replace the file by this state.
+
+        Raises:
+            DatasetError: The file cannot be written.
+        """
         waiting = self.path.with_suffix(".part")
-        waiting.write_bytes(pack({"identity": self.identity, "run": state}))
-        os.replace(waiting, self.path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            waiting.write_bytes(pack({"identity": self.identity, "run": state}))
+            os.replace(waiting, self.path)
+            self._fresh = False
+        except OSError as err:
+            raise DatasetError(f"{self.path} cannot be written: {err.strerror}") from err
 
     def load(self) -> dict[str, Any] | None:
-        """Return the saved state, or None where there is no file.
+        """Return the saved state, or None where there is none to continue.
 
         Raises:
             ConfigurationError: The file belongs to another run.
             DatasetError: The file is unreadable.
         """
-        if not self.path.exists():
+        if self._fresh:
             return None
-        saved = unpack(self.path.read_bytes())
+        try:
+            data = self.path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as err:
+            raise DatasetError(f"{self.path} cannot be read: {err.strerror}") from err
+        try:
+            saved = unpack(data)
+        except DatasetError as err:
+            raise DatasetError(f"{self.path}: {err}; remove it and begin again") from err
         if saved.get("identity") != self.identity:
             raise ConfigurationError(
                 f"{self.path} is of a run with other data, settings or versions and cannot be resumed; "
@@ -130,4 +156,5 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Remove the file: the run is over."""
-        self.path.unlink(missing_ok=True)
+        for path in (self.path, self.path.with_suffix(".part")):
+            path.unlink(missing_ok=True)

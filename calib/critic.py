@@ -9,8 +9,9 @@ generator: the same seed, the same critic.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -131,6 +132,32 @@ class Critic:
         for k in range(settings.updates):
             gap = self._update(batches[k], copies[k])
         return gap
+
+    def save(self) -> dict[str, Any]:
+        """Return weights, the optimiser's memory and the generator as arrays."""
+        memory = self.optimiser.state_dict()["state"]
+        return {
+            "weights": [parameter.detach().numpy().copy() for parameter in self._parameters],
+            "optimiser": {
+                str(number): {name: value.numpy().copy() for name, value in state.items()}
+                for number, state in memory.items()
+            },
+            "generator": self.generator.get_state().numpy().copy(),
+        }
+
+    @torch.no_grad()
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`save` returned."""
+        for parameter, values in zip(self._parameters, state["weights"], strict=True):
+            parameter.copy_(torch.tensor(values))
+        memory = {
+            int(number): {name: torch.tensor(value) for name, value in values.items()}
+            for number, values in state["optimiser"].items()
+        }
+        # Learning rates and the like are settings, not state.
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": memory, "param_groups": groups})
+        self.generator.set_state(torch.tensor(state["generator"]))
 
     @torch.no_grad()
     def score(self, samples: Samples, chunk: int = 8192) -> Samples:

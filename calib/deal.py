@@ -20,17 +20,20 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.coordinates import Coordinates, Members, logistic, logit
+from deal_hw.calib.checkpoint import State
+from deal_hw.calib.coordinates import Members
 from deal_hw.calib.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
-from deal_hw.calib.ensemble_kalman import EnsembleKalman
 from deal_hw.calib.innovations import cut, explained, is_noisy, linearise, predict, samples_per_tick
+from deal_hw.calib.kalman_search import KalmanStepper
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem, WindowData
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
 _CRITIC = CriticSettings(hidden=(64, 64), learning_rate=1e-3, updates=20, batch=512)
@@ -70,84 +73,119 @@ class DealSettings:
     torch_threads: int = 1
 
 
-class Deal(CalibrationMethod[Problem]):
+@dataclass(frozen=True)
+class Deal(Search):
     """Critic features and an ensemble Kalman step.
 
-    Args:
+    Attributes:
         settings: How to run.
     """
 
     name = "deal"
+    settings: DealSettings = field(default_factory=DealSettings)
 
-    def __init__(self, settings: DealSettings | None = None) -> None:
-        self.settings = settings or DealSettings()
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Deal(run, rng, self.settings)
 
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Calibrate: one round of critic updates and one Kalman step a generation."""
-        settings = self.settings
-        run = Run(self.name, problem, budget, progress)
-        coordinates = Coordinates(problem)
-        kalman = EnsembleKalman(
-            logit(coordinates.sample(rng, budget.population)), rng, step_clip=settings.step_clip
+
+class _Deal(KalmanStepper):
+    """A run of `deal`: stages of windows, one round of critic updates and one Kalman step a generation."""
+
+    def __init__(self, run: Run, rng: np.random.Generator, settings: DealSettings) -> None:
+        super().__init__(run, rng, settings.step_clip)
+        self._settings = settings
+        self._noisy = is_noisy(run.problem)
+        self._lengths = settings.noisy_ticks if self._noisy else settings.clean_ticks
+        self._most = min(settings.generations, run.budget.generations)
+        self._view: _View
+        self._enter_stage(0)
+        self._skip_empty_stages()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last stage is over."""
+        return self._last and self._stage_over
+
+    def step(self) -> None:
+        """One round of critic updates and one Kalman step."""
+        z = self.kalman.ask()
+        members, centre = self.population(z)
+        with torch_threads(self._settings.torch_threads):
+            residual, gap = self._view.residual(members, centre)
+        # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise
+        # begins. Noise-free ones have no such end: each step takes a fixed share of what is left.
+        step = self.kalman.tell(residual, keep=None if self._noisy else self._settings.keep)
+        self._spread = step.spread
+        self.run.note(
+            f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
+            members.theta,
+            {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
+            members.latency_s,
         )
-        noisy = is_noisy(problem)
-        lengths = settings.noisy_ticks if noisy else settings.clean_ticks
-        most = min(settings.generations, budget.generations)
-        with torch_threads(settings.torch_threads):
-            for stage, ticks in enumerate(lengths):
-                if stage:
-                    kalman.widen(settings.widen)
-                view: _View = (_NoisyView if noisy else _CleanView)(problem, settings, ticks, rng, stage > 0)
-                # Earlier stages bring the population near; a third of the budget is kept for the last.
-                end = most if stage == len(lengths) - 1 else 2 * most // 3
-                spread = np.inf
-                while len(run.trace) < end and not kalman.finished and spread > settings.least_spread:
-                    spread = self._generation(run, coordinates, kalman, view, noisy=noisy)
-        z = kalman.ask()
-        centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-        chi2 = explained(problem, centre, lengths[-1])
+        self._skip_empty_stages()
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`."""
+        members, centre = self.population(self.kalman.ask())
+        chi2 = explained(self.run.problem, centre, self._lengths[-1])
         alarms = []
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
-        if noisy and not chi2 <= settings.alarm_chi2:
+        if self._noisy and not chi2 <= self._settings.alarm_chi2:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(run.trace)} generations; polish it, search again with another seed, or use weki"
+                f"{len(self.run.trace)} generations; polish it, search again with another seed, or use weki"
             )
-        return run.result(
-            coordinates,
+        return self.run.result(
+            self.coordinates,
             centre,
-            coordinates.members(logistic(z)),
-            settings=settings,
+            members,
+            settings=self._settings,
             chi2=chi2,
             alarms=alarms,
             extra={
                 "interval": "ensemble spread, uncalibrated",
-                "view": "control periods" if noisy else "windows",
+                "view": "control periods" if self._noisy else "windows",
             },
         )
 
-    def _generation(
-        self, run: Run, coordinates: Coordinates, kalman: EnsembleKalman, view: _View, *, noisy: bool
-    ) -> float:
-        z = kalman.ask()
-        members = coordinates.members(logistic(z))
-        centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-        residual, gap = view.residual(members, centre)
-        # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise
-        # begins. Noise-free ones have no such end: each step takes a fixed share of what is left.
-        step = kalman.tell(residual, keep=None if noisy else self.settings.keep)
-        run.note(
-            f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
-            members.theta,
-            {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
-        )
-        return step.spread
+    def save(self) -> dict[str, Any]:
+        """See :meth:`Stepper.save`."""
+        return {
+            "kalman": self.kalman.save(),
+            "stage": self._stage,
+            "spread": self._spread,
+            "view": self._view.save(),
+        }
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._enter_stage(state["stage"])
+        self.kalman.load(state["kalman"])
+        self._spread = state["spread"]
+        self._view.load(state["view"])
+
+    @property
+    def _last(self) -> bool:
+        return self._stage + 1 == len(self._lengths)
+
+    @property
+    def _stage_over(self) -> bool:
+        # Earlier stages bring the population near; a third of the budget is kept for the last.
+        end = self._most if self._last else 2 * self._most // 3
+        told_apart = self._spread > self._settings.least_spread
+        return len(self.run.trace) >= end or self.kalman.finished or not told_apart
+
+    def _skip_empty_stages(self) -> None:
+        while self._stage_over and not self._last:
+            self._enter_stage(self._stage + 1)
+
+    def _enter_stage(self, stage: int) -> None:
+        self._stage, self._spread = stage, float("inf")
+        if stage:
+            self.kalman.widen(self._settings.widen)
+        kind: type[_View] = _NoisyView if self._noisy else _CleanView
+        self._view = kind(self.run.problem, self._settings, self._lengths[stage], self.rng, stage > 0)
 
 
 class _View(abc.ABC):
@@ -217,6 +255,18 @@ class _View(abc.ABC):
         residual[~good] = np.nan
         return residual, gap
 
+    def save(self) -> dict[str, Any]:
+        """Return the critic and the start states of the next generation."""
+        return {
+            "critic": self._critic.save(),
+            "offsets": {str(episode): offset for episode, offset in self._offsets.items()},
+        }
+
+    def load(self, state: State) -> None:
+        """Continue from what :meth:`save` returned."""
+        self._critic.load(state["critic"])
+        self._offsets = {int(episode): offset for episode, offset in state["offsets"].items()}
+
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
         # Far members' windows run away by many scales; a critic that spends itself on them sees nothing in
         # the middle.
@@ -229,7 +279,7 @@ class _CleanView(_View):
     """Noise-free recordings: one sample is one window of innovations at the control rate."""
 
     def _width(self) -> int:
-        return self._ticks * self._problem.joints
+        return self._ticks * len(self._problem.channels)
 
     def _make_context(self, data: WindowData) -> FloatArray:
         episode = self._problem.episodes[data.episode]
@@ -246,7 +296,7 @@ class _CleanView(_View):
             np.concatenate([members.theta, centre.theta]),
             np.concatenate([members.latency_s, centre.latency_s]),
         )
-        predicted = predict(self._problem, both, data)[0][:, :, at]
+        predicted = predict(self._problem, both, data).observed[:, :, at]
         real = data.measured[:, at] - predicted[-1]
         fake = predicted[:-1] - predicted[-1]
         return real.reshape(len(real), -1), fake.reshape(*fake.shape[:2], -1)
@@ -271,7 +321,7 @@ class _NoisyView(_View):
     """
 
     def _width(self) -> int:
-        return self._every * self._problem.joints
+        return self._every * len(self._problem.channels)
 
     def _make_context(self, data: WindowData) -> FloatArray:
         starts, episode = self._problem.starts[data.episode], self._problem.episodes[data.episode]
@@ -284,7 +334,7 @@ class _NoisyView(_View):
     ) -> tuple[FloatArray, FloatArray]:
         offset = self._offsets.get(data.episode)
         whitening = linearise(self._problem, centre, data, offset)
-        predicted, _ = predict(self._problem, members, data, *whitening.starts(data))
+        predicted = predict(self._problem, members, data, *whitening.starts(data)).observed
         if self._move_starts:
             self._offsets[data.episode] = whitening.next_offset(data.measured)
         # The inverse Cholesky factor is lower triangular: each period's innovation is whitened by its past.

@@ -8,25 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from deal_hw.calib.checkpoint import State
 from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.critic import ClippedCritic, CriticSettings, Samples, torch_threads
+from deal_hw.calib.critic import CriticSettings
 from deal_hw.calib.diffusion_evolution import DiffusionEvolution, DiffusionSettings
+from deal_hw.calib.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.rollouts import (
-    PopulationPolicy,
-    Ticks,
-    TransitionScale,
-    control_ticks,
-    demonstration,
-    rollout_population,
-    transitions,
-)
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
+from deal_hw.calib.rollouts import PopulationPolicy
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
 HALF_WIDTH = 3.0**0.5
@@ -47,95 +41,58 @@ class PaperSettings:
         diffusion: The search's choices; its number of generations is the budget's.
         normalise: Whether the search moves in the normalised range (section 3.2); off is the ablation
             DEAL\PN, which moves in raw SI units.
-        constant_fitness: Score every member 0: a search that cannot see the data.
+        fitness: Name of the fitness (`deal_hw.calib.fitness`). "critic" is the paper's; "flat" scores every
+            member 0, a search that cannot see the data. Eq. 9 reads the fitness as it is, whatever its scale.
         replay_generations: How many generations' rollouts D_S holds, None for all. Algorithm 1 stores
             rollouts and does not say whether it forgets; a critic that is still trained against populations
             of long ago pushes the present one along with them (measured: no better than the centre), so the
             default forgets.
         ticks: Most transitions of a rollout (Table 4: 200).
+        horizon_ticks: Window length in control periods of the fitness "trajectory".
         torch_threads: Threads of the critic's arithmetic.
     """
 
     critic: CriticSettings = field(default_factory=CriticSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     normalise: bool = True
-    constant_fitness: bool = False
+    fitness: str = "critic"
     replay_generations: int | None = 1
     ticks: int = 200
+    horizon_ticks: int = 10
     torch_threads: int = 1
 
+    @property
+    def scoring(self) -> FitnessSettings:
+        """What of these the fitness reads."""
+        return FitnessSettings(
+            horizon_ticks=self.horizon_ticks,
+            ticks=self.ticks,
+            critic=self.critic,
+            replay_generations=self.replay_generations,
+            torch_threads=self.torch_threads,
+        )
 
-class DealPaper(CalibrationMethod[Problem]):
-    """DEAL as published.
+
+@dataclass(frozen=True)
+class DealPaper(Search):
+    """DEAL as published; the budget's population is N, its generations are T.
 
     The latency, of which the paper knows nothing, is one more searched coordinate unless the problem gives
     it.
 
-    Args:
+    Attributes:
         settings: How to run.
         policy: pi_0 to run in the loop; None replays its recorded actions.
         name: Name in results.
     """
 
-    def __init__(
-        self,
-        settings: PaperSettings | None = None,
-        policy: PopulationPolicy | None = None,
-        name: str = "deal-paper",
-    ) -> None:
-        self.settings = settings or PaperSettings()
-        self.policy = policy
-        self.name = name
+    settings: PaperSettings = field(default_factory=PaperSettings)
+    policy: PopulationPolicy | None = None
+    name: str = "deal-paper"
 
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Calibrate: the budget's population N and generations T."""
-        run = Run(self.name, problem, budget, progress)
-        box = _Box(Coordinates(problem), normalise=self.settings.normalise)
-        search = DiffusionEvolution(
-            # Line 1: theta^T from the search range, uniform in the normalised box.
-            box.from_unit(box.coordinates.sample(rng, budget.population)),
-            _with_generations(self.settings.diffusion, budget.generations),
-            rng,
-        )
-        view = _PaperView(problem, self.settings, self.policy, rng)
-        with torch_threads(self.settings.torch_threads):
-            while not search.finished:
-                members = box.members(search.ask())
-                if self.settings.constant_fitness:
-                    fitness, gap = np.zeros(budget.population), 0.0
-                else:
-                    fitness, gap = view.fitness(members)
-                step = search.tell(fitness)
-                finite = fitness[np.isfinite(fitness)]
-                run.note(
-                    f"effective size {step.effective_size:.0f} of {budget.population}",
-                    members.theta,
-                    {
-                        "fitness": float(finite.mean()) if finite.size else float("nan"),
-                        "wasserstein": gap,
-                        "effective_size": step.effective_size,
-                        "effective_neighbours": step.effective_neighbours,
-                        "delta": step.delta,
-                        "sigma": step.sigma,
-                        "clamped": float(step.clamped),
-                    },
-                )
-        final = search.ask()
-        # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best
-        # member differ from it by less than the population's own error.
-        return run.result(
-            box.coordinates,
-            box.members(final.mean(axis=0, keepdims=True)),
-            box.members(final),
-            settings=self.settings,
-            extra={"interval": "population spread, uncalibrated", "estimate": "mean of the last population"},
-        )
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _DealPaper(run, rng, self.settings, self.policy)
 
 
 def paper() -> DealPaper:
@@ -161,11 +118,72 @@ def without_normalisation() -> DealPaper:
 
 def flat() -> DealPaper:
     """Return `deal-paper` with a constant fitness: whatever it finds, it did not find in the data."""
-    return DealPaper(PaperSettings(constant_fitness=True), name="deal-paper-flat")
+    return DealPaper(PaperSettings(fitness="flat"), name="deal-paper-flat")
 
 
-def _with_generations(settings: DiffusionSettings, generations: int) -> DiffusionSettings:
-    return dataclasses.replace(settings, generations=max(generations, 1))
+class _DealPaper(Stepper):
+    """A run of Algorithm 1: one denoising step a generation."""
+
+    def __init__(
+        self, run: Run, rng: np.random.Generator, settings: PaperSettings, policy: PopulationPolicy | None
+    ) -> None:
+        self._run, self._settings = run, settings
+        self._box = _Box(Coordinates(run.problem), normalise=settings.normalise)
+        self._search = DiffusionEvolution(
+            # Line 1: theta^T from the search range, uniform in the normalised box.
+            self._box.from_unit(self._box.coordinates.sample(rng, run.budget.population)),
+            dataclasses.replace(settings.diffusion, generations=max(run.budget.generations, 1)),
+            rng,
+        )
+        self._fitness = make_fitness(settings.fitness, run.problem, rng, settings.scoring, policy)
+
+    @property
+    def finished(self) -> bool:
+        """Whether theta^0 has been reached."""
+        return self._search.finished
+
+    def step(self) -> None:
+        """Lines 3 to 15: from theta^t to theta^(t - 1)."""
+        members = self._box.members(self._search.ask())
+        fitness = self._fitness.score(members)
+        step = self._search.tell(fitness)
+        finite = fitness[np.isfinite(fitness)]
+        self._run.note(
+            f"effective size {step.effective_size:.0f} of {len(fitness)}",
+            members.theta,
+            {
+                "fitness": float(finite.mean()) if finite.size else float("nan"),
+                **self._fitness.values,
+                "effective_size": step.effective_size,
+                "effective_neighbours": step.effective_neighbours,
+                "delta": step.delta,
+                "sigma": step.sigma,
+                "clamped": float(step.clamped),
+            },
+            members.latency_s,
+        )
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`."""
+        final = self._search.ask()
+        # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best
+        # member differ from it by less than the population's own error.
+        return self._run.result(
+            self._box.coordinates,
+            self._box.members(final.mean(axis=0, keepdims=True)),
+            self._box.members(final),
+            settings=self._settings,
+            extra={"interval": "population spread, uncalibrated", "estimate": "mean of the last population"},
+        )
+
+    def save(self) -> dict[str, Any]:
+        """See :meth:`Stepper.save`."""
+        return {"search": self._search.save(), "fitness": self._fitness.save()}
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._search.load(state["search"])
+        self._fitness.load(state["fitness"])
 
 
 class _Box:
@@ -194,45 +212,3 @@ class _Box:
         if self.coordinates.fixed_latency_s is None:
             unit = np.concatenate([unit, self.coordinates.latency_unit(x[:, len(space)])[:, None]], axis=1)
         return self.coordinates.members(unit)
-
-
-class _PaperView:
-    """Rollouts, replay and critic: lines 3 to 9 of Algorithm 1."""
-
-    def __init__(
-        self,
-        problem: Problem,
-        settings: PaperSettings,
-        policy: PopulationPolicy | None,
-        rng: np.random.Generator,
-    ) -> None:
-        self._problem, self._settings, self._policy = problem, settings, policy
-        self._ticks: list[Ticks] = [
-            control_ticks(problem, index, settings.ticks) for index in range(len(problem.episodes))
-        ]
-        raw = np.concatenate([demonstration(problem, i, ticks) for i, ticks in enumerate(self._ticks)])
-        self._scale = TransitionScale.of(raw.astype(np.float64))
-        self._real: Samples = self._scale.apply(raw)
-        self._critic = ClippedCritic(raw.shape[1], settings.critic, rng)
-        self._replay: list[Samples] = []
-
-    def fitness(self, members: Members) -> tuple[FloatArray, float]:
-        """Return each member's mean critic output, (N,), and the critic's Wasserstein estimate."""
-        rollouts, usable = self._rollouts(members)
-        N, _, width = rollouts.shape
-        self._replay.append(rollouts[usable].reshape(-1, width))
-        if self._settings.replay_generations is not None:
-            del self._replay[: -self._settings.replay_generations]
-        gap = self._critic.train_on_blocks(self._real, self._replay)
-        # Line 9: the expectation over the member's own rollout.
-        score = self._critic.score(rollouts.reshape(-1, width)).reshape(N, -1).mean(axis=1).astype(np.float64)
-        return np.where(usable, score, -np.inf), gap
-
-    def _rollouts(self, members: Members) -> tuple[Samples, npt.NDArray[np.bool_]]:
-        blocks = []
-        for index, ticks in enumerate(self._ticks):
-            moved = rollout_population(self._problem, members, index, ticks, self._policy)
-            blocks.append(transitions(*moved))
-        raw = blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
-        usable = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
-        return self._scale.apply(raw), usable

@@ -11,8 +11,9 @@ the search starts.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import logsumexp, softmax
@@ -119,6 +120,15 @@ class DiffusionEvolution:
     def finished(self) -> bool:
         """Whether theta^0 has been reached."""
         return self.t == 0
+
+    def save(self) -> dict[str, Any]:
+        """Return theta^t and t; the generator is the caller's."""
+        return {"theta": self._theta.copy(), "t": self.t}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`save` returned."""
+        self._theta = np.array(state["theta"], dtype=float)
+        self.t = int(state["t"])
 
     def tell(self, fitness: FloatArray) -> DiffusionStep:
         """Take the step t -> t - 1.

@@ -9,7 +9,9 @@ tempering reaches 1.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +56,15 @@ class EnsembleKalman:
     def finished(self) -> bool:
         """Whether the whole likelihood has been used."""
         return self.tempering >= 1.0 - 1e-12
+
+    def save(self) -> dict[str, Any]:
+        """Return members and tempering; the generator is the caller's."""
+        return {"members": self._members.copy(), "tempering": self.tempering}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`save` returned."""
+        self._members = np.array(state["members"], dtype=float)
+        self.tempering = float(state["tempering"])
 
     def tell(self, residual: FloatArray, keep: float | None = None) -> KalmanStep:
         """Move the ensemble.

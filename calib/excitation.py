@@ -24,10 +24,12 @@ def check_excitation(problem: Problem) -> None:
             f"{seconds:.2f} s of usable samples, at least {SHORTEST_S:g} s are needed; {advice}"
         )
     names = problem.robot.description.joint_names
-    spans = np.max([np.ptp(e.position[e.usable], axis=0) for e in problem.episodes], axis=0)
+    joints = problem.robot.joints
+    spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
+    noises = problem.noise_std[: problem.coordinates][joints]
     still = [
         f"{name} moved {span:.2g} (noise {noise:.2g})"
-        for name, span, noise in zip(names, spans, problem.noise_std, strict=True)
+        for name, span, noise in zip(names, spans, noises, strict=True)
         if span < LEAST_NOISE_RATIO * noise
     ]
     if still:

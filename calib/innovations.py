@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.coordinates import Members
-from deal_hw.calib.problem import NOISE_FREE_STD, SMOOTHING_S, Problem, WindowData
-from deal_hw.sim.windows import predict_windows, setpoints
+from deal_hw.calib.problem import NOISE_FREE_STD, SMOOTHING_S, Prediction, Problem, WindowData
+from deal_hw.sim.windows import setpoints
 from deal_hw.types import FloatArray
 
 ADVANCE_S = 0.008
@@ -22,8 +22,8 @@ ADVANCE_S = 0.008
 
 
 def is_noisy(problem: Problem) -> bool:
-    """Return whether the recording's positions carry sensor noise."""
-    return bool(np.any(problem.noise_std >= NOISE_FREE_STD))
+    """Return whether what was measured carries sensor noise."""
+    return bool(np.any(problem.noise_std[problem.channels] >= NOISE_FREE_STD))
 
 
 def samples_per_tick(problem: Problem) -> int:
@@ -51,26 +51,15 @@ def predict(
     data: WindowData,
     position: FloatArray | None = None,
     velocity: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative.
-
-    Returns:
-        Positions and velocities, (N, W, H, J) each.
-    """
+) -> Prediction:
+    """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative."""
     episode = problem.episodes[data.episode]
     batch = problem.batch(len(members.theta))
     batch.set_parameters(members.theta)
     ahead = round(ADVANCE_S / episode.step_s)
     path = setpoints(batch, episode, members.latency_s + ahead * episode.step_s)
     path = np.concatenate([path[:, ahead:], np.repeat(path[:, -1:], ahead, axis=1)], axis=1)
-    return predict_windows(
-        batch,
-        episode,
-        data.windows,
-        data.start_position if position is None else position,
-        data.start_velocity if velocity is None else velocity,
-        path,
-    )
+    return problem.predict_along(batch, path, data, position, velocity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +67,12 @@ class Whitening:
     """What whitens the windows of one episode.
 
     Attributes:
-        reference: Prediction of the simulator around which was linearised, (W, H, J).
-        factor: Inverse Cholesky factors of Sigma, (W, H J, H J).
-        root: J sqrt(P0): what one standard deviation of each start coordinate does, (W, H J, 2 J).
-        std: Standard deviations of a start state, (2 J,).
+        reference: Prediction of the simulator around which was linearised, (W, H, M).
+        factor: Inverse Cholesky factors of Sigma, (W, H M, H M).
+        root: J sqrt(P0): what one standard deviation of each start coordinate does, (W, H M, 2 C).
+        std: Standard deviations of a start state, (2 C,).
         offset: Start states relative to the smoothed ones around which was linearised, in units of ``std``,
-            (W, 2 J).
+            (W, 2 C).
     """
 
     reference: FloatArray
@@ -93,25 +82,25 @@ class Whitening:
     offset: FloatArray
 
     def apply(self, difference: FloatArray) -> FloatArray:
-        """Whiten differences of positions, (N, W, H, J); returns (N, W, H J)."""
+        """Whiten differences of channels, (N, W, H, M); returns (N, W, H M)."""
         flat = difference.reshape(*difference.shape[:2], -1)
         return np.asarray(np.einsum("wij,nwj->nwi", self.factor, flat, optimize=True))
 
     def innovation(self, measured: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Whiten recording minus prediction, the latter moved to the smoothed start states, (N, W, H J).
+        """Whiten recording minus prediction, the latter moved to the smoothed start states, (N, W, H M).
 
         Args:
-            measured: (W, H, J).
-            predicted: From the start states that :meth:`starts` gives, (N, W, H, J).
+            measured: (W, H, M).
+            predicted: From the start states that :meth:`starts` gives, (N, W, H, M).
         """
         moved = np.einsum("wis,ws->wi", self.root, self.offset).reshape(measured.shape)
         return self.apply(measured + moved - predicted)
 
     def starts(self, data: WindowData) -> tuple[FloatArray, FloatArray]:
-        """Return the start positions and velocities around which was linearised, (W, J) each."""
-        J = data.start_position.shape[1]
+        """Return the start positions and velocities around which was linearised, (W, C) each."""
+        C = data.start_position.shape[1]
         moved = self.offset * self.std
-        return data.start_position + moved[:, :J], data.start_velocity + moved[:, J:]
+        return data.start_position + moved[:, :C], data.start_velocity + moved[:, C:]
 
     def next_offset(self, measured: FloatArray) -> FloatArray:
         """Return the most probable start states under the linearisation's simulator: the next ``offset``."""
@@ -134,23 +123,23 @@ def linearise(
         problem: Data and simulator.
         centre: One member, the mean of the population.
         data: The windows.
-        offset: Start states to linearise around, in standard deviations from the smoothed ones, (W, 2 J).
+        offset: Start states to linearise around, in standard deviations from the smoothed ones, (W, 2 C).
     """
     states = problem.starts[data.episode]
-    W, J = data.start_position.shape
+    W, C = data.start_position.shape
     std = np.concatenate([states.position_std, states.velocity_std])
-    around = np.zeros((W, 2 * J)) if offset is None else offset
+    around = np.zeros((W, 2 * C)) if offset is None else offset
     # Central differences at half the uncertainty: friction makes predictions kinked, and a secant of the size
     # of the error itself says more about them than a derivative.
-    count = 1 + 4 * J
-    position = np.repeat(data.start_position[None] + around[:, :J] * std[:J], count, axis=0)
-    velocity = np.repeat(data.start_velocity[None] + around[:, J:] * std[J:], count, axis=0)
-    for s in range(2 * J):
-        state, j = (position, s) if s < J else (velocity, s - J)
-        state[1 + 2 * s, :, j] += 0.5 * std[s]
-        state[2 + 2 * s, :, j] -= 0.5 * std[s]
+    count = 1 + 4 * C
+    position = np.repeat(data.start_position[None] + around[:, :C] * std[:C], count, axis=0)
+    velocity = np.repeat(data.start_velocity[None] + around[:, C:] * std[C:], count, axis=0)
+    for s in range(2 * C):
+        state, c = (position, s) if s < C else (velocity, s - C)
+        state[1 + 2 * s, :, c] += 0.5 * std[s]
+        state[2 + 2 * s, :, c] -= 0.5 * std[s]
     members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
-    predicted, _ = predict(problem, members, data, position, velocity)
+    predicted = predict(problem, members, data, position, velocity).observed
     predicted = np.where(np.isfinite(predicted), predicted, predicted[:1])
     flat = predicted.reshape(count, W, -1)
     root = np.moveaxis(flat[1::2] - flat[2::2], 0, -1)
@@ -184,8 +173,12 @@ def whitened_residual(
     """
     parts = []
     for i, data in enumerate(windows):
+        if problem.exact:
+            whitened = (data.measured - predict(problem, members, data).observed) / data.std
+            parts.append(whitened.reshape(len(whitened), -1))
+            continue
         whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
-        predicted, _ = predict(problem, members, data, *whitening.starts(data))
+        predicted = predict(problem, members, data, *whitening.starts(data)).observed
         whitened = whitening.innovation(data.measured, predicted)
         parts.append(whitened.reshape(len(whitened), -1))
         if offsets is not None:

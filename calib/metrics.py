@@ -64,13 +64,14 @@ def fisher_std(
         theta: True parameters, (K,).
         latency_s: True latency [s].
         states: True positions and velocities at the samples of each episode, (T, J) each.
-        noise_std: True standard deviation of reported positions, (J,).
+        noise_std: True standard deviation of the measured channels, (M,).
         length: Samples a window predicts.
     """
     shooting = Shooting(problem, length)
     hessian = shooting.normal(shooting.start(theta, latency_s, list(states))).hessian
     # The problem whitens by the noise it estimated, the bound is that of the true noise.
-    ratio = float(np.mean((problem.noise_std / np.maximum(noise_std, problem.noise_std * 1e-3)) ** 2))
+    estimated = problem.noise_std[problem.channels]
+    ratio = float(np.mean((estimated / np.maximum(noise_std, estimated * 1e-3)) ** 2))
     low, high = problem.latency_range_s
     prior = np.append(problem.space.width**2, (high - low) ** 2) / 12.0
     covariance = np.linalg.inv(hessian * ratio + np.diag(1.0 / prior))

@@ -40,12 +40,26 @@ class Run:
         self._start = time.perf_counter()
         self._earlier_steps, self._earlier_seconds = 0, 0.0
 
-    def note(self, message: str, population: FloatArray, values: Mapping[str, float]) -> None:
-        """Write one generation into the trace and call the callback, which may raise to stop the run."""
+    def note(
+        self,
+        message: str,
+        population: FloatArray,
+        values: Mapping[str, float],
+        latency_s: FloatArray | None = None,
+    ) -> None:
+        """Write one generation into the trace and call the callback, which may raise to stop the run.
+
+        Args:
+            message: One short line.
+            population: What was simulated, (N, K) physical values.
+            values: For the trace.
+            latency_s: Total latency of each member, (N,) [s], where it is searched.
+        """
         self.trace.append({"generation": float(len(self.trace)), **values})
         if self._progress is not None:
             total = max(self.budget.generations, len(self.trace))
-            self._progress(Progress("search", len(self.trace), total, message, population))
+            mean = None if latency_s is None else float(np.mean(latency_s))
+            self._progress(Progress("search", len(self.trace), total, message, population, mean, values))
 
     @property
     def steps(self) -> int:

@@ -8,11 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deal_hw.calib.attempts import Attempts
 from deal_hw.calib.excitation import check_excitation
 from deal_hw.calib.identifiability import MISMATCH_CHI2, Z90, Uncertainty, intervals, uncertainty
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import Polished, polish
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import (
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+    StateStore,
+)
 from deal_hw.types import FloatArray
 
 RESTARTS = 2
@@ -72,11 +80,16 @@ class PolishedMethod(CalibrationMethod[Problem]):
         budget: Budget,
         rng: np.random.Generator,
         progress: ProgressCallback | None = None,
+        checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
-        """Search, polish, scan the latency, state what is known. See :class:`CalibrationMethod`."""
+        """Search, polish, scan the latency, state what is known. See :meth:`CalibrationMethod.run`.
+
+        A resumed run takes finished searches from the checkpoint and polishes again, which draws nothing.
+        """
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
-        searched, polished, restarts = self._until_explained(problem, budget, rng, progress)
+        attempts = Attempts(self.search, problem, rng, checkpoint)
+        searched, polished, restarts = _until_explained(attempts, problem, budget, progress)
         scan = None if problem.fixed_latency_s is not None else scan_latency(problem, polished, progress)
         whole = scan is not None and scan.polished[scan.best].normal.cost < polished.normal.cost + SCAN_WORSE
         if scan is not None and whole:
@@ -115,31 +128,31 @@ class PolishedMethod(CalibrationMethod[Problem]):
             latency_interval_s=known.latency_interval_s,
             chi2=polished.chi2,
             alarms=known.alarms,
-            steps=problem.steps - steps,
-            seconds=time.perf_counter() - began,
+            steps=problem.steps - steps + attempts.earlier_steps,
+            seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
         )
 
-    def _until_explained(
-        self, problem: Problem, budget: Budget, rng: np.random.Generator, progress: ProgressCallback | None
-    ) -> tuple[CalibrationResult, Polished, int]:
-        best: tuple[CalibrationResult, Polished] | None = None
-        attempt, left = 0, budget.generations
-        for attempt in range(1 + RESTARTS):  # noqa: B007
-            searched = self.search.run(problem, dataclasses.replace(budget, generations=left), rng, progress)
-            left -= len(searched.trace)
-            polished = polish_from(problem, searched, progress)
-            previous = best[1].chi2 if best is not None else np.inf
-            if best is None or _better(polished, best[1]):
-                best = (searched, polished)
-            # Two searches that end at the same unexplained residual say that the model is wrong, not the
-            # search.
-            same = abs(polished.chi2 - previous) < SAME_CHI2 * previous
-            if best[1].chi2 < MISMATCH_CHI2 or same or left < FEWEST_GENERATIONS:
-                break
-        if best is None:
-            raise RuntimeError("unreachable: at least one search is run")
-        return (*best, attempt)
+
+def _until_explained(
+    attempts: Attempts, problem: Problem, budget: Budget, progress: ProgressCallback | None
+) -> tuple[CalibrationResult, Polished, int]:
+    best: tuple[CalibrationResult, Polished] | None = None
+    attempt, left = 0, budget.generations
+    for attempt in range(1 + RESTARTS):
+        searched = attempts.run(attempt, dataclasses.replace(budget, generations=left), progress)
+        left -= len(searched.trace)
+        polished = polish_from(problem, searched, progress)
+        previous = best[1].chi2 if best is not None else np.inf
+        if best is None or _better(polished, best[1]):
+            best = (searched, polished)
+        # Two searches that end at the same unexplained residual say that the model is wrong, not the search.
+        same = abs(polished.chi2 - previous) < SAME_CHI2 * previous
+        if best[1].chi2 < MISMATCH_CHI2 or same or left < FEWEST_GENERATIONS:
+            break
+    if best is None:
+        raise RuntimeError("unreachable: at least one search is run")
+    return (*best, attempt)
 
 
 def _better(a: Polished, b: Polished) -> bool:
@@ -156,7 +169,7 @@ def polish_from(problem: Problem, searched: CalibrationResult, progress: Progres
 
     def notify(done: int, chi2: float) -> None:
         if progress is not None:
-            progress(Progress("polish", done, done, f"chi2 {chi2:.3g}"))
+            progress(Progress("polish", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
 
     return polish(problem, searched.estimate, latency, fixed_latency=fixed, notify=notify)
 

@@ -1,7 +1,8 @@
 """A calibration problem: recordings on the device's time grid, a batched simulator, and what is searched.
 
 Every method sees the data through this class, so that all of them use the same simulator, the same start
-states and the same count of simulated steps.
+states and the same count of simulated steps. States have C chart coordinates and as many velocities; what was
+measured of them are the M channels that predictions are compared with.
 """
 
 from __future__ import annotations
@@ -10,38 +11,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.signal import savgol_coeffs
 
 from deal_hw.calib.noise import NoiseModel, noise_model, white_noise_std
-from deal_hw.errors import InsufficientDataError
+from deal_hw.calib.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
+from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.batch import ServoBatch
 from deal_hw.sim.episode import Episode, fill_gaps
 from deal_hw.sim.model import RobotModel
 from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
+
+__all__ = [
+    "LATENCY_RANGE_S", "NOISE_FREE_STD", "SMOOTHING_S", "Prediction", "Problem", "StartStates", "WindowData",
+    "smooth_states",
+]  # fmt: skip
 
 WIRE_RESOLUTION = 1e-6
 """Positions travel as whole micrometres and microradians."""
 
 LATENCY_RANGE_S = (0.0, 0.04)
 
+VELOCITY_PRIOR_STD = {"m": 3.0, "rad": 30.0}
+"""Weak prior on start velocities, in m/s and rad/s: keeps windows of few samples solvable."""
 
-@dataclass(frozen=True, slots=True)
-class StartStates:
-    """Smoothed states at every sample of an episode, with their uncertainty.
+EXACT_STD = 1e-5
+"""What residuals are measured by where nothing is noisy [m or rad]: far above rounding, far below sensors."""
 
-    Attributes:
-        position: (T, J).
-        velocity: (T, J).
-        position_std: Standard deviation of a smoothed position, (J,).
-        velocity_std: Standard deviation of a smoothed velocity, (J,).
-    """
-
-    position: FloatArray
-    velocity: FloatArray
-    position_std: FloatArray
-    velocity_std: FloatArray
+UNSEEN_STD = 1e-6
+"""Prior on a base's place on the floor where nobody measured it: no trajectory depends on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,22 +49,40 @@ class WindowData:
     Attributes:
         episode: Index of the episode.
         windows: W windows of H samples.
-        measured: Reported positions at the predicted samples, (W, H, J).
-        start_position: Smoothed positions at the starts, (W, J).
-        start_velocity: Smoothed velocities at the starts, (W, J).
-        reported_start: Reported positions at the starts, (W, J).
-        std: Standard deviation of the measured positions, (W, H, J); infinite where none was reported.
-        start_std: Standard deviation of the reported start positions, (W, J).
+        measured: Measured channels at the predicted samples, (W, H, M).
+        std: Standard deviation of the measured channels, (W, H, M); infinite where none was reported.
+        start_position: Smoothed positions at the starts, (W, C).
+        start_velocity: Smoothed velocities at the starts, (W, C).
+        prior_mean: What is known of the start states beside what the window predicts: the measurement at the
+            start, or an estimate, or a weak guess, (W, 2 C).
+        prior_std: Standard deviation of ``prior_mean``, (W, 2 C).
+        prior_counts: Which entries of ``prior_mean`` are as good as a measurement, (2 C,).
     """
 
     episode: int
     windows: Windows
     measured: FloatArray
+    std: FloatArray
     start_position: FloatArray
     start_velocity: FloatArray
-    reported_start: FloatArray
-    std: FloatArray
-    start_std: FloatArray
+    prior_mean: FloatArray
+    prior_std: FloatArray
+    prior_counts: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What N members predict of W windows of H samples; NaN where a member diverged.
+
+    Attributes:
+        observed: The measured channels, (N, W, H, M).
+        position: Chart coordinates, (N, W, H, C).
+        velocity: (N, W, H, C).
+    """
+
+    observed: FloatArray
+    position: FloatArray
+    velocity: FloatArray
 
 
 @dataclass(slots=True)
@@ -76,11 +92,15 @@ class Problem:
     Attributes:
         robot: The nominal model.
         space: What is searched.
-        episodes: The recordings to fit; short gaps are filled in and not fitted to.
+        episodes: The recordings to fit; short gaps are filled in and not fitted to. All measure the same
+            channels.
         threads: Simulation threads; None for all CPUs.
         latency_range_s: Total latencies that are searched [s].
         fixed_latency_s: A latency that is given; None to search it.
-        noise_std: Noise of positions over all speeds, (J,).
+        known_std: Standard deviation of every entry of (position, velocity), (2 C,), where it is known or
+            chosen; None to estimate it from the recordings.
+        channels: Indices of the measured channels into (position, velocity), (M,).
+        noise_std: Noise of (position, velocity) over all speeds, (2 C,); only measured entries mean anything.
         noise: Noise at rest and jitter of the samples' time.
         starts: Smoothed states of each episode.
     """
@@ -91,6 +111,8 @@ class Problem:
     threads: int | None = None
     latency_range_s: tuple[float, float] = LATENCY_RANGE_S
     fixed_latency_s: float | None = None
+    known_std: FloatArray | None = None
+    channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
@@ -100,11 +122,44 @@ class Problem:
         if not self.episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
         self.episodes = [fill_gaps(e) for e in self.episodes]
-        floor = WIRE_RESOLUTION / np.sqrt(12.0)
-        self.noise_std = np.max([white_noise_std(e.position, floor) for e in self.episodes], axis=0)
-        self.starts = [smooth_states(e, self.noise_std) for e in self.episodes]
-        positions, velocities = [e.position for e in self.episodes], [s.velocity for s in self.starts]
-        self.noise = noise_model(positions, velocities, float(floor))
+        self.channels = self.episodes[0].channels
+        if any(not np.array_equal(e.channels, self.channels) for e in self.episodes):
+            raise ConfigurationError("the recordings measure different channels; calibrate them one by one")
+        floor = float(WIRE_RESOLUTION / np.sqrt(12.0))
+        self.noise_std = self._white_noise(floor)
+        rotation = self.robot.rotation
+        self.starts = [smooth_states(e, self.noise_std, rotation) for e in self.episodes]
+        self.noise = self._noise_model(floor)
+
+    def _white_noise(self, floor: float) -> FloatArray:
+        if self.known_std is not None:
+            if self.known_std.shape != (2 * self.coordinates,):
+                raise ConfigurationError(
+                    f"known_std has shape {self.known_std.shape}, expected ({2 * self.coordinates},): positions, "
+                    "then velocities"
+                )
+            return np.maximum(self.known_std, floor)
+        if self.exact:
+            return np.full(2 * self.coordinates, EXACT_STD)
+        found = np.full(2 * self.coordinates, floor)
+        for e in self.episodes:
+            values = np.concatenate([e.position, e.velocity], axis=1)[:, self.channels]
+            found[self.channels] = np.maximum(found[self.channels], white_noise_std(values, floor))
+        return found
+
+    def _noise_model(self, floor: float) -> NoiseModel:
+        if self.known_std is not None or self.exact:
+            return NoiseModel(self.noise_std[self.channels], 0.0)
+        C, rotation = self.coordinates, self.robot.rotation
+        # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.
+        timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
+        columns = self.channels[timed]
+        moved = noise_model(
+            [e.position[:, columns] for e in self.episodes], [s.velocity[:, columns] for s in self.starts], floor
+        )
+        std = self.noise_std[self.channels]
+        std[timed] = moved.position_std
+        return NoiseModel(std, moved.timing_std_s)
 
     @property
     def steps(self) -> int:
@@ -112,15 +167,37 @@ class Problem:
         return sum(batch.steps for batch in self._batches.values())
 
     @property
-    def joints(self) -> int:
-        """Joints J."""
+    def exact(self) -> bool:
+        """Whether all states are known without error, so that windows need not fit where they start."""
+        return all(e.exact for e in self.episodes)
+
+    @property
+    def coordinates(self) -> int:
+        """Chart coordinates C of a state."""
         return int(self.episodes[0].position.shape[1])
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the measured channels, (M,)."""
+        names = self.robot.coordinates
+        every = (*names, *(f"{name}.velocity" for name in names))
+        return tuple(every[c] for c in self.channels)
 
     def batch(self, count: int) -> ServoBatch:
         """Return the simulator of ``count`` members; made once for each count."""
         if count not in self._batches:
             self._batches[count] = ServoBatch(self.robot, self.space, count, self.threads)
         return self._batches[count]
+
+    def measured(self, index: int) -> FloatArray:
+        """Return the measured channels of an episode, (T, M)."""
+        episode = self.episodes[index]
+        return np.concatenate([episode.position, episode.velocity], axis=1)[:, self.channels]
+
+    def channel_speed(self, index: int) -> FloatArray:
+        """Return how fast each measured channel changes, (T, M); 0 for velocities."""
+        moved = self.starts[index].velocity
+        return np.concatenate([moved, np.zeros_like(moved)], axis=1)[:, self.channels]
 
     def windows(self, length: int, hop: int | None = None, offset: int = 0) -> list[WindowData]:
         """Cut all episodes into windows of ``length`` samples.
@@ -142,24 +219,47 @@ class Problem:
                 problem = str(err)
                 continue
             starts = self.starts[index]
-            std = self.noise.std(starts.velocity)
+            std = self.noise.std(self.channel_speed(index))
             if episode.reported is not None:
                 std = np.where(episode.reported[:, None], std, np.inf)
+            mean, spread, counts = self._prior(index, std)
             found.append(
                 WindowData(
                     episode=index,
                     windows=windows,
-                    measured=episode.position[windows.samples()],
+                    measured=self.measured(index)[windows.samples()],
+                    std=std[windows.samples()],
                     start_position=starts.position[windows.start],
                     start_velocity=starts.velocity[windows.start],
-                    reported_start=episode.position[windows.start],
-                    std=std[windows.samples()],
-                    start_std=std[windows.start],
+                    prior_mean=mean[windows.start],
+                    prior_std=spread[windows.start],
+                    prior_counts=counts,
                 )
             )
         if not found:
             raise InsufficientDataError(problem)
         return found
+
+    def _prior(
+        self, index: int, std: FloatArray
+    ) -> tuple[FloatArray, FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+        """Return what is known of each state without prediction: mean and std, (T, 2 C), and what counts."""
+        episode, C = self.episodes[index], self.coordinates
+        T = len(episode.sample)
+        weak = np.array([VELOCITY_PRIOR_STD[unit] for unit in self.robot.coordinate_units])
+        # The weak prior on velocities is centred on zero; it only guards the inverse.
+        mean = np.concatenate([episode.position, np.zeros((T, C))], axis=1)
+        spread = np.concatenate([np.full((T, C), UNSEEN_STD), np.repeat(weak[None], T, axis=0)], axis=1)
+        counts = np.concatenate([np.ones(C, dtype=bool), np.zeros(C, dtype=bool)])
+        if episode.estimate_std is not None:
+            estimate = np.broadcast_to(episode.estimate_std, (T, 2 * C))
+            known = np.isfinite(estimate).all(axis=0)
+            states = np.concatenate([episode.position, episode.velocity], axis=1)
+            mean[:, known], spread[:, known] = states[:, known], estimate[:, known]
+            counts |= known
+        mean[:, self.channels], spread[:, self.channels] = self.measured(index), std
+        counts[self.channels] = True
+        return mean, spread, counts
 
     def predict(
         self,
@@ -168,78 +268,40 @@ class Problem:
         data: WindowData,
         position: FloatArray | None = None,
         velocity: FloatArray | None = None,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> Prediction:
         """Predict windows with N parameter vectors.
 
         Args:
             theta: Physical values, (N, K).
             latency_s: Total latency of each member, (N,) [s].
             data: The windows.
-            position: Start positions, (W, J) or (N, W, J); the smoothed ones by default.
+            position: Start positions, (W, C) or (N, W, C); the smoothed ones by default.
             velocity: Start velocities, likewise.
-
-        Returns:
-            Positions and velocities, (N, W, H, J) each; NaN where a member diverged.
         """
         batch = self.batch(len(theta))
         batch.set_parameters(theta)
-        episode = self.episodes[data.episode]
-        path = setpoints(batch, episode, latency_s)
-        return predict_windows(
+        path = setpoints(batch, self.episodes[data.episode], latency_s)
+        return self.predict_along(batch, path, data, position, velocity)
+
+    def predict_along(
+        self,
+        batch: ServoBatch,
+        path: FloatArray,
+        data: WindowData,
+        position: FloatArray | None = None,
+        velocity: FloatArray | None = None,
+    ) -> Prediction:
+        """Predict windows with members whose parameters are set, along given set-points, (N, S, A)."""
+        x, v = predict_windows(
             batch,
-            episode,
+            self.episodes[data.episode],
             data.windows,
             data.start_position if position is None else position,
             data.start_velocity if velocity is None else velocity,
             path,
         )
-
-
-SMOOTHING_S = 0.1
-SMOOTHING_ORDER = 3
-NOISE_FREE_STD = 2e-5
-
-
-def smooth_states(episode: Episode, noise_std: FloatArray) -> StartStates:
-    """Estimate the state at every sample by local polynomials (Savitzky-Golay).
-
-    Positions that are free of noise are left alone, and so are the reported velocities then: smoothing would
-    only round off the impacts.
-
-    Args:
-        episode: The recording.
-        noise_std: Noise of the positions, (J,).
-    """
-    if np.all(noise_std < NOISE_FREE_STD):
-        return StartStates(
-            episode.position, episode.velocity, np.maximum(noise_std, 1e-7), np.full_like(noise_std, 1e-4)
-        )
-    period = episode.period_s
-    length = max(2 * round(SMOOTHING_S / period / 2) + 1, SMOOTHING_ORDER + 2)
-    half = length // 2
-    T = len(episode.sample)
-    if length > T:
-        raise InsufficientDataError(
-            f"the recording has {T} usable samples, the shortest that can be smoothed has {length}; "
-            "record longer"
-        )
-    position, velocity = np.empty_like(episode.position), np.empty_like(episode.position)
-    centre = savgol_coeffs(length, SMOOTHING_ORDER, use="dot")
-    slope = savgol_coeffs(length, SMOOTHING_ORDER, deriv=1, delta=period, use="dot")
-    for t in range(T):
-        first = min(max(t - half, 0), T - length)
-        at = t - first
-        if at == half:
-            weights, rates = centre, slope
-        else:
-            weights = savgol_coeffs(length, SMOOTHING_ORDER, pos=at, use="dot")
-            rates = savgol_coeffs(length, SMOOTHING_ORDER, deriv=1, delta=period, pos=at, use="dot")
-        section = episode.position[first : first + length]
-        position[t], velocity[t] = weights @ section, rates @ section
-    # Twice the propagated noise: kinks of stick-slip and saturation are not polynomials.
-    return StartStates(
-        position,
-        velocity,
-        2 * noise_std * float(np.linalg.norm(centre)),
-        2 * noise_std * float(np.linalg.norm(slope)),
-    )
+        C, channels = x.shape[-1], self.channels
+        if np.array_equal(channels, np.arange(C)):
+            return Prediction(x, x, v)
+        observed = np.concatenate([x[..., channels[channels < C]], v[..., channels[channels >= C] - C]], axis=-1)
+        return Prediction(observed, x, v)

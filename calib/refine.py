@@ -108,7 +108,8 @@ def polish(
     return result
 
 
-def _bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
+def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Return the least and greatest parameters in their own scale, the latency [s] last, (K + 1,) each."""
     space = problem.space
     low, high = problem.latency_range_s
     return np.append(space.to_scale(space.low), low), np.append(space.to_scale(space.high), high)
@@ -117,12 +118,15 @@ def _bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
 def _solve(
     shooting: Shooting, point: Point, iterations: int, fixed_latency: bool
 ) -> tuple[Point, Normal, int]:
-    low, high = _bounds(shooting.problem)
+    low, high = value_bounds(shooting.problem)
     normal = shooting.normal(point)
     used = 0
     for _ in range(iterations):
         used += 1
-        steps = [_step(point, normal, damping, low, high, fixed_latency) for damping in DAMPINGS]
+        steps = [
+            damped_step(point.value, normal.gradient, normal.hessian, damping, low, high, fixed_latency)
+            for damping in DAMPINGS
+        ]
         candidates = [shooting.moved(point, normal, step) for step in steps]
         costs = shooting.costs(candidates)
         best = int(np.argmin(costs))
@@ -136,22 +140,41 @@ def _solve(
     return point, normal, used
 
 
-def _step(
-    point: Point, normal: Normal, damping: float, low: FloatArray, high: FloatArray, fixed_latency: bool
+def damped_step(
+    value: FloatArray,
+    gradient: FloatArray,
+    hessian: FloatArray,
+    damping: float,
+    low: FloatArray,
+    high: FloatArray,
+    fixed_latency: bool,
 ) -> FloatArray:
-    free = np.ones(len(point.value), dtype=bool)
+    """Return the Levenberg-Marquardt step inside the range, (K + 1,).
+
+    Args:
+        value: Parameters in their own scale, then the latency [s], (K + 1,).
+        gradient: Half the cost's gradient there, (K + 1,).
+        hessian: Half its Gauss-Newton Hessian, (K + 1, K + 1).
+        damping: How much shorter than the Gauss-Newton step.
+        low: Least values, (K + 1,).
+        high: Greatest values, (K + 1,).
+        fixed_latency: Keep the latency.
+    """
+    free = np.ones(len(value), dtype=bool)
     free[-1] = not fixed_latency
     # A parameter at its bound that wants to leave the range stays; the others are solved without it.
-    free &= ~((point.value <= low) & (normal.gradient > 0)) & ~((point.value >= high) & (normal.gradient < 0))
-    step = np.zeros(len(point.value))
+    free &= ~((value <= low) & (gradient > 0)) & ~((value >= high) & (gradient < 0))
+    step = np.zeros(len(value))
+    if not free.any():
+        return step
     scale = np.append(np.ones(len(step) - 1), 100.0)  # 10 ms of latency count like a factor e.
     limit = np.append(np.full(len(step) - 1, STEP_LIMIT), LATENCY_STEP_LIMIT_S)
-    H = normal.hessian[np.ix_(free, free)]
+    H = hessian[np.ix_(free, free)]
     # Levenberg's damping in units of the parameters' scale beside Marquardt's relative one: a parameter
     # that the data cannot see (a limit never reached) must not run away.
     weight = np.diag(H) + np.max(np.diag(H) / scale[free] ** 2) * 1e-9 * scale[free] ** 2 + scale[free] ** 2
-    step[free] = -np.linalg.solve(H + damping * np.diag(weight), normal.gradient[free])
+    step[free] = -np.linalg.solve(H + damping * np.diag(weight), gradient[free])
     shrink = np.max(np.abs(step) / limit)
     if shrink > 1:
         step = step / shrink
-    return np.asarray(np.clip(point.value + step, low, high) - point.value)
+    return np.asarray(np.clip(value + step, low, high) - value)

@@ -13,6 +13,7 @@ from deal_hw.calib.innovations import ADVANCE_S
 from deal_hw.calib.problem import Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.chart import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.episode import Episode
 from deal_hw.sim.servo import delay, slew
 from deal_hw.sim.windows import setpoints
@@ -116,7 +117,11 @@ def rollout_population(
     batch = problem.batch(len(members.theta))
     batch.set_parameters(members.theta)
     starts, first = problem.starts[index], int(ticks.sample[0])
-    batch.set_state(starts.position[first], starts.velocity[first])
+    batch.set_state(
+        starts.position[first],
+        starts.velocity[first],
+        reference=None if episode.reference is None else episode.reference[first],
+    )
     if policy is None:
         return _replay(batch, episode, members, ticks)
     return _closed_loop(batch, episode, members, ticks, policy)
@@ -244,5 +249,9 @@ def demonstration(problem: Problem, index: int, ticks: Ticks) -> npt.NDArray[np.
     method.
     """
     starts, episode = problem.starts[index], problem.episodes[index]
-    position, velocity = starts.position[ticks.sample][None], starts.velocity[ticks.sample][None]
-    return np.asarray(transitions(position, velocity, episode.target[ticks.action][None])[0])
+    position, velocity = starts.position[ticks.sample].copy(), starts.velocity[ticks.sample]
+    if episode.reference is not None:
+        # A rollout is far from the recording: both are put in one chart, that of the identity.
+        turned = to_quaternion(position[:, problem.robot.rotation], episode.reference[ticks.sample])
+        position[:, problem.robot.rotation] = to_vector(turned, IDENTITY)
+    return np.asarray(transitions(position[None], velocity[None], episode.target[ticks.action][None])[0])

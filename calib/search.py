@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.checkpoint import Checkpoint, State, generator_state, restore_generator
+from deal_hw.calib.checkpoint import State, generator_state, restore_generator
 from deal_hw.calib.outcome import Run
 from deal_hw.calib.problem import Problem
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
+from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback, StateStore
 
 
 class Stepper(abc.ABC):
@@ -56,17 +56,9 @@ class Search(CalibrationMethod[Problem]):
         budget: Budget,
         rng: np.random.Generator,
         progress: ProgressCallback | None = None,
-        checkpoint: Checkpoint | None = None,
+        checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
-        """Search to the end; see :class:`deal_hw.calibration.CalibrationMethod`.
-
-        Args:
-            problem: Data and simulator.
-            budget: How much may be used.
-            rng: The only source of randomness.
-            progress: Called after each generation.
-            checkpoint: Where the state is saved after each generation, and resumed from where there is one.
-        """
+        """Search to the end; see :meth:`deal_hw.calibration.CalibrationMethod.run`."""
         run = Run(self.name, problem, budget, progress)
         stepper = self.begin(run, rng)
         saved = checkpoint.load() if checkpoint is not None else None

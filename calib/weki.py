@@ -7,16 +7,17 @@ the information.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.coordinates import Coordinates, logistic, logit
-from deal_hw.calib.ensemble_kalman import EnsembleKalman
+from deal_hw.calib.checkpoint import State
 from deal_hw.calib.innovations import cut, explained, is_noisy, whitened_residual
+from deal_hw.calib.kalman_search import KalmanStepper
 from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
 
@@ -41,92 +42,133 @@ class WekiSettings:
     stage_generations: int = 20
 
 
-class Weki(CalibrationMethod[Problem]):
-    """Whitened ensemble Kalman inversion.
+@dataclass(frozen=True)
+class Weki(Search):
+    """Whitened ensemble Kalman inversion; restarts while the residual is unexplained and the budget lasts.
 
-    Args:
+    Attributes:
         settings: How to run.
     """
 
     name = "weki"
+    settings: WekiSettings = field(default_factory=WekiSettings)
 
-    def __init__(self, settings: WekiSettings | None = None) -> None:
-        self.settings = settings or WekiSettings()
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Weki(run, rng, self.settings)
 
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Calibrate; restarts while the residual is unexplained and the budget has generations left."""
-        run = Run(self.name, problem, budget, progress)
-        coordinates = Coordinates(problem)
-        best: tuple[float, FloatArray] | None = None
-        restarts = -1
-        while len(run.trace) < budget.generations:
-            restarts += 1
-            chi2, z = self._search(run, coordinates, rng)
-            if best is None or chi2 < best[0]:
-                best = (chi2, z)
-            if chi2 <= self.settings.restart_chi2:
-                break
-        if best is None:
-            best = (float("nan"), logit(coordinates.sample(rng, budget.population)))
-        chi2, z = best
+
+class _Weki(KalmanStepper):
+    """A run of `weki`: searches, each of several stages, each of several generations."""
+
+    def __init__(self, run: Run, rng: np.random.Generator, settings: WekiSettings) -> None:
+        super().__init__(run, rng, settings.step_clip)
+        self._settings = settings
+        self._lengths = settings.noisy_ticks if is_noisy(run.problem) else settings.clean_ticks
+        self._restarts = 0
+        self._best: tuple[float, FloatArray] | None = None
+        self._over = run.budget.generations <= 0
+        self._offsets: list[FloatArray] | None = None
+        self._enter_stage(0)
+
+    @property
+    def finished(self) -> bool:
+        """Whether a search has explained the recording, or the budget is used up."""
+        return self._over
+
+    def step(self) -> None:
+        """One Kalman step; at the end of a stage or search also the beginning of the next."""
+        z = self.kalman.ask()
+        members, centre = self.population(z)
+        problem = self.run.problem
+        step = self.kalman.tell(whitened_residual(problem, members, centre, self._windows, self._offsets))
+        self._generation += 1
+        ticks = self._lengths[self._stage]
+        self.run.note(
+            f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
+            members.theta,
+            {
+                "ticks": float(ticks),
+                "misfit": step.misfit,
+                "spread": step.spread,
+                "inflation": step.inflation,
+                "tempering": self.kalman.tempering,
+            },
+            members.latency_s,
+        )
+        while self._stage_over and not self._over:
+            if self._stage + 1 < len(self._lengths):
+                self._enter_stage(self._stage + 1)
+            else:
+                self._end_search()
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`."""
+        chi2, z = self._best or (float("nan"), self.kalman.ask())
         alarms = []
-        if not chi2 <= self.settings.restart_chi2:
+        if not chi2 <= self._settings.restart_chi2:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(run.trace)} generations; "
+                f"{len(self.run.trace)} generations; "
                 "allow more generations, widen the ranges, or suspect the model"
             )
-        return run.result(
-            coordinates,
-            coordinates.members(logistic(z.mean(axis=0, keepdims=True))),
-            coordinates.members(logistic(z)),
-            settings=self.settings,
+        members, centre = self.population(z)
+        return self.run.result(
+            self.coordinates,
+            centre,
+            members,
+            settings=self._settings,
             chi2=chi2,
             alarms=alarms,
-            extra={"restarts": restarts, "interval": "ensemble spread, uncalibrated"},
+            extra={"restarts": self._restarts, "interval": "ensemble spread, uncalibrated"},
         )
 
-    def _search(
-        self, run: Run, coordinates: Coordinates, rng: np.random.Generator
-    ) -> tuple[float, FloatArray]:
-        problem, budget, settings = run.problem, run.budget, self.settings
-        kalman = EnsembleKalman(
-            logit(coordinates.sample(rng, budget.population)), rng, step_clip=settings.step_clip
+    def save(self) -> dict[str, Any]:
+        """See :meth:`Stepper.save`."""
+        return {
+            "kalman": self.kalman.save(),
+            "restarts": self._restarts,
+            "best": self._best,
+            "over": self._over,
+            "stage": self._stage,
+            "generation": self._generation,
+            "offsets": self._offsets,
+        }
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._enter_stage(state["stage"])
+        self.kalman.load(state["kalman"])
+        self._restarts, self._over = state["restarts"], state["over"]
+        self._best = None if state["best"] is None else (state["best"][0], state["best"][1])
+        self._generation, self._offsets = state["generation"], state["offsets"]
+
+    @property
+    def _stage_over(self) -> bool:
+        return (
+            self.kalman.finished
+            or self._generation >= self._settings.stage_generations
+            or len(self.run.trace) >= self.run.budget.generations
         )
-        lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
-        for stage, ticks in enumerate(lengths):
-            windows = cut(problem, ticks)
-            offsets: list[FloatArray] | None = None
-            if stage:
-                kalman.widen(settings.widen)
-                # From the second stage on the population is near enough to say better than a smoother where
-                # each window began: start states are linearised anew around the last generation's most
-                # probable ones.
-                offsets = [np.zeros((len(d.windows), 2 * problem.joints)) for d in windows]
-            for _ in range(settings.stage_generations):
-                if kalman.finished or len(run.trace) >= budget.generations:
-                    break
-                z = kalman.ask()
-                members = coordinates.members(logistic(z))
-                centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-                step = kalman.tell(whitened_residual(problem, members, centre, windows, offsets))
-                run.note(
-                    f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
-                    members.theta,
-                    {
-                        "ticks": float(ticks),
-                        "misfit": step.misfit,
-                        "spread": step.spread,
-                        "inflation": step.inflation,
-                        "tempering": kalman.tempering,
-                    },
-                )
-        z = kalman.ask()
-        centre = coordinates.members(logistic(z.mean(axis=0, keepdims=True)))
-        return explained(problem, centre, lengths[-1]), z
+
+    def _enter_stage(self, stage: int) -> None:
+        self._stage, self._generation = stage, 0
+        self._windows = cut(self.run.problem, self._lengths[stage])
+        self._offsets = None
+        if stage:
+            self.kalman.widen(self._settings.widen)
+            # From the second stage on the population is near enough to say better than a smoother where each
+            # window began: start states are linearised anew around the last generation's most probable ones.
+            self._offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self._windows]
+
+    def _end_search(self) -> None:
+        z = self.kalman.ask()
+        chi2 = explained(self.run.problem, self.population(z)[1], self._lengths[-1])
+        if self._best is None or chi2 < self._best[0]:
+            self._best = (chi2, z)
+        if chi2 <= self._settings.restart_chi2 or len(self.run.trace) >= self.run.budget.generations:
+            self._over = True
+            return
+        self._restarts += 1
+        self.kalman = self.new_ensemble()
+        self._enter_stage(0)

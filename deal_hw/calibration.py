@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,8 @@ class Progress:
         total: Units expected; may grow.
         message: One short line.
         population: The current population, (N, K) physical values, or None.
+        latency_s: The population's mean total latency [s], or None.
+        values: What else is known of this generation or iteration, as in the result's trace.
     """
 
     stage: str
@@ -33,6 +35,8 @@ class Progress:
     total: int
     message: str = ""
     population: FloatArray | None = None
+    latency_s: float | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -162,6 +166,20 @@ class CalibrationResult:
         )
 
 
+class StateStore(Protocol):
+    """Where a method keeps what it needs to continue: nested mappings of plain values and arrays."""
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Replace what is kept, wholly or not at all."""
+
+    def load(self) -> Mapping[str, Any] | None:
+        """Return what is kept, or None.
+
+        Raises:
+            DealHwError: It is of another run, or unreadable.
+        """
+
+
 class CalibrationMethod(abc.ABC, Generic[ProblemT]):
     """A way to calibrate: it knows a problem (data and simulator); the optimiser inside knows neither."""
 
@@ -174,6 +192,7 @@ class CalibrationMethod(abc.ABC, Generic[ProblemT]):
         budget: Budget,
         rng: np.random.Generator,
         progress: ProgressCallback | None = None,
+        checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
         """Calibrate.
 
@@ -182,4 +201,6 @@ class CalibrationMethod(abc.ABC, Generic[ProblemT]):
             budget: How much may be used.
             rng: The only source of randomness: the same generator state gives the same result.
             progress: Called after each generation; may raise to stop the run.
+            checkpoint: Kept up to date after each generation. What it holds at the start is continued, to
+                the same numbers as without the interruption; then ``rng`` is set to what was saved.
         """

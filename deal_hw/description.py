@@ -7,12 +7,15 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
+
+ACTUATIONS: Final = ("position", "motor")
+"""How actuators take commands: set-points of a P-D position loop, or efforts as a share of the limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,13 +84,17 @@ class RobotDescription:
         stiffness: Default kp, (A,).
         damping: Default kd, (A,).
         effort_limit: Default effort limit, (A,).
-        speed_limit: Default speed limit of the set-point, (A,).
+        speed_limit: Default speed limit of the set-point, (A,); infinite without a set-point generator.
         control_rate_hz: Rate of commands.
         device_rate_hz: Rate of the P-D loop inside the device.
         state_rate_hz: Rate of state samples.
         limits: What the safety filter enforces.
         sensor: The nominal sensor model.
         mjcf: The robot's MuJoCo model.
+        actuation: "position": commands are set-points of a P-D loop; "motor": commands are efforts, -1..1 of
+            ``effort_limit``, and stiffness and damping are 0.
+        floating_base: Name of the free joint that carries the robot; None for a fixed base. It is not among
+            ``joint_names``.
         sources: Where each number comes from, by attribute name.
     """
 
@@ -106,6 +113,8 @@ class RobotDescription:
     limits: SafetyLimits
     sensor: SensorModel
     mjcf: Path
+    actuation: str = "position"
+    floating_base: str | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -113,6 +122,15 @@ class RobotDescription:
         if unknown:
             raise ConfigurationError(
                 f"robot {self.name!r}: actuated joints {unknown} are not among {self.joint_names}"
+            )
+        if self.actuation not in ACTUATIONS:
+            raise ConfigurationError(
+                f"robot {self.name!r}: actuation is {self.actuation!r}; allowed: {', '.join(ACTUATIONS)}"
+            )
+        if self.floating_base in self.joint_names:
+            raise ConfigurationError(
+                f"robot {self.name!r}: the free joint {self.floating_base!r} must not be among joint_names, "
+                "which hold one coordinate each"
             )
         J, A = len(self.joint_names), len(self.actuated)
         for name, length in (
@@ -141,6 +159,10 @@ class RobotDescription:
         values = dataclasses.asdict(self)
         values["mjcf"] = hashlib.sha256(self.mjcf.read_bytes()).hexdigest()
         values["sources"] = dict(self.sources)
+        # A default stays out: a description written before the field existed keeps its digest.
+        for name, default in (("actuation", "position"), ("floating_base", None)):
+            if values[name] == default:
+                del values[name]
         return values
 
     def digest(self) -> str:

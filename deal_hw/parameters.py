@@ -36,6 +36,9 @@ class Parameter:
         high: Upper end of the search range.
         scale: Whether equal steps are equal ratios ("log") or equal differences ("linear").
         known: Measured by other means (ruler, scale); not searched.
+        prior_mean: Physical value that the parameter is expected to have; None: nothing is expected.
+        prior_std: Standard deviation of that expectation in the parameter's own scale: a share of the value
+            (0.05 for 5 %) on a log scale, the unit itself on a linear one.
     """
 
     name: str
@@ -47,6 +50,18 @@ class Parameter:
     high: float
     scale: Scale = "log"
     known: bool = False
+    prior_mean: float | None = None
+    prior_std: float | None = None
+
+    @classmethod
+    def around(
+        cls, name: str, kind: str, elements: Iterable[str], unit: str, nominal: float, ratio: float = 5.0
+    ) -> Parameter:
+        """Return a parameter on a log scale, searched a factor ``ratio`` to either side of its nominal."""
+        return cls(
+            name=name, kind=kind, elements=tuple(elements), unit=unit, nominal=nominal,
+            low=nominal / ratio, high=nominal * ratio,
+        )  # fmt: skip
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
@@ -64,6 +79,33 @@ class Parameter:
                 f"parameter {self.name!r}: the nominal value {self.nominal:g} lies outside "
                 f"[{self.low:g}, {self.high:g}] {self.unit}; widen the range or correct the model"
             )
+        self._check_prior()
+
+    def _check_prior(self) -> None:
+        if (self.prior_mean is None) != (self.prior_std is None):
+            raise ConfigurationError(
+                f"parameter {self.name!r}: a prior needs both mean and std, got mean={self.prior_mean}, "
+                f"std={self.prior_std}"
+            )
+        if self.prior_mean is None or self.prior_std is None:
+            return
+        if not (np.isfinite(self.prior_std) and self.prior_std > 0):
+            raise ConfigurationError(
+                f"parameter {self.name!r}: prior std must be above 0, got {self.prior_std:g}"
+            )
+        if not self.low <= self.prior_mean <= self.high:
+            raise ConfigurationError(
+                f"parameter {self.name!r}: the prior's mean {self.prior_mean:g} lies outside "
+                f"[{self.low:g}, {self.high:g}] {self.unit}"
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; a prior is there only where there is one."""
+        values = dataclasses.asdict(self)
+        if self.prior_mean is None:
+            # Policies carry a digest of these values: those made before priors existed must keep theirs.
+            del values["prior_mean"], values["prior_std"]
+        return values
 
 
 class ParameterSpace:
@@ -132,6 +174,16 @@ class ParameterSpace:
         return self.from_scale(self._offset + np.asarray(unit) * self._width)
 
     @property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean, in physical units, and standard deviation, in each parameter's own scale, (K,) each.
+
+        Where nothing is expected: the nominal value and infinity.
+        """
+        mean = np.array([p.nominal if p.prior_mean is None else p.prior_mean for p in self.free], dtype=float)
+        std = np.array([np.inf if p.prior_std is None else p.prior_std for p in self.free], dtype=float)
+        return mean, std
+
+    @property
     def width(self) -> FloatArray:
         """Width of the range in its own scale, (K,): ln(high / low) or high - low."""
         return self._width.copy()
@@ -191,7 +243,7 @@ class ParameterSpace:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain JSON values."""
-        return [dataclasses.asdict(p) for p in self.parameters]
+        return [p.to_json() for p in self.parameters]
 
     @classmethod
     def from_json(cls, values: Iterable[Mapping[str, Any]]) -> ParameterSpace:

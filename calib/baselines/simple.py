@@ -5,15 +5,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import abc
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from deal_hw.calib.checkpoint import State
 from deal_hw.calib.coordinates import Coordinates, Members
 from deal_hw.calib.innovations import cut, explained, whitened_residual
 from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 
@@ -22,55 +26,81 @@ class NoSettings:
     """Settings of a method that has none."""
 
 
-class Centre(CalibrationMethod[Problem]):
-    """Return the centre of every range, in the range's own scale, and the whole range as interval."""
+@dataclass(frozen=True)
+class _Ignorant(Search):
+    """A method that looks at nothing and states the whole range as interval.
+
+    Attributes:
+        settings: None.
+    """
+
+    settings: NoSettings = field(default_factory=NoSettings)
+
+    @abc.abstractmethod
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the estimate, (K,)."""
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Draw(run, rng, self.estimate(run.problem.space))
+
+
+class Centre(_Ignorant):
+    """Return the centre of every range, in the range's own scale."""
 
     name = "centre"
 
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Look at nothing; the population is a uniform draw, so that the interval is the range's."""
-        return _ignorant(self.name, problem, budget, rng, progress, problem.space.center)
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the centre."""
+        return space.center
 
 
-class Nominal(CalibrationMethod[Problem]):
-    """Return the values of the user's own model, and the whole range as interval."""
+class Nominal(_Ignorant):
+    """Return the values of the user's own model."""
 
     name = "nominal"
 
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Look at nothing."""
-        return _ignorant(self.name, problem, budget, rng, progress, problem.space.nominal)
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the nominal values."""
+        return space.nominal
 
 
-def _ignorant(
-    name: str,
-    problem: Problem,
-    budget: Budget,
-    rng: np.random.Generator,
-    progress: ProgressCallback | None,
-    estimate: FloatArray,
-) -> CalibrationResult:
-    run = Run(name, problem, budget, progress)
-    coordinates = Coordinates(problem)
-    population = coordinates.members(coordinates.sample(rng, max(budget.population, 2)))
-    middle = 0.5 * sum(problem.latency_range_s)
-    centre = Members(estimate[None], np.array([coordinates.clip_latency(middle)]))
-    run.note("no data is read", population.theta, {})
-    return run.result(
-        coordinates, centre, population, settings=NoSettings(), extra={"interval": "the range, uncalibrated"}
-    )
+class _Draw(Stepper):
+    """One generation: the population is a uniform draw, so that the interval is the range's."""
+
+    def __init__(self, run: Run, rng: np.random.Generator, estimate: FloatArray) -> None:
+        self._run = run
+        self._coordinates = Coordinates(run.problem)
+        self._unit = self._coordinates.sample(rng, max(run.budget.population, 2))
+        self._estimate = estimate
+
+    @property
+    def finished(self) -> bool:
+        """Whether the one generation was noted."""
+        return bool(self._run.trace)
+
+    def step(self) -> None:
+        """Note the draw."""
+        self._run.note("no data is read", self._coordinates.members(self._unit).theta, {})
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`."""
+        middle = self._coordinates.clip_latency(0.5 * sum(self._run.problem.latency_range_s))
+        return self._run.result(
+            self._coordinates,
+            Members(self._estimate[None], np.array([middle])),
+            self._coordinates.members(self._unit),
+            settings=NoSettings(),
+            extra={"interval": "the range, uncalibrated"},
+        )
+
+    def save(self) -> dict[str, Any]:
+        """See :meth:`Stepper.save`."""
+        return {"unit": self._unit}
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._unit = state["unit"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,54 +109,78 @@ class RandomSettings:
 
     Attributes:
         ticks: Window length in control periods.
-        elite: Members that make the population of the result, best first.
+        elite: Members that make the population of the result, best first; at least 2.
     """
 
     ticks: int = 10
     elite: int = 10
 
 
-class RandomSearch(CalibrationMethod[Problem]):
-    """Draw uniformly, score by the mean absolute whitened window innovation, return the best member."""
+@dataclass(frozen=True)
+class RandomSearch(Search):
+    """Draw uniformly, score by the mean absolute whitened window innovation, return the best member.
+
+    The budget's population times generations are the draws.
+
+    Attributes:
+        settings: How to run.
+    """
 
     name = "random"
+    settings: RandomSettings = field(default_factory=RandomSettings)
 
-    def __init__(self, settings: RandomSettings | None = None) -> None:
-        self.settings = settings or RandomSettings()
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Random(run, rng, self.settings)
 
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Use the budget's population times generations as draws."""
-        run = Run(self.name, problem, budget, progress)
-        coordinates = Coordinates(problem)
-        windows = cut(problem, self.settings.ticks)
-        middle = coordinates.members(np.full((1, coordinates.count), 0.5))
-        kept: list[FloatArray] = []
-        scores: list[FloatArray] = []
-        for _ in range(max(budget.generations, 1)):
-            unit = coordinates.sample(rng, budget.population)
-            members = coordinates.members(unit)
-            # One metric for all draws, that of the range's centre: scores of different metrics do not
-            # compare.
-            score = np.mean(np.abs(whitened_residual(problem, members, middle, windows)), axis=1)
-            kept.append(unit)
-            scores.append(np.where(np.isfinite(score), score, np.inf))
-            run.note(
-                f"best {min(s.min() for s in scores):.3g}", members.theta, {"best": float(scores[-1].min())}
-            )
-        order = np.argsort(np.concatenate(scores))[: max(self.settings.elite, 2)]
-        elite = coordinates.members(np.concatenate(kept)[order])
+
+class _Random(Stepper):
+    """A run of `random`: one draw of a population a generation, of which the best are kept."""
+
+    def __init__(self, run: Run, rng: np.random.Generator, settings: RandomSettings) -> None:
+        self._run, self._rng, self._settings = run, rng, settings
+        self._coordinates = Coordinates(run.problem)
+        self._windows = cut(run.problem, settings.ticks)
+        # One metric for all draws, that of the range's centre: scores of different metrics do not compare.
+        self._middle = self._coordinates.members(np.full((1, self._coordinates.count), 0.5))
+        self._unit = np.empty((0, self._coordinates.count))
+        self._score = np.empty(0)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget's draws, or those of one generation, were made."""
+        return len(self._run.trace) >= max(self._run.budget.generations, 1)
+
+    def step(self) -> None:
+        """Draw and score one population."""
+        unit = self._coordinates.sample(self._rng, self._run.budget.population)
+        members = self._coordinates.members(unit)
+        residual = whitened_residual(self._run.problem, members, self._middle, self._windows)
+        score = np.mean(np.abs(residual), axis=1)
+        score = np.where(np.isfinite(score), score, np.inf)
+        units, scores = np.concatenate([self._unit, unit]), np.concatenate([self._score, score])
+        order = np.argsort(scores, kind="stable")[: max(self._settings.elite, 2)]
+        self._unit, self._score = units[order], scores[order]
+        values = {"best": float(score.min())}
+        self._run.note(f"best {self._score[0]:.3g}", members.theta, values, members.latency_s)
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`."""
+        elite = self._coordinates.members(self._unit)
         best = Members(elite.theta[:1], elite.latency_s[:1])
-        return run.result(
-            coordinates,
+        return self._run.result(
+            self._coordinates,
             best,
             elite,
-            settings=self.settings,
-            chi2=explained(problem, best, self.settings.ticks),
+            settings=self._settings,
+            chi2=explained(self._run.problem, best, self._settings.ticks),
             extra={"interval": "spread of the best draws, uncalibrated"},
         )
+
+    def save(self) -> dict[str, Any]:
+        """See :meth:`Stepper.save`."""
+        return {"unit": self._unit, "score": self._score}
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._unit, self._score = state["unit"], state["score"]

@@ -106,7 +106,7 @@ def calibration_row(
     sensor = find_profile(d.truth.profile).sensor
     bound = fisher_std(
         problem, d.theta, d.truth.latency_s, [d.fit_truth],
-        np.maximum(sensor.position_std, problem.noise_std * 1e-2), length=160,
+        np.maximum(sensor.position_std, problem.noise_std[problem.channels] * 1e-2), length=160,
     )  # fmt: skip
     score = interval_score(d.space, result.interval, d.theta, bound)
     errors = heldout_nrmse(

@@ -17,6 +17,13 @@ import numpy as np
 import tyro
 
 from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.cli.calibrate_live import (
+    CHECKPOINT,
+    check_resume,
+    open_checkpoint,
+    saying_how_to_resume,
+    watching,
+)
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
@@ -82,6 +89,18 @@ class Calibrate:
     threads: int | None = None
     """Simulation threads; by default all CPUs."""
 
+    resume: bool = False
+    """Go on with the calibration that was stopped in this folder; all other settings must be the same."""
+
+    watch: bool = False
+    """Show the population while it searches: in a window, or in a browser where there is no desktop."""
+
+    watch_save: Path | None = None
+    """Write that view to a file, FILE.rrd."""
+
+    report: bool = True
+    """Write report.html, one page with everything; takes some seconds."""
+
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -110,6 +129,9 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     from deal_hw.errors import InsufficientDataError
 
     dataset = Dataset.open(config.dataset)
+    folder = (config.out or config.dataset.resolve().parent) / "calibration"
+    checkpoint = folder / CHECKPOINT
+    check_resume(checkpoint, config.resume)
     fit, holdout = choose_episodes(dataset, config.episodes, config.holdout)
     space = make_space(dataset.description["name"], config)
     recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
@@ -121,18 +143,26 @@ def calibrate(config: Calibrate) -> CalibrateReport:
                 "record again with `deal-hw collect`"
             )
     robot, episodes = _simulation(dataset, recordings)
-    result = calibrate_episodes(
-        robot,
-        space,
-        [episodes[i] for i in fit],
-        [episodes[i] for i in holdout],
-        method=config.method,
-        budget=Budget(population=config.population, generations=config.generations, polish=config.polish),
-        rng=np.random.default_rng(config.seed),
-        latency_s=config.latency,
-        threads=config.threads,
-        quiet=config.quiet,
-    )
+    shown = recordings[fit[0]]
+    with (
+        saying_how_to_resume(checkpoint),
+        watching(config.watch, config.watch_save, space, robot.description, shown, config.latency) as watch,
+    ):
+        result = calibrate_episodes(
+            robot,
+            space,
+            [episodes[i] for i in fit],
+            [episodes[i] for i in holdout],
+            method=config.method,
+            budget=Budget(population=config.population, generations=config.generations, polish=config.polish),
+            rng=np.random.default_rng(config.seed),
+            latency_s=config.latency,
+            threads=config.threads,
+            quiet=config.quiet,
+            checkpoint=checkpoint,
+            resume=config.resume,
+            watch=watch,
+        )
     result = dataclasses.replace(
         result,
         provenance={
@@ -151,8 +181,22 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     )
     from deal_hw.calib.folder import write_result
 
-    folder = (config.out or config.dataset.resolve().parent) / "calibration"
-    files = write_result(folder, robot, result)
+    report = None
+    if config.report:
+        from deal_hw.calib.report.gather import gather
+
+        report = gather(
+            robot,
+            result,
+            [episodes[i] for i in fit],
+            [episodes[i] for i in holdout],
+            telemetry=[
+                f"episode {i}: {v.severity}: {v.message}" for i, t in recordings.items() for v in check(t)
+            ],
+            threads=config.threads,
+        )
+    files = write_result(folder, robot, result, report)
+    checkpoint.unlink(missing_ok=True)
     if not config.quiet:
         print_result(result)
         print("written: " + ", ".join(str(f) for f in files.values()))
@@ -233,6 +277,9 @@ def calibrate_episodes(
     latency_s: float | None = None,
     threads: int | None = None,
     quiet: bool = True,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    watch: ProgressCallback | None = None,
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid; the heart of the verb, without files.
 
@@ -247,6 +294,9 @@ def calibrate_episodes(
         latency_s: Total latency if it is known [s].
         threads: Simulation threads.
         quiet: Show no progress.
+        checkpoint: File that holds the state after each generation; None to keep none.
+        resume: Go on with what that file holds.
+        watch: Called with the progress, too.
     """
     try:
         from deal_hw.calib.methods import make_method
@@ -258,7 +308,17 @@ def calibrate_episodes(
     problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s)
     searcher = make_method(method, polish=budget.polish)
     with show_progress(f"calibrate ({method})", quiet) as report:
-        result = searcher.run(problem, budget, rng, report)
+
+        def progress(p: Progress) -> None:
+            report(p)
+            if watch is not None:
+                watch(p)
+
+        if checkpoint is None:
+            result = searcher.run(problem, budget, rng, progress)
+        else:
+            store = open_checkpoint(checkpoint, resume, problem, searcher, budget, rng)
+            result = searcher.run(problem, budget, rng, progress, store)
     if not holdout:
         return result
     errors = heldout_nrmse(

@@ -1,4 +1,4 @@
-"""`deal-hw data`: tell about recordings, verify them, repair them."""
+"""`deal-hw data`: tell about recordings, verify them, repair them, import and export them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from deal_hw.cli.data_import import Export, Import, export_recordings, import_recordings
 from deal_hw.data.dataset import INDEX_NAME, Dataset
 from deal_hw.data.episode_info import EpisodeInfo, summarize
 from deal_hw.data.repair import RepairReport, repair, verify
@@ -56,10 +57,12 @@ Data = (
     Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
 
-def data(config: Info | Verify | Repair) -> int:
+def data(config: Info | Verify | Repair | Import | Export) -> int:
     """Run the verb.
 
     Returns:
@@ -70,6 +73,10 @@ def data(config: Info | Verify | Repair) -> int:
     """
     if isinstance(config, Info):
         return _info(config)
+    if isinstance(config, Import):
+        return import_recordings(config)
+    if isinstance(config, Export):
+        return export_recordings(config)
     reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))
     if config.json:
         values = [{**asdict(report), "sound": report.sound} for report in reports]

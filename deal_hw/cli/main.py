@@ -105,7 +105,10 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             extra="sim",
         ),
         "data": _verb(
-            "data", help="tell about a dataset, verify it, repair it", example="data info runs/first/dataset"
+            "data",
+            help="tell about a dataset, verify it, repair it, import and export recordings",
+            example="data info runs/first/dataset",
+            extra="sim",
         ),
         "replay": _verb(
             "replay",

@@ -61,12 +61,14 @@ class Dataset:
         self._next = len(episodes)
 
     @classmethod
-    def create_or_open(cls, folder: Path, description: RobotDescription, notify: Notify = print) -> Self:
+    def create_or_open(
+        cls, folder: Path, description: RobotDescription | Mapping[str, Any], notify: Notify = print
+    ) -> Self:
         """Open a dataset for a collector, creating it where there is none; holds its lock until closed.
 
         Args:
             folder: The dataset.
-            description: Of the robot about to be recorded.
+            description: Of the robot about to be recorded, or its plain JSON values.
             notify: Called with a sentence for each repair.
 
         Raises:
@@ -74,6 +76,7 @@ class Dataset:
                 cannot be read or written.
         """
         folder = Path(folder)
+        facts = description.to_json() if isinstance(description, RobotDescription) else dict(description)
         try:
             (folder / "episodes").mkdir(parents=True, exist_ok=True)
             lock = _lock(folder)
@@ -86,9 +89,9 @@ class Dataset:
         try:
             if (folder / INDEX_NAME).exists():
                 dataset = cls._load(folder, lock, notify)
-                _refuse_other(folder, dataset.description, description.to_json())
+                _refuse_other(folder, dataset.description, facts)
             else:
-                dataset = cls(folder, description.to_json(), (), lock, notify)
+                dataset = cls(folder, facts, (), lock, notify)
                 dataset._save()
             dataset._adopt()
         except BaseException:

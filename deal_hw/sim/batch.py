@@ -1,4 +1,10 @@
-"""Batched simulation of a servo-driven robot: N members with their own parameters on one thread pool."""
+"""Batched simulation of one robot: N members with their own parameters on one thread pool.
+
+States are chart coordinates (:mod:`deal_hw.sim.chart`), (N, C): for a floating base position, rotation vector
+and then the joints, for a fixed base the joints alone; velocities are MuJoCo's, in the same order. Joint
+positions are as the robot reports them: each member's encoder bias is added to what comes out and taken from
+what goes in.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +15,14 @@ import numpy.typing as npt
 from mujoco.batch import Batch
 
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim import chart
 from deal_hw.sim.fields import BatchFields
 from deal_hw.sim.model import RobotModel
 from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
 from deal_hw.types import FloatArray
+
+ENCODER_BIAS = "encoder_bias"
+"""Kind of parameter that no MuJoCo field holds: reported minus true joint position."""
 
 
 def default_threads() -> int:
@@ -41,7 +51,16 @@ class ServoBatch:
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._warmstart = self.batch.bind("qacc_warmstart")
         self._nominal = np.array([p.nominal for p in space.parameters])
-        self.speed_limit = np.zeros((count, len(robot.actuator)))
+        self._dof = list(robot.qvel)
+        if robot.base is not None:
+            self._dof = [*range(robot.base[1], robot.base[1] + 6), *self._dof]
+        description = robot.description
+        self._default = {
+            "servo_stiffness": np.array(description.stiffness),
+            "servo_damping": np.array(description.damping),
+            "servo_effort_limit": np.array(description.effort_limit),
+            "servo_speed_limit": np.array(description.speed_limit),
+        }
         self.steps = 0
         self.set_parameters(np.repeat(space.nominal[None], count, axis=0))
 
@@ -56,76 +75,125 @@ class ServoBatch:
         apply_parameters(self._fields, self.space, self._theta)
         self.batch.set_const(ids=where)
         columns = {name: self._theta[:, k] for k, name in enumerate(self.space.names)}
-        self._servo: dict[str, FloatArray] = {}
         description = self.robot.description
-        defaults = {
-            "servo_stiffness": description.stiffness,
-            "servo_damping": description.damping,
-            "servo_effort_limit": description.effort_limit,
-            "servo_speed_limit": description.speed_limit,
+        self._acting = {
+            kind: np.repeat(self._default[kind][None], self.count, axis=0) for kind in SERVO_KINDS
         }
-        for kind in SERVO_KINDS:
-            factor = np.ones((self.count, len(description.actuated)))
-            for p in self.space.parameters:
-                if p.kind != kind:
-                    continue
-                values = columns.get(p.name, np.full(self.count, p.nominal))
-                for name in p.elements:
-                    a = description.actuated.index(name)
-                    factor[:, a] = values / defaults[kind][a]
-            self._servo[kind] = factor
+        self._bias = np.zeros((self.count, len(description.joint_names)))
+        for p in self.space.parameters:
+            values = columns.get(p.name, np.full(self.count, p.nominal))
+            for name in p.elements:
+                if p.kind in SERVO_KINDS:
+                    self._acting[p.kind][:, description.actuated.index(name)] = values
+                elif p.kind == ENCODER_BIAS:
+                    self._bias[:, description.joint_names.index(name)] = values
+        self._biased = bool(np.any(self._bias))
         self.set_sent(
-            np.array(description.stiffness), np.array(description.damping), np.array(description.effort_limit)
+            self._default["servo_stiffness"],
+            self._default["servo_damping"],
+            self._default["servo_effort_limit"],
         )
 
     def servo_factor(self, kind: str) -> FloatArray:
         """Return what the device makes of a sent gain or limit: acting value = factor * sent, (N, A)."""
-        return self._servo[kind]
+        default = self._default[kind]
+        # A gain of zero or a limit of infinity has no factor; what is sent then acts as it is.
+        scalable = np.isfinite(default) & (default != 0)
+        factor = self._acting[kind] / np.where(scalable, default, 1.0)
+        return np.where(scalable, factor, 1.0)
+
+    def _act(self, kind: str, sent: FloatArray) -> FloatArray:
+        default = self._default[kind]
+        scalable = np.isfinite(default) & (default != 0)
+        ratio = np.where(scalable, sent / np.where(scalable, default, 1.0), 1.0)
+        return np.asarray(self._acting[kind] * ratio)
 
     def set_sent(self, stiffness: FloatArray, damping: FloatArray, effort_limit: FloatArray) -> None:
-        """Set the gains and limits that the host sends from now on, (A,) each."""
+        """Set the gains and limits that the host sends from now on, (A,) each; motors take none."""
+        if self.robot.description.actuation != "position":
+            return
         gain, bias = self._fields.get("actuator_gainprm"), self._fields.get("actuator_biasprm")
         force = self._fields.get("actuator_forcerange")
-        for a, actuator in enumerate(self.robot.actuator):
-            kp = self._servo["servo_stiffness"][:, a] * stiffness[a]
-            gain[:, actuator, 0] = kp
-            bias[:, actuator, 1] = -kp
-            bias[:, actuator, 2] = -self._servo["servo_damping"][:, a] * damping[a]
-            limit = self._servo["servo_effort_limit"][:, a] * effort_limit[a]
+        kp, kd = self._act("servo_stiffness", stiffness), self._act("servo_damping", damping)
+        limit = self._act("servo_effort_limit", effort_limit)
+        actuator = list(self.robot.actuator)
+        gain[:, actuator, 0] = kp
+        bias[:, actuator, 1] = -kp
+        bias[:, actuator, 2] = -kd
+        if np.isfinite(limit).all():
             force[:, actuator, 0] = -limit
             force[:, actuator, 1] = limit
 
     def set_state(
-        self, position: FloatArray, velocity: FloatArray, where: npt.NDArray[np.intp] | slice = slice(None)
+        self,
+        position: FloatArray,
+        velocity: FloatArray,
+        where: npt.NDArray[np.intp] | slice = slice(None),
+        reference: FloatArray | None = None,
     ) -> None:
-        """Set joint positions and velocities, (N, J) or (J,) each, of the members in ``where``."""
+        """Set the state, (N, C) or (C,) each, of the members in ``where``.
+
+        Args:
+            position: Chart coordinates.
+            velocity: Their velocities: linear in the world, angular in the base's frame, joints.
+            where: The members.
+            reference: Reference orientation of the chart, (4,) or (N, 4); the identity by default.
+        """
         rows = np.arange(self.count)[where][:, None]
-        self._qpos[rows, list(self.robot.qpos)] = position
-        self._qvel[rows, list(self.robot.qvel)] = velocity
+        joints = position[..., self.robot.joints]
+        self._qpos[rows, list(self.robot.qpos)] = joints - self._bias[rows[:, 0]] if self._biased else joints
+        if self.robot.base is not None:
+            at = self.robot.base[0]
+            self._qpos[rows, [at, at + 1, at + 2]] = position[..., :3]
+            orientation = chart.to_quaternion(
+                position[..., 3:6], chart.IDENTITY if reference is None else reference
+            )
+            self._qpos[rows, [at + 3, at + 4, at + 5, at + 6]] = orientation
+        self._qvel[rows, self._dof] = velocity
         # A warm start left by another episode would make results depend on history in the last digits.
         self._warmstart[rows[:, 0]] = 0.0
 
     @property
     def position(self) -> FloatArray:
-        """Joint positions now, (N, J)."""
-        return np.asarray(self._qpos[:, list(self.robot.qpos)])
+        """Chart coordinates now, (N, C), around the identity."""
+        return self._chart(self._qpos, None)
 
     @property
     def velocity(self) -> FloatArray:
-        """Joint velocities now, (N, J)."""
-        return np.asarray(self._qvel[:, list(self.robot.qvel)])
+        """Velocities now, (N, C)."""
+        return np.asarray(self._qvel[:, self._dof])
 
-    def advance(self, setpoint: FloatArray, every: int = 0) -> tuple[FloatArray, FloatArray]:
+    def _chart(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
+        """Return qpos, (N, ..., nq), as reported chart coordinates, (N, ..., C)."""
+        joints = qpos[..., list(self.robot.qpos)]
+        if self._biased:
+            joints = joints + self._bias.reshape(self.count, *(1,) * (qpos.ndim - 2), -1)
+        if self.robot.base is None:
+            return np.asarray(joints)
+        at = self.robot.base[0]
+        turned = chart.to_vector(
+            qpos[..., at + 3 : at + 7], chart.IDENTITY if reference is None else reference
+        )
+        return np.concatenate([qpos[..., at : at + 3], turned, joints], axis=-1)
+
+    def advance(
+        self, setpoint: FloatArray, every: int = 0, reference: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Advance all members in open loop.
 
         Args:
-            setpoint: Set-point in force at each step, (N, S, A).
+            setpoint: Set-point (or motor command) in force at each step, (N, S, A).
             every: Record each ``every``-th step; 0 records only the last.
+            reference: Reference orientations of the charts at the recorded steps, (S // every, 4); the
+                identity by default.
 
         Returns:
-            Positions and velocities after steps every, 2 every, ..., (N, S // every, J) each. A member that
+            Positions and velocities after steps every, 2 every, ..., (N, S // every, C) each. A member that
             diverged (MuJoCo's warning counters rose) is NaN from there on.
         """
+        if self._biased and self.robot.description.actuation == "position":
+            # The servo compares the set-point with the biased reading.
+            setpoint = setpoint - self._bias[:, None, list(self.robot.description.actuated_index)]
         count, steps, _ = setpoint.shape
         nu = self.robot.model.nu
         if nu != setpoint.shape[2] or list(self.robot.actuator) != list(range(nu)):
@@ -139,8 +207,8 @@ class ServoBatch:
             # Stepping by rollout with a record of one field costs nothing over bare stepping.
             every = steps
         record = self.batch.rollout(steps, control=control, record=("qpos", "qvel"))
-        position = record["qpos"][:, every - 1 :: every][..., list(self.robot.qpos)]
-        velocity = record["qvel"][:, every - 1 :: every][..., list(self.robot.qvel)]
+        position = self._chart(record["qpos"][:, every - 1 :: every], reference)
+        velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
         bad = self._warnings() > before
         if bad.any():
             position, velocity = position.copy(), velocity.copy()

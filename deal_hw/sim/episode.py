@@ -21,8 +21,9 @@ class Episode:
     Attributes:
         step_s: Device period [s].
         sample: Grid index of each sample, (T,).
-        position: Reported positions, (T, J).
-        velocity: Reported velocities, (T, J).
+        position: Reported positions, chart coordinates (T, C): the joints, for a floating base after its six.
+            Coordinates that nobody measured hold an estimate.
+        velocity: Reported velocities, (T, C), likewise.
         target: Position target in force at each period, before any latency, (S, A).
         stiffness: Sent stiffness in force, (S, A).
         damping: (S, A).
@@ -33,6 +34,12 @@ class Episode:
         first_row: Sample of the recording that became the first sample here.
         origin: Device period 0 of the grid, counted from the recording's first sample.
         reported: Samples that the robot reported; the others are filled in, (T,). None: all.
+        reference: Reference orientation of each sample's chart, (T, 4); None for a fixed base.
+        measured: Which entries of (position, velocity) were measured and count as observations, (2 C,). None:
+            the positions.
+        estimate_std: Standard deviation of the entries that were not measured, (2 C,) or, sample by sample,
+            (T, 2 C); None where all positions were.
+        exact: Whether the whole state is reported without any error: only a simulated target does that.
     """
 
     step_s: float
@@ -49,6 +56,16 @@ class Episode:
     first_row: int = 0
     origin: int = 0
     reported: npt.NDArray[np.bool_] | None = None
+    reference: FloatArray | None = None
+    measured: npt.NDArray[np.bool_] | None = None
+    estimate_std: FloatArray | None = None
+    exact: bool = False
+
+    @property
+    def channels(self) -> IntArray:
+        """Indices into (position, velocity), 2 C, of the M channels that are compared with predictions."""
+        C = self.position.shape[1]
+        return np.arange(C) if self.measured is None else np.flatnonzero(self.measured)
 
     @property
     def steps(self) -> int:
@@ -160,6 +177,10 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
         velocity=np.where(reported[:, None], episode.velocity[after], line(episode.velocity)),
         usable=sound[before] & sound[after] & bridged,
         reported=reported,
+        reference=None if episode.reference is None else episode.reference[after],
+        estimate_std=None
+        if episode.estimate_std is None
+        else np.broadcast_to(episode.estimate_std, (len(episode.sample), 2 * episode.position.shape[1]))[after],
     )
 
 

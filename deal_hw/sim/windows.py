@@ -90,6 +90,10 @@ def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> Flo
         episode: The episode.
         latency_s: Total latency of each member, (N,) [s].
     """
+    if batch.robot.description.actuation == "motor":
+        # Efforts are not slewed; before the first one the motors are off.
+        efforts = np.repeat(episode.target[None], batch.count, axis=0)
+        return delay(efforts, np.asarray(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
     factor = batch.servo_factor("servo_speed_limit")
     rate = factor[:, None] * episode.speed_limit[None] * episode.step_s
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
@@ -111,19 +115,20 @@ def predict_windows(
         batch: The members, parameters set.
         episode: The episode.
         windows: The windows.
-        position: Positions at the windows' starts, (W, J) or (N, W, J).
-        velocity: Velocities at the windows' starts, (W, J) or (N, W, J).
+        position: Positions at the windows' starts, (W, C) or (N, W, C).
+        velocity: Velocities at the windows' starts, (W, C) or (N, W, C).
         setpoint: Set-points of the whole episode, (N, S, A), from :func:`setpoints`.
 
     Returns:
-        Positions and velocities at the samples after each start, (N, W, H, J) each; NaN where a member
-        diverged.
+        Positions and velocities at the samples after each start, (N, W, H, C) each, in the chart of each
+        sample's reference orientation; NaN where a member diverged.
     """
     N, W, H = batch.count, len(windows), windows.length
-    J = episode.position.shape[1]
-    x = np.broadcast_to(position, (N, W, J))
-    v = np.broadcast_to(velocity, (N, W, J))
-    out_x, out_v = np.empty((N, W, H, J)), np.empty((N, W, H, J))
+    C = episode.position.shape[1]
+    x = np.broadcast_to(position, (N, W, C))
+    v = np.broadcast_to(velocity, (N, W, C))
+    out_x, out_v = np.empty((N, W, H, C)), np.empty((N, W, H, C))
+    reference = episode.reference
     steps = H * windows.stride
     per_step = episode.step_s / batch.robot.step_s
     repeat = round(per_step)
@@ -138,9 +143,10 @@ def predict_windows(
         if now != sent:
             batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
             sent = now
-        batch.set_state(x[:, w], v[:, w])
+        batch.set_state(x[:, w], v[:, w], reference=None if reference is None else reference[start])
         control = setpoint[:, at : at + steps]
         if repeat > 1:
             control = np.repeat(control, repeat, axis=1)
-        out_x[:, w], out_v[:, w] = batch.advance(control, windows.stride * repeat)
+        charts = None if reference is None else reference[start + 1 : start + 1 + H]
+        out_x[:, w], out_v[:, w] = batch.advance(control, windows.stride * repeat, charts)
     return out_x, out_v

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import (
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+    StateStore,
+)
+from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.types import FloatArray
 
 _SEED = 5
+_LONG = 8
+_FEW = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +39,9 @@ class MethodCase:
         short_budget: As little as makes a generation.
         tolerance: Largest mean |ln(estimate / truth)| that counts as recovered; None for methods that do not
             read the data.
+        open_store: Opens a checkpoint file: path, identity of the run. None where there is no such file; then
+            states are kept in memory.
+        grows: Whether what the method keeps grows with its generations by design, as a surrogate's data do.
     """
 
     method: CalibrationMethod[Any]
@@ -35,16 +50,55 @@ class MethodCase:
     budget: Budget
     short_budget: Budget
     tolerance: float | None
+    open_store: Callable[[Path, str], StateStore] | None = None
+    grows: bool = False
 
     def run(
-        self, budget: Budget, seed: int = _SEED, progress: ProgressCallback | None = None
+        self,
+        budget: Budget,
+        seed: int = _SEED,
+        progress: ProgressCallback | None = None,
+        checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
         """Calibrate a new problem."""
-        return self.method.run(self.make_problem(), budget, np.random.default_rng(seed), progress)
+        rng = np.random.default_rng(seed)
+        return self.method.run(self.make_problem(), budget, rng, progress, checkpoint)
+
+    def store(self, path: Path, identity: str = "mine") -> StateStore:
+        """Return a place to keep a run's state."""
+        return MemoryStore() if self.open_store is None else self.open_store(path, identity)
 
     def log_error(self, estimate: FloatArray) -> float:
         """Return the mean |ln(estimate / truth)|."""
         return float(np.mean(np.abs(np.log(estimate / self.truth))))
+
+
+class MemoryStore:
+    """Keeps the last state in memory, and how many bytes of arrays each one held beside the trace."""
+
+    def __init__(self) -> None:
+        self.state: Mapping[str, Any] | None = None
+        self.sizes: list[int] = []
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """See :meth:`deal_hw.calibration.StateStore.save`."""
+        # What goes on changing after it was saved would not be what was saved.
+        self.state = copy.deepcopy(state)
+        self.sizes.append(_bytes_of(state))
+
+    def load(self) -> Mapping[str, Any] | None:
+        """See :meth:`deal_hw.calibration.StateStore.load`."""
+        return copy.deepcopy(self.state)
+
+
+def _bytes_of(value: Any) -> int:
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, Mapping):
+        return sum(_bytes_of(v) for k, v in value.items() if k != "trace")
+    if isinstance(value, list | tuple):
+        return 1 + sum(_bytes_of(v) for v in value)
+    return 0
 
 
 class _StopRunError(Exception):
@@ -125,3 +179,65 @@ class MethodSuite:
         assert "settings" in short.provenance
         again = CalibrationResult.from_json(short.to_json())
         np.testing.assert_allclose(again.estimate, short.estimate)
+
+    def test_resumed_run_gives_the_same_numbers(
+        self, case: MethodCase, short: CalibrationResult, tmp_path: Path
+    ) -> None:
+        """Stopped at each of its generations and resumed, a run ends bit for bit where it would have."""
+        store = case.store(tmp_path / "checkpoint.npz")
+        result, stops = None, 0
+        while result is None:
+            stops += 1
+            try:
+                result = case.run(case.short_budget, progress=_stop_at(stops), checkpoint=store)
+            except _StopRunError:
+                assert stops <= len(short.trace), "a resumed run goes on for ever"
+        assert stops == len(short.trace) + 1
+        np.testing.assert_array_equal(result.estimate, short.estimate)
+        np.testing.assert_array_equal(result.interval, short.interval)
+        np.testing.assert_array_equal(result.population, short.population)
+        np.testing.assert_equal([dict(row) for row in result.trace], [dict(row) for row in short.trace])
+        assert result.latency_s == short.latency_s
+        assert result.latency_interval_s == short.latency_interval_s
+        assert result.alarms == short.alarms
+
+    def test_checkpoint_of_another_run_is_refused(self, case: MethodCase, tmp_path: Path) -> None:
+        """A file with another identity is neither continued nor overwritten."""
+        if case.open_store is None:
+            pytest.skip("this method's states are kept in memory")
+        path = tmp_path / "checkpoint.npz"
+        case.run(case.short_budget, checkpoint=case.open_store(path, "mine"))
+        before = path.read_bytes()
+        with pytest.raises(ConfigurationError, match="cannot be resumed"):
+            case.run(case.short_budget, checkpoint=case.open_store(path, "yours"))
+        assert path.read_bytes() == before
+
+    def test_damaged_checkpoint_is_refused(self, case: MethodCase, tmp_path: Path) -> None:
+        """A torn file, or one that never was a checkpoint, is an error that names the file."""
+        if case.open_store is None:
+            pytest.skip("this method's states are kept in memory")
+        path = tmp_path / "checkpoint.npz"
+        case.run(case.short_budget, checkpoint=case.open_store(path, "mine"))
+        whole = path.read_bytes()
+        for damaged in (whole[: len(whole) // 2], b"", b"not a checkpoint"):
+            path.write_bytes(damaged)
+            with pytest.raises(DatasetError, match=r"checkpoint\.npz"):
+                case.run(case.short_budget, checkpoint=case.open_store(path, "mine"))
+
+    def test_state_does_not_grow(self, case: MethodCase) -> None:
+        """What is kept grows when a stage begins, not with each generation; the trace aside."""
+        if case.grows:
+            pytest.skip("this method keeps what it has seen")
+        store = MemoryStore()
+        population = max(case.short_budget.population, 20)
+        case.run(Budget(population=population, generations=_LONG), checkpoint=store)
+        growths = int(np.sum(np.diff(store.sizes) > 0))
+        assert growths <= _FEW
+
+
+def _stop_at(generation: int) -> ProgressCallback:
+    def stop(progress: Progress) -> None:
+        if progress.done == generation:
+            raise _StopRunError
+
+    return stop

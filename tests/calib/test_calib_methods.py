@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import pytest
 
+from deal_hw.calib.checkpoint import Checkpoint
 from deal_hw.calib.deal import Deal
 from deal_hw.calib.methods import METHODS, NULL_METHODS, check_method, make_method
 from deal_hw.calib.pipeline import PolishedMethod
@@ -67,6 +68,7 @@ def case_of(name: str, budget: Budget, tolerance: float | None) -> MethodCase:
         budget=budget,
         short_budget=Budget(population=10, generations=2),
         tolerance=tolerance,
+        open_store=Checkpoint,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
+from deal_hw.data.importing.table import Table
 from deal_hw.data.record import CycleRecord
 from deal_hw.data.recorder import EpisodeRecorder
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -124,5 +125,41 @@ def make_trajectory() -> Callable[..., Trajectory]:
             "metadata": {"description": DESCRIPTION.to_json()},
         }
         return Trajectory(**{**fields, **changes})  # type: ignore[arg-type]
+
+    return make
+
+
+@pytest.fixture
+def make_table() -> Callable[..., Table]:
+    """Return a function that makes a sound 12 s recording at 100 Hz; keywords replace fields.
+
+    Three joints follow sums of sines of their own with a lag of 30 ms; commands have the samples' stamps.
+    """
+
+    def make(**changes: object) -> Table:
+        time_s = np.arange(1200) * 0.01
+        frequency = np.array([[0.31, 1.13], [0.47, 1.51], [0.23, 0.89]])
+        size = np.array([[0.4, 0.2], [0.3, 0.25], [0.5, 0.15]])
+
+        def motion(at: np.ndarray[tuple[int], np.dtype[np.float64]]) -> object:
+            return np.sum(
+                size[:, None] * np.sin(2 * np.pi * frequency[:, None] * at[None, :, None]), axis=2
+            ).T
+
+        fields: dict[str, object] = {
+            "joint_names": ("hip", "knee", "foot"),
+            "actuated": ("hip", "knee", "foot"),
+            "units": ("rad", "rad", "rad"),
+            "time_s": time_s,
+            "position": 0.98 * motion(time_s - 0.03),  # type: ignore[operator]
+            "velocity": None,
+            "effort": None,
+            "command_s": time_s,
+            "target": motion(time_s),
+            "orientation": None,
+            "gyro": None,
+            "source": {"file": "rec.csv", "part": "", "kind": "csv", "sha256": "0" * 64},
+        }
+        return Table(**{**fields, **changes})  # type: ignore[arg-type]
 
     return make

@@ -12,14 +12,9 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES, k9_space, 
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.calibrated_mjcf import LATENCY_NUMERIC, SPEED_LIMIT_NUMERIC, write_calibrated_mjcf
 from deal_hw.sim.fields import ModelFields, element_id
-from deal_hw.sim.model import (
-    LATENCY_NUMERIC,
-    SPEED_LIMIT_NUMERIC,
-    load_model,
-    model_with,
-    write_calibrated_mjcf,
-)
+from deal_hw.sim.model import load_model, model_with
 from deal_hw.sim.parameters import KINDS, apply_parameters
 
 

@@ -1,42 +1,58 @@
 """Parameter kinds: how a physical parameter changes a MuJoCo model, one small function each.
 
-A kind is ``apply(fields, elements, values)``: it writes ``values`` (N,) for the named elements into the
-fields of N simulations. The table :data:`KINDS` is explicit; new kinds are added here.
+A kind's ``apply(fields, elements, values)`` writes ``values`` (N,) for the named elements into the fields of
+N simulations. The table :data:`KIND_TABLE` is explicit; new kinds go into the tuple of their element's file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import difflib
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from deal_hw.errors import UnknownNameError
-from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.fields import Array, Fields
-from deal_hw.sim.parameters.actuator import servo_damping, servo_effort_limit, servo_stiffness
-from deal_hw.sim.parameters.body import body_mass, rod_length
-from deal_hw.sim.parameters.joint import dof_armature, dof_damping, dof_frictionloss
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.sim.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.actuator import ACTUATOR_KINDS
+from deal_hw.sim.parameters.body import BODY_KINDS
+from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
+from deal_hw.sim.parameters.joint import JOINT_KINDS
+from deal_hw.sim.parameters.kind import Apply, Kind
+from deal_hw.sim.parameters.sensor import SENSOR_KINDS
 
-Apply = Callable[[Fields, Sequence[str], Array], None]
+KIND_TABLE: Mapping[str, Kind] = MappingProxyType(
+    {k.name: k for k in (*BODY_KINDS, *JOINT_KINDS, *GEOM_KINDS, *ACTUATOR_KINDS, *SENSOR_KINDS)}
+)
+"""Every kind by name."""
 
-KINDS: Mapping[str, Apply] = {
-    "body_mass": body_mass,
-    "rod_length": rod_length,
-    "dof_armature": dof_armature,
-    "dof_damping": dof_damping,
-    "dof_frictionloss": dof_frictionloss,
-    "servo_stiffness": servo_stiffness,
-    "servo_damping": servo_damping,
-    "servo_effort_limit": servo_effort_limit,
-}
-DEVICE_KINDS = ("servo_speed_limit",)
-"""Kinds that no MuJoCo field holds: the set-point generator in front of the actuator applies them."""
+KINDS: Mapping[str, Apply] = MappingProxyType(
+    {name: kind.apply for name, kind in KIND_TABLE.items() if kind.apply is not None}
+)
+"""Kinds that MuJoCo fields hold."""
+
+DEVICE_KINDS = tuple(name for name, kind in KIND_TABLE.items() if kind.apply is None)
+"""Kinds that no MuJoCo field holds: what stands between simulator, commands and recording applies them."""
 
 SERVO_KINDS = ("servo_stiffness", "servo_damping", "servo_effort_limit", "servo_speed_limit")
 """Kinds that scale with what the robot was sent."""
 
-ORDER = ("rod_length", "body_mass")
-"""Kinds that must be applied first, in this order: mass scales the inertia that a length has set."""
+
+def find_kind(name: str) -> Kind:
+    """Return the kind of that name.
+
+    Raises:
+        UnknownNameError: There is none; the message lists the kinds, and the nearest one if any is near.
+    """
+    if name in KIND_TABLE:
+        return KIND_TABLE[name]
+    error = UnknownNameError("parameter kind", name, KIND_TABLE)
+    near = difflib.get_close_matches(name, KIND_TABLE, n=1)
+    if near:
+        error.args = (f"{error}; did you mean {near[0]!r}?",)
+    raise error
 
 
 def check_kinds(space: ParameterSpace) -> None:
@@ -46,8 +62,49 @@ def check_kinds(space: ParameterSpace) -> None:
         UnknownNameError: One is not; the message lists the kinds.
     """
     for parameter in space.parameters:
-        if parameter.kind not in KINDS and parameter.kind not in DEVICE_KINDS:
-            raise UnknownNameError("parameter kind", parameter.kind, (*KINDS, *DEVICE_KINDS))
+        find_kind(parameter.kind)
+
+
+def check_space(model: Any, space: ParameterSpace) -> None:
+    """Check that a model has what the parameters name, and that their values can act there.
+
+    Args:
+        model: The MjModel.
+        space: The parameters.
+
+    Raises:
+        UnknownNameError: A kind or an element is not known; the message lists the names.
+        ConfigurationError: A value is outside what the kind allows, an element cannot have the parameter, two
+            parameters write the same thing, or another geom overrules a contact parameter.
+    """
+    owner: dict[tuple[str, str], str] = {}
+    for p in space.parameters:
+        kind = find_kind(p.kind)
+        _check_bounds(p, kind)
+        for name in p.elements:
+            index = element_id(model, kind.element, name)
+            if kind.usable is not None:
+                try:
+                    kind.usable(model, index, name)
+                except ConfigurationError as err:
+                    raise ConfigurationError(f"parameter {p.name!r} ({p.kind}): {err}") from err
+            first = owner.setdefault((p.kind, name), p.name)
+            if first != p.name:
+                raise ConfigurationError(
+                    f"parameters {first!r} and {p.name!r} both set {p.kind} of {name!r}; keep one"
+                )
+        if p.kind in ("geom_friction", "geom_restitution"):
+            check_partners(model, p.kind, p.elements, p.low)
+
+
+def _check_bounds(p: Parameter, kind: Kind) -> None:
+    if p.low < kind.least or p.high > kind.most:
+        raise ConfigurationError(
+            f"parameter {p.name!r}: range [{p.low:g}, {p.high:g}] {p.unit} leaves what {p.kind} allows, "
+            f"[{kind.least:g}, {kind.most:g}]; narrow the range"
+        )
+    if not p.elements:
+        raise ConfigurationError(f"parameter {p.name!r} names no {kind.element}")
 
 
 def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> None:
@@ -61,10 +118,11 @@ def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> Non
     check_kinds(space)
     count = theta.shape[0]
     columns = {name: theta[:, k] for k, name in enumerate(space.names)}
-    ranked = sorted(space.parameters, key=lambda p: ORDER.index(p.kind) if p.kind in ORDER else len(ORDER))
-    for parameter in ranked:
-        if parameter.kind in DEVICE_KINDS:
-            continue
+    used = [(KIND_TABLE[p.kind], p) for p in space.parameters if p.kind in KINDS]
+    # Kinds that scale or shift what they find start from the model each time, or they would pile up.
+    for field in sorted({field for kind, _ in used if kind.relative for field in kind.writes}):
+        fields.get(field)[:] = getattr(fields.model, field)
+    for _, parameter in sorted(used, key=lambda pair: pair[0].order):
         values = columns.get(parameter.name)
         if values is None:
             values = np.full(count, parameter.nominal)

@@ -1,0 +1,415 @@
+"""`bo`: Bayesian optimisation (BoTorch): a Gaussian process of the fitness, and batches that may improve it.
+
+The first generation is a scrambled Sobol sequence. Each further one fits a Gaussian process (BoTorch's own:
+one length scale a coordinate, whose prior grows with their number) to what was scored and takes the batch of
+the largest log expected improvement (qLogEI, Ament et al. 2023) inside a trust region around the best point,
+which grows after successes and shrinks after failures (TuRBO, Eriksson et al. 2019). Over the whole range of
+ten coordinates the batch is little better than a random one (measured: worse than the range's centre).
+
+Scores have an arbitrary scale and long tails, so the process models their normal quantiles, which keep
+nothing but the order.
+
+Cost: a Gaussian process of n points takes n^3 operations, so it sees `most_points` at most, the better half
+by rank and the others by age, and a batch is small: `bo` simulates far fewer members than its budget allows.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import rankdata
+from scipy.stats.qmc import Sobol
+
+from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.checkpoint import State
+from deal_hw.calib.coordinates import Members
+from deal_hw.calib.fitness import FitnessSettings
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.rollouts import PopulationPolicy
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.types import FloatArray, IntArray
+
+_FIT_ITERATIONS = 60
+_ACQUISITION_ITERATIONS = 30
+_STARTS, _RAW_STARTS, _SAMPLES = 2, 64, 64
+"""Starts of the acquisition's optimiser, draws they are chosen from, and draws of the process."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoSettings:
+    """Settings of `bo`.
+
+    Attributes:
+        fitness: Name of the fitness. The paper's row has the critic's return, but a critic changes every
+            generation and a Gaussian process models one fixed function, so the default is the trajectory
+            error. With a fitness that changes, each generation scores a part of the earlier members again
+            beside the new ones (the budget's population in all), and the process sees only these.
+        batch: New members of a generation after the first, q.
+        trust_region: Whether batches are taken near the best point; off is the textbook's search of the whole
+            range.
+        most_points: Most points of the Gaussian process.
+        elite: Members that make the population of the result, best first.
+        scoring: How the fitness scores.
+    """
+
+    fitness: str = "trajectory"
+    batch: int = 8
+    trust_region: bool = True
+    most_points: int = 300
+    elite: int = 10
+    scoring: FitnessSettings = field(default_factory=FitnessSettings)
+
+    def __post_init__(self) -> None:
+        if self.batch < 1 or self.elite < 2:
+            raise ConfigurationError(
+                f"batch must be at least 1 and elite at least 2, got {self.batch} and {self.elite}"
+            )
+        if self.most_points < 4:
+            raise ConfigurationError(f"most_points must be at least 4, got {self.most_points}")
+
+
+class TrustRegion:
+    """The side of the box in which the next batch is taken, in widths of the range (TuRBO, algorithm 1).
+
+    Args:
+        failures: Generations without a better point after which the box is halved.
+    """
+
+    LONGEST, FIRST, SHORTEST = 1.6, 0.8, 0.5**7
+    SUCCESSES = 3
+    """Better points in a row after which the box is doubled."""
+
+    def __init__(self, failures: int) -> None:
+        self._failures = failures
+        self.length, self._good, self._bad = self.FIRST, 0, 0
+
+    def tell(self, *, better: bool) -> None:
+        """Say whether the batch held a better point than all before."""
+        self._good, self._bad = (self._good + 1, 0) if better else (0, self._bad + 1)
+        if self._good >= self.SUCCESSES:
+            self.length, self._good = min(2 * self.length, self.LONGEST), 0
+        elif self._bad >= self._failures:
+            self.length, self._bad = self.length / 2, 0
+        if self.length < self.SHORTEST:
+            # TuRBO forgets all points here; the process is global, so that only the box starts again.
+            self.length = self.FIRST
+
+    def save(self) -> State:
+        """Return length and counters."""
+        return {"length": self.length, "good": self._good, "bad": self._bad}
+
+    def load(self, state: State) -> None:
+        """Continue from a saved state."""
+        self.length, self._good, self._bad = float(state["length"]), int(state["good"]), int(state["bad"])
+
+
+class GaussianProcessSearch:
+    """Points in the unit cube, proposed from a Gaussian process of the scores of earlier ones.
+
+    Knows no simulator: it is asked for points and told their fitness. All draws are those of one seed and the
+    generation's number, so that points and scores are the whole state.
+
+    Args:
+        count: Coordinates C.
+        population: Points of the first generation, and of all of them where the fitness changes.
+        settings: Sizes.
+        seed: Decides all draws.
+        stationary: Whether a point's fitness stays what it was; if not, earlier points are scored again.
+    """
+
+    def __init__(
+        self, count: int, population: int, settings: BoSettings, seed: int, *, stationary: bool
+    ) -> None:
+        if population < 2:
+            raise ConfigurationError(f"bo needs a population of 2 or more, got {population}")
+        self._count, self._population, self._settings = count, population, settings
+        self._seed, self._stationary = seed, stationary
+        self._points, self._fitness = np.empty((0, count)), np.empty(0)
+        self._asked: FloatArray | None = None
+        self._batch = min(settings.batch, max(population - 2, 1))
+        self._generation = 0
+        self.region = TrustRegion(int(np.ceil(max(4, count) / self._batch)))
+        self.fallbacks = 0
+
+    @property
+    def points(self) -> FloatArray:
+        """Points with scores that compare, (n, C)."""
+        return self._points
+
+    @property
+    def best(self) -> float:
+        """Best fitness among the points."""
+        return float(_ranked(self._fitness).max(initial=-np.inf))
+
+    @property
+    def order(self) -> IntArray:
+        """Indices of the points, best first, (n,)."""
+        return np.asarray(np.argsort(-_ranked(self._fitness), kind="stable"))
+
+    def ask(self) -> FloatArray:
+        """Return the points to score next, (n, C)."""
+        if self._asked is None:
+            if not len(self._points):
+                self._asked = self._sobol(self._population)
+            elif self._stationary:
+                self._asked = self._propose(self._batch)
+            else:
+                again = self._points[self._kept(self._population - self._batch)]
+                self._asked = np.concatenate([again, self._propose(self._batch)])
+        return self._asked
+
+    def tell(self, fitness: FloatArray) -> None:
+        """Add the scores of the points that were asked for.
+
+        Args:
+            fitness: Higher is better, (n,); points that are not finite count as the worst.
+        """
+        asked = self.ask()
+        if fitness.shape != (len(asked),):
+            raise ValueError(
+                f"fitness has shape {fitness.shape}, the points that were asked for {asked.shape}"
+            )
+        if self._generation:
+            # Where the fitness changes, the points that were scored again are the ones to be better than.
+            earlier = self._fitness if self._stationary else fitness[: -self._batch]
+            new = _ranked(fitness[-self._batch :]).max()
+            self.region.tell(better=bool(new > _ranked(earlier).max()))
+        before = len(self._points) if self._stationary else 0
+        self._points = np.concatenate([self._points[:before], asked])
+        self._fitness = np.concatenate([self._fitness[:before], fitness])
+        self._asked = None
+        self._generation += 1
+
+    def save(self) -> State:
+        """Return points, scores and counters."""
+        return {
+            "points": self._points,
+            "fitness": self._fitness,
+            "generation": self._generation,
+            "seed": self._seed,
+            "fallbacks": self.fallbacks,
+            "region": self.region.save(),
+        }
+
+    def load(self, state: State) -> None:
+        """Continue from a saved state."""
+        self._points, self._fitness = np.array(state["points"]), np.array(state["fitness"])
+        self._generation, self._seed = int(state["generation"]), int(state["seed"])
+        self.fallbacks, self._asked = int(state["fallbacks"]), None
+        self.region.load(state["region"])
+
+    def _sobol(self, count: int) -> FloatArray:
+        seed = np.random.default_rng([self._seed, self._generation])
+        # A power of two of points is balanced; a part of it is the next best thing, not an error.
+        power = max(int(np.ceil(np.log2(count))), 0)
+        return np.asarray(Sobol(self._count, rng=seed).random_base2(power)[:count])
+
+    def _kept(self, count: int) -> IntArray:
+        """Return the indices of so many points: the better half by rank, the others by age, newest first."""
+        best = self.order[: (count + 1) // 2]
+        rest = np.setdiff1d(np.arange(len(self._points)), best)
+        return np.sort(np.concatenate([best, rest[::-1][: count - len(best)]]))
+
+    def _propose(self, batch: int) -> FloatArray:
+        kept = self._kept(self._settings.most_points)
+        points, fitness = self._points[kept], self._fitness[kept]
+        found = None
+        if len(np.unique(fitness[np.isfinite(fitness)])) > 1:
+            side = self.region.length if self._settings.trust_region else None
+            seed = self._seed + self._generation
+            found = _largest_improvement(points, _quantiles(fitness), batch, side, seed)
+        if found is None:
+            self.fallbacks += 1
+            return self._sobol(batch)
+        return np.clip(found, 0.0, 1.0)
+
+
+def _ranked(fitness: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(fitness), fitness, -np.inf)
+
+
+def _quantiles(fitness: FloatArray) -> FloatArray:
+    """Return the normal quantiles of the ranks of scores, (n,); equal scores are equal."""
+    return np.asarray(ndtri((rankdata(_ranked(fitness)) - 0.5) / len(fitness)))
+
+
+def _largest_improvement(
+    points: FloatArray, value: FloatArray, batch: int, side: float | None, seed: int
+) -> FloatArray | None:
+    """Return the batch of the largest qLogEI, (batch, C), or None where the process could not be fitted.
+
+    Args:
+        points: (n, C) in the unit cube.
+        value: What the process models, (n,).
+        batch: Points to return.
+        side: Mean side of the box around the best point in which to look; None for the unit cube.
+        seed: Decides all draws.
+    """
+    bo = _botorch()
+    torch = bo.torch
+    from deal_hw.calib.critic import torch_threads
+
+    x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
+    # BoTorch draws its starts from torch's global generator; the fork gives the caller's back.
+    with warnings.catch_warnings(), torch_threads(1), torch.random.fork_rng(devices=[]):
+        warnings.simplefilter("ignore")
+        torch.manual_seed(seed)
+        try:
+            model = bo.process(x, y, outcome_transform=None)
+            likelihood = bo.likelihood(model.likelihood, model)
+            options = {"maxiter": _FIT_ITERATIONS}
+            bo.fit(likelihood, optimizer_kwargs={"options": options})
+            sampler = bo.sampler(torch.Size([_SAMPLES]), seed=seed)
+            acquisition = bo.improvement(model, best_f=y.max(), sampler=sampler)
+            found, _ = bo.optimise(
+                acquisition,
+                bounds=torch.from_numpy(_box(points, value, model, side)),
+                q=batch,
+                num_restarts=_STARTS,
+                raw_samples=_RAW_STARTS,
+                options={"maxiter": _ACQUISITION_ITERATIONS, "seed": seed, "sample_around_best": True},
+            )
+        except bo.failures:
+            return None
+    return np.asarray(found.detach().numpy(), dtype=float)
+
+
+def _box(points: FloatArray, value: FloatArray, model: Any, side: float | None) -> FloatArray:
+    """Return the bounds in which the batch is taken, (2, C): longer where the process varies less."""
+    C = points.shape[1]
+    if side is None:
+        return np.stack([np.zeros(C), np.ones(C)])
+    scale = model.covar_module.lengthscale.detach().numpy().reshape(C)
+    half = 0.5 * side * scale / np.exp(np.mean(np.log(scale)))
+    best = points[np.argmax(value)]
+    return np.clip(np.stack([best - half, best + half]), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class BayesianOptimisation(Search):
+    """Bayesian optimisation of a pluggable fitness.
+
+    Attributes:
+        settings: How to run.
+        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
+    """
+
+    name = "bo"
+    settings: BoSettings = field(default_factory=BoSettings)
+    policy: PopulationPolicy | None = None
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Bo(run, rng, self.settings, self.policy)
+
+
+def critic_return() -> BayesianOptimisation:
+    """Return the paper's row: Bayesian optimisation of the critic's return."""
+    return BayesianOptimisation(BoSettings(fitness="critic"))
+
+
+class _Bo(ScoredStepper):
+    def __init__(
+        self, run: Run, rng: np.random.Generator, settings: BoSettings, policy: PopulationPolicy | None
+    ) -> None:
+        super().__init__(run, rng, settings.fitness, settings.scoring, policy)
+        self._settings = settings
+        # Now rather than after the first generation has been simulated.
+        _botorch()
+        self._search = GaussianProcessSearch(
+            self.coordinates.count,
+            run.budget.population,
+            settings,
+            int(rng.integers(2**31)),
+            stationary=self.stationary,
+        )
+
+    def step(self) -> None:
+        """Ask, score and tell."""
+        unit = self._search.ask()
+        members = self.coordinates.members(unit)
+        fitness, values = self.score(members)
+        self._search.tell(fitness)
+        found = self._search.best
+        self.note(
+            f"best {found:.3g} of {len(self._search.points)} points",
+            members,
+            {
+                **values,
+                "found": found,
+                "fallbacks": float(self._search.fallbacks),
+                "side": self._search.region.length,
+            },
+        )
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`; the estimate is the best point, the population the best few."""
+        found = self._search.points[self._search.order] if self.run.trace else self._search.ask()
+        elite = self.coordinates.members(found[: self._settings.elite])
+        centre = Members(elite.theta[:1], elite.latency_s[:1])
+        return self.run.result(
+            self.coordinates,
+            centre,
+            elite,
+            settings=self._settings,
+            chi2=self.residual(centre),
+            alarms=self.alarms(),
+            extra={"interval": "spread of the best points, uncalibrated"},
+        )
+
+    def save(self) -> State:
+        """See :meth:`Stepper.save`."""
+        return {"search": self._search.save(), "fitness": self.fitness.save()}
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._search.load(state["search"])
+        self.fitness.load(state["fitness"])
+
+
+@dataclass(frozen=True, slots=True)
+class _Botorch:
+    """What is used of BoTorch and GPyTorch, loaded on use."""
+
+    torch: Any
+    process: Any
+    likelihood: Any
+    fit: Any
+    improvement: Any
+    sampler: Any
+    optimise: Any
+    failures: tuple[type[Exception], ...]
+
+
+def _botorch() -> _Botorch:
+    try:
+        with warnings.catch_warnings():
+            # Its parts use parts of torch that are on their way out.
+            warnings.simplefilter("ignore")
+            import torch
+            from botorch.acquisition import qLogExpectedImprovement
+            from botorch.exceptions.errors import ModelFittingError
+            from botorch.fit import fit_gpytorch_mll
+            from botorch.models import SingleTaskGP
+            from botorch.optim import optimize_acqf
+            from botorch.sampling import SobolQMCNormalSampler
+            from gpytorch.mlls import ExactMarginalLogLikelihood
+            from linear_operator.utils.errors import NanError, NotPSDError
+    except ImportError as err:  # pragma: no cover - the extra is installed where the tests run
+        raise MissingExtraError("botorch", "bench") from err
+    return _Botorch(
+        torch,
+        SingleTaskGP,
+        ExactMarginalLogLikelihood,
+        fit_gpytorch_mll,
+        qLogExpectedImprovement,
+        SobolQMCNormalSampler,
+        optimize_acqf,
+        (ModelFittingError, NanError, NotPSDError),
+    )

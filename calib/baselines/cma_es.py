@@ -1,0 +1,317 @@
+"""`cma`: covariance matrix adaptation (pycma) with restarts of growing population, on a pluggable fitness.
+
+The baseline of robot calibration in practice (PACE, NVIDIA's extension). Restarts double the population
+(IPOP, Auger and Hansen 2005) and begin at a uniform draw; the first one begins at the centre of the range.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.checkpoint import State
+from deal_hw.calib.fitness import FitnessSettings
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.rollouts import PopulationPolicy
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
+from deal_hw.types import FloatArray
+
+_SAME = 1e-9
+"""A replayed mean may be off by this, or the numerical libraries differ from those of the saved run."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CmaSettings:
+    """Settings of `cma`.
+
+    Attributes:
+        fitness: Name of the fitness.
+        population: Members of the first run; None for pycma's own 4 + 3 ln C, at most the budget's. At equal
+            simulated members many small populations get far nearer than few large ones (measured, 10
+            coordinates, 1200 members: 13 and 12 against 78 and 30 in log_error_x100).
+        growth: Factor of the population from one restart to the next (IPOP: 2).
+        sigma: First step size, in widths of the range.
+        least_step: A run is over when no coordinate moves more than this, in widths of the range.
+        scoring: How the fitness scores.
+    """
+
+    fitness: str = "trajectory"
+    population: int | None = None
+    growth: int = 2
+    sigma: float = 0.3
+    least_step: float = 1e-6
+    scoring: FitnessSettings = field(default_factory=FitnessSettings)
+
+    def __post_init__(self) -> None:
+        if self.population is not None and self.population < 2:
+            raise ConfigurationError(f"population must be at least 2 or None, got {self.population}")
+        if self.growth < 1:
+            raise ConfigurationError(f"growth must be at least 1, got {self.growth}")
+        if not (self.sigma > 0 and self.least_step > 0):
+            raise ConfigurationError(
+                f"sigma and least_step must be above 0, got {self.sigma:g} and {self.least_step:g}"
+            )
+
+
+class RestartedCma:
+    """CMA-ES in the unit cube, restarted when a run is over; all randomness comes from one seed.
+
+    Knows no simulator: it is asked for a population and told its cost. pycma's state cannot be stored but by
+    pickling, so what is stored is the costs it was told: asked and told again it is where it was.
+
+    Args:
+        count: Coordinates C.
+        population: Members of the first run.
+        settings: Step sizes and growth.
+        seed: Decides all draws.
+    """
+
+    def __init__(self, count: int, population: int, settings: CmaSettings, seed: int) -> None:
+        if population < 2:
+            raise ConfigurationError(f"cma needs a population of 2 or more, got {population}")
+        self._count, self._first, self._settings, self._seed = count, population, settings, seed
+        self._costs: list[FloatArray] = []
+        self._asked: FloatArray | None = None
+        self.restarts = -1
+        self._begin()
+
+    def _begin(self) -> None:
+        self.restarts += 1
+        # Each run has its own stream, so that where one ends does not shift the draws of the next.
+        rng = np.random.default_rng([self._seed, self.restarts])
+        start = np.full(self._count, 0.5) if self.restarts == 0 else rng.random(self._count)
+        self.population = self._first * self._settings.growth**self.restarts
+        options = {
+            "bounds": [0.0, 1.0],
+            "popsize": self.population,
+            # The seed "not a number" leaves numpy's global generator alone, which `randn` replaces.
+            "seed": np.nan,
+            "randn": lambda *shape: rng.standard_normal(shape),
+            "tolx": self._settings.least_step,
+            "verbose": -10,
+            "verb_log": 0,
+            "verb_disp": 0,
+        }
+        self._strategy: Any = _pycma().CMAEvolutionStrategy(start, self._settings.sigma, options)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of the present run's distribution, (C,), inside the unit cube."""
+        return np.clip(np.asarray(self._strategy.result.xfavorite, dtype=float), 0.0, 1.0)
+
+    @property
+    def sigma(self) -> float:
+        """Present step size, in widths of the range."""
+        return float(self._strategy.sigma)
+
+    def ask(self) -> FloatArray:
+        """Return the next population, (population, C), inside the unit cube."""
+        if self._asked is None:
+            self._asked = np.clip(np.array(self._strategy.ask(), dtype=float), 0.0, 1.0)
+        return self._asked
+
+    def tell(self, cost: FloatArray) -> bool:
+        """Update, and begin the next run where this one is over.
+
+        Args:
+            cost: Lower is better, (population,); members that are not finite count as worse than the worst.
+
+        Returns:
+            Whether a new run was begun.
+        """
+        asked = self.ask()
+        if cost.shape != (len(asked),):
+            raise ValueError(f"cost has shape {cost.shape}, the population that was asked for {asked.shape}")
+        self._costs.append(np.array(cost, dtype=float))
+        self._strategy.tell(list(asked), _finite(cost).tolist())
+        self._asked = None
+        if not self._strategy.stop():
+            return False
+        self._begin()
+        return True
+
+    def save(self) -> State:
+        """Return the costs that were told so far, and the mean they lead to."""
+        flat = np.concatenate(self._costs) if self._costs else np.empty(0)
+        return {"seed": self._seed, "first": self._first, "costs": flat, "mean": self.mean}
+
+    def load(self, state: State) -> None:
+        """Ask and tell what was told before.
+
+        Raises:
+            DatasetError: That leads elsewhere: another version of pycma or of the numerical libraries.
+        """
+        self._seed, self._first = int(state["seed"]), int(state["first"])
+        self._costs, self._asked, self.restarts = [], None, -1
+        self._begin()
+        costs, at = np.asarray(state["costs"], dtype=float), 0
+        while at < len(costs):
+            # Told by its present size: `tell` may begin a run with a larger population.
+            size = self.population
+            self.tell(costs[at : at + size])
+            at += size
+        if not np.allclose(self.mean, state["mean"], rtol=0.0, atol=_SAME):
+            raise DatasetError(
+                "the saved run of `cma` cannot be repeated here: its costs lead to another mean; resume it "
+                "with the versions of cma and numpy that began it, or start again"
+            )
+
+
+@dataclass(frozen=True)
+class Cma(Search):
+    """CMA-ES with restarts, inside the budget's population times generations.
+
+    Attributes:
+        settings: How to run.
+        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
+    """
+
+    name = "cma"
+    settings: CmaSettings = field(default_factory=CmaSettings)
+    policy: PopulationPolicy | None = None
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Cma(run, rng, self.settings, self.policy)
+
+
+class _Cma(ScoredStepper):
+    def __init__(
+        self, run: Run, rng: np.random.Generator, settings: CmaSettings, policy: PopulationPolicy | None
+    ) -> None:
+        super().__init__(run, rng, settings.fitness, settings.scoring, policy)
+        self._settings = settings
+        usual = min(4 + int(3 * np.log(self.coordinates.count)), run.budget.population)
+        first = settings.population or usual
+        self._search = RestartedCma(self.coordinates.count, first, settings, int(rng.integers(2**62)))
+        self._scored = 0
+        self._best = Best.none(self.coordinates.count)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the next population would be more than what is left of the budget."""
+        budget = self.run.budget
+        return self._scored + self._search.population > budget.population * budget.generations
+
+    def step(self) -> None:
+        """Ask, score and tell, until the share of one of the budget's generations is used up."""
+        share = (len(self.run.trace) + 1) * self.run.budget.population
+        scored = diverged = 0.0
+        while True:
+            unit, restarts, sigma = self._search.ask(), self._search.restarts, self._search.sigma
+            members = self.coordinates.members(unit)
+            fitness, values = self.score(members)
+            self._search.tell(-fitness)
+            self._scored += len(unit)
+            scored, diverged = scored + values["scored"], diverged + values["diverged"]
+            self._best = self._best.updated(unit, fitness, restarts, keep=self.stationary)
+            if self.finished or self._scored + self._search.population > share:
+                break
+        self.note(
+            f"run {restarts + 1} of {len(unit)} members: step {sigma:.2g} of the range",
+            members,
+            {
+                **values,
+                "scored": scored,
+                "diverged": diverged,
+                "found": self._best.fitness,
+                "restarts": float(restarts),
+                "sigma": sigma,
+            },
+        )
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`.
+
+        The estimate is the best member of all runs, the population that of its run; where the fitness changes
+        over the generations, the best of the last one.
+        """
+        centre = self.coordinates.members(self._best.unit[None])
+        return self.run.result(
+            self.coordinates,
+            centre,
+            self.coordinates.members(self._best.population),
+            settings=self._settings,
+            chi2=self.residual(centre),
+            alarms=self.alarms(),
+            extra={"restarts": self._search.restarts, "interval": "population spread, uncalibrated"},
+        )
+
+    def save(self) -> State:
+        """See :meth:`Stepper.save`."""
+        return {
+            "search": self._search.save(),
+            "fitness": self.fitness.save(),
+            "scored": self._scored,
+            "best": asdict(self._best),
+        }
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._search.load(state["search"])
+        self.fitness.load(state["fitness"])
+        self._scored = int(state["scored"])
+        self._best = Best(**state["best"])
+
+
+@dataclass(frozen=True, slots=True)
+class Best:
+    """The best member so far.
+
+    Attributes:
+        unit: Its unit coordinates, (C,); the centre of the range before any was scored.
+        fitness: Its fitness.
+        run: The run it belongs to.
+        population: The last population of that run, (n, C).
+    """
+
+    unit: FloatArray
+    fitness: float
+    run: int
+    population: FloatArray
+
+    @classmethod
+    def none(cls, count: int) -> Best:
+        """Return what is known before any member was scored."""
+        corners = np.stack([np.zeros(count), np.ones(count)])
+        return cls(np.full(count, 0.5), -float("inf"), 0, corners)
+
+    def updated(self, unit: FloatArray, fitness: FloatArray, run: int, *, keep: bool) -> Best:
+        """Return the best after a further population.
+
+        Args:
+            unit: The population, (n, C).
+            fitness: Its fitness, (n,); -inf where a member diverged.
+            run: The run it belongs to.
+            keep: Whether earlier fitness compares with this one.
+        """
+        top = int(np.argmax(fitness))
+        if fitness[top] > self.fitness or (not keep and np.isfinite(fitness[top])):
+            return Best(unit[top], float(fitness[top]), run, unit)
+        return replace(self, population=unit) if run == self.run else self
+
+
+def _finite(cost: FloatArray) -> FloatArray:
+    """Return costs in which members that are not finite are worse than all others, (N,)."""
+    usable = np.isfinite(cost)
+    if not usable.any():
+        return np.zeros(len(cost))
+    worst = float(cost[usable].max())
+    return np.where(usable, cost, worst + max(abs(worst), 1.0))
+
+
+def _pycma() -> Any:
+    try:
+        with warnings.catch_warnings():
+            # It warns of plotting packages that are not there.
+            warnings.simplefilter("ignore")
+            import cma
+    except ImportError as err:  # pragma: no cover - the extra is installed where the tests run
+        raise MissingExtraError("cma", "bench") from err
+    return cma

@@ -1,0 +1,212 @@
+"""`easi`: evolution strategy against a critic (EASI, Dong et al., NeurIPS 2024), the paper's first baseline.
+
+Each generation rolls every member out, trains the critic on these rollouts, scores them by the trained critic
+and refits a diagonal Gaussian to the better half, from which the next generation is drawn. There is neither a
+step-size control nor a covariance: the spread of the elites is the step.
+
+Written from the method's description and from the constants of its published program (population, survival
+rate, weights, critic); where we deviate it is said at the place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.checkpoint import State
+from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.critic import CriticSettings
+from deal_hw.calib.fitness import FitnessSettings
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.rollouts import PopulationPolicy
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray
+
+BoxScale = Literal["own", "linear"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EasiSettings:
+    """Settings of `easi`.
+
+    Attributes:
+        fitness: Name of the fitness; EASI's is the critic.
+        survive_rate: Share of members that are elites; at most a half, beyond which weights are negative.
+        scale: Box of the search: "own" takes equal steps of each parameter's own scale (log for positive
+            ones), "linear" is the box as published, in which a range of ratio xi^2 has its centre at half its
+            upper end.
+        critic: The published critic (two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation).
+        batch_per_member: Transitions in one of the critic's batches for each member of the population (16).
+        scoring: How the fitness scores, but for the critic.
+    """
+
+    fitness: str = "critic"
+    survive_rate: float = 0.5
+    scale: BoxScale = "own"
+    critic: CriticSettings = field(default_factory=lambda: CriticSettings(hidden=(128, 128)))
+    batch_per_member: int = 16
+    scoring: FitnessSettings = field(default_factory=FitnessSettings)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.survive_rate <= 0.5:
+            raise ConfigurationError(f"survive_rate must be within (0, 0.5], got {self.survive_rate:g}")
+        if self.scale not in ("own", "linear"):
+            raise ConfigurationError(f"unknown scale {self.scale!r} of the box; known: own, linear")
+
+
+def elite_weights(population: int, elites: int) -> FloatArray:
+    """Return the weights of the elites, best first, (elites,); they sum to 1.
+
+    Args:
+        population: Members N.
+        elites: How many of them survive, at most N / 2.
+    """
+    raw = np.log(0.5 * (population + 1)) - np.log(np.arange(1, elites + 1))
+    return np.asarray(raw / raw.sum())
+
+
+class EliteGaussian:
+    """A diagonal Gaussian in the unit cube that is refitted to the best members of its own sample.
+
+    Knows no simulator: it is asked for a population and told its fitness.
+
+    Args:
+        population: The first members, (N, C), drawn uniformly.
+        survive_rate: Share of members that are elites.
+        rng: Draws all later members.
+    """
+
+    def __init__(self, population: FloatArray, survive_rate: float, rng: np.random.Generator) -> None:
+        if len(population) < 2:
+            raise ConfigurationError(f"a population of {len(population)} has no elite; use 2 members or more")
+        self._rng = rng
+        self._elites = max(int(survive_rate * len(population)), 1)
+        self._population = np.array(population, dtype=float)
+        self.mean = self._population.mean(axis=0)
+        self.std = self._population.std(axis=0)
+
+    def ask(self) -> FloatArray:
+        """Return the population, (N, C), inside the unit cube."""
+        return self._population.copy()
+
+    def tell(self, fitness: FloatArray) -> None:
+        """Refit to the elites and draw the next population.
+
+        The published program calls the first half of the random start its first elite, without a look at
+        fitness; here the first generation is scored like the others.
+
+        Args:
+            fitness: Higher is better, (N,); members that are not finite are never elites.
+        """
+        usable = np.flatnonzero(np.isfinite(fitness))
+        if usable.size:
+            # Stable, so that equal members keep their order on every machine.
+            order = usable[np.argsort(-fitness[usable], kind="stable")][: self._elites]
+            elites = self._population[order]
+            weights = elite_weights(len(fitness), len(elites))
+            self.mean = weights @ elites
+            self.std = np.sqrt(weights @ (elites - self.mean) ** 2)
+        draw = self._rng.standard_normal(self._population.shape)
+        self._population = np.clip(self.mean + self.std * draw, 0.0, 1.0)
+
+    def save(self) -> State:
+        """Return everything that changes."""
+        return {"population": self._population, "mean": self.mean, "std": self.std}
+
+    def load(self, state: State) -> None:
+        """Continue from a saved state."""
+        self._population = np.array(state["population"])
+        self.mean, self.std = np.array(state["mean"]), np.array(state["std"])
+
+
+class Box:
+    """The map between the unit cube in which the Gaussian lives and physical values.
+
+    Args:
+        coordinates: The problem's coordinates.
+        scale: See `EasiSettings`.
+    """
+
+    def __init__(self, coordinates: Coordinates, scale: BoxScale) -> None:
+        self._coordinates, self._linear = coordinates, scale == "linear"
+
+    def members(self, unit: FloatArray) -> Members:
+        """Map unit coordinates, (N, C), to physical values inside the range."""
+        members = self._coordinates.members(unit)
+        if not self._linear:
+            return members
+        space = self._coordinates.space
+        theta = space.low + (space.high - space.low) * unit[:, : len(space)]
+        return Members(np.clip(theta, space.low, space.high), members.latency_s)
+
+
+@dataclass(frozen=True)
+class Easi(Search):
+    """EASI: critic, elites and a diagonal Gaussian.
+
+    Attributes:
+        settings: How to run.
+        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
+    """
+
+    name = "easi"
+    settings: EasiSettings = field(default_factory=EasiSettings)
+    policy: PopulationPolicy | None = None
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """See :meth:`Search.begin`."""
+        return _Easi(run, rng, self.settings, self.policy)
+
+
+def published() -> Easi:
+    """Return EASI in the box as published: linear, whatever the parameters' scale."""
+    return Easi(EasiSettings(scale="linear"))
+
+
+class _Easi(ScoredStepper):
+    def __init__(
+        self, run: Run, rng: np.random.Generator, settings: EasiSettings, policy: PopulationPolicy | None
+    ) -> None:
+        critic = replace(settings.critic, batch=settings.batch_per_member * run.budget.population)
+        scoring = replace(settings.scoring, critic=critic)
+        super().__init__(run, rng, settings.fitness, scoring, policy)
+        self._settings = settings
+        self._box = Box(self.coordinates, settings.scale)
+        # The latency's coordinate is drawn without its margin, all others uniformly.
+        start = self.coordinates.sample(rng, run.budget.population)
+        self._search = EliteGaussian(start, settings.survive_rate, rng)
+
+    def step(self) -> None:
+        """Roll out, train the critic, score by the trained critic, select."""
+        members = self._box.members(self._search.ask())
+        fitness, values = self.score(members)
+        self._search.tell(fitness)
+        spread = float(self._search.std.mean())
+        self.note(f"spread {spread:.3g} of the range", members, {**values, "spread": spread})
+
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`; the estimate is the Gaussian's mean."""
+        centre = self._box.members(self._search.mean[None])
+        return self.run.result(
+            self.coordinates,
+            centre,
+            self._box.members(self._search.ask()),
+            settings=self._settings,
+            chi2=self.residual(centre),
+            alarms=self.alarms(),
+            extra={"interval": "population spread, uncalibrated"},
+        )
+
+    def save(self) -> State:
+        """See :meth:`Stepper.save`."""
+        return {"search": self._search.save(), "fitness": self.fitness.save()}
+
+    def load(self, state: State) -> None:
+        """See :meth:`Stepper.load`."""
+        self._search.load(state["search"])
+        self.fitness.load(state["fitness"])

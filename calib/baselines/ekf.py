@@ -1,0 +1,307 @@
+"""`ekf`: parameters as additional states of an extended Kalman filter that runs along the recording.
+
+The filter of the paper's Table 6: the state is (positions, velocities, parameters in their own scale and the
+latency), the model is one sample of simulation, its Jacobian that of forward differences in one batch. It is
+extended, not unscented or ensemble: what bends between the mean and its uncertainty is lost.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.identifiability import Z90, intervals
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.problem import WindowData
+from deal_hw.calib.refine import value_bounds
+from deal_hw.calib.residuals import LATENCY_STEP_S, PARAMETER_STEP, POSITION_STEP, VELOCITY_STEP
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.types import FloatArray
+
+
+class ExtendedKalman:
+    """An extended Kalman filter with numeric Jacobians; it knows no simulator.
+
+    The first n of its D states move; the others, the parameters, stay. Ask for the points, let them move by
+    one step, tell what came out.
+
+    Args:
+        mean: First mean, (D,).
+        covariance: First covariance, (D, D).
+        moving: How many states move, n.
+        step: Step of the forward differences, (D,).
+        noise: Variance that is added before each step, (D,).
+    """
+
+    def __init__(
+        self, mean: FloatArray, covariance: FloatArray, moving: int, step: FloatArray, noise: FloatArray
+    ) -> None:
+        self.mean, self.covariance = mean.copy(), covariance.copy()
+        self._moving, self._step, self._noise = moving, step, noise
+
+    def ask(self) -> FloatArray:
+        """Return the mean and, for each state, the mean with that state moved: (1 + D, D)."""
+        return np.concatenate([self.mean[None], self.mean + np.diag(self._step)])
+
+    def tell(self, moved: FloatArray, observed: FloatArray, measured: FloatArray, std: FloatArray) -> float:
+        """Predict and update.
+
+        Args:
+            moved: Moving states after the step of each point that was asked, (1 + D, n).
+            observed: What each would measure then, (1 + D, M).
+            measured: What was measured, (M,).
+            std: Its standard deviation, (M,); infinite where nothing was measured.
+
+        Returns:
+            The innovation's squared length in its own covariance over the channels: 1 on average for a filter
+            that is right.
+        """
+        n, D = self._moving, len(self.mean)
+        known = np.isfinite(std)
+        # Noise enters at the start of a step, so that one set of points gives both Jacobians.
+        prior = self.covariance + np.diag(self._noise)
+        F = np.eye(D)
+        F[:n] = (moved[1:] - moved[0]).T / self._step
+        G = ((observed[1:] - observed[0]).T / self._step)[known]
+        self.mean[:n] = moved[0]
+        self.covariance = F @ prior @ F.T
+        if not known.any():
+            return math.nan
+        S = G @ prior @ G.T + np.diag(std[known] ** 2)
+        gain = np.linalg.solve(S, G @ prior @ F.T).T
+        innovation = measured[known] - observed[0, known]
+        self.mean += gain @ innovation
+        P = self.covariance - gain @ S @ gain.T
+        self.covariance = 0.5 * (P + P.T)
+        return float(innovation @ np.linalg.solve(S, innovation)) / int(known.sum())
+
+    def restart(self, mean: FloatArray, std: FloatArray) -> None:
+        """Put the moving states elsewhere, (n,) each, and forget what ties the parameters to them."""
+        n = self._moving
+        self.mean[:n] = mean
+        self.covariance[:n], self.covariance[:, :n] = 0.0, 0.0
+        self.covariance[:n, :n] = np.diag(std**2)
+
+
+DIVERGED = 3.0
+"""Innovations that are so many times their own variance say that the filter does not follow the recording."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EkfSettings:
+    """Settings of `ekf`.
+
+    Attributes:
+        passes: Runs along all recordings, at most the budget's generations. Each starts at the parameters
+            that the last one ended with and with the first one's covariance, so that no sample counts twice.
+        parameter_drift: Standard deviation by which a parameter may drift in one second, in parts of its
+            range.
+        velocity_noise: Standard deviation that the model's error adds to a velocity in one sample, in parts
+            of the start states' uncertainty.
+        first_noise_factor: Factor on the sensors' standard deviations in the first pass; it falls by equal
+            ratios to 1 in the last. While the parameters are far off, what bends outweighs the noise.
+    """
+
+    passes: int = 8
+    parameter_drift: float = 1e-3
+    velocity_noise: float = 0.0
+    first_noise_factor: float = 30.0
+
+
+class Ekf(Search):
+    """Augmented extended Kalman filter.
+
+    Args:
+        settings: How to run.
+    """
+
+    name = "ekf"
+
+    def __init__(self, settings: EkfSettings | None = None) -> None:
+        self.settings = settings or EkfSettings()
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """Return the run before its first pass; the filter draws nothing."""
+        return _Passes(run, self.settings)
+
+
+class _Passes(Stepper):
+    """One run: a generation is one pass along all recordings.
+
+    Args:
+        run: Book-keeping.
+        settings: How to run.
+    """
+
+    def __init__(self, run: Run, settings: EkfSettings) -> None:
+        self._run, self._settings, self._problem = run, settings, run.problem
+        self._coordinates = Coordinates(run.problem)
+        self._samples: Sequence[WindowData] = run.problem.windows(1)
+        self._low, self._high = value_bounds(run.problem)
+        space = run.problem.space
+        self._free_latency = run.problem.fixed_latency_s is None
+        # A range is a flat prior: its centre and its standard deviation, where nothing better is expected.
+        expected, spread = space.prior
+        known = np.isfinite(spread)
+        self._drift = np.append(space.width, self._high[-1] - self._low[-1])
+        self._prior_std = self._drift / math.sqrt(12.0)
+        self._prior_std[:-1] = np.where(known, spread, self._prior_std[:-1])
+        middle = 0.5 * (self._low[-1] + self._high[-1])
+        start = space.to_scale(np.where(known, expected, space.center))
+        self._value = np.append(start, self._coordinates.clip_latency(float(middle)))
+        if not self._free_latency:
+            self._prior_std = self._prior_std[:-1]
+        self._covariance = np.diag(self._prior_std**2)
+        self._lost, self._misfit = 0, math.nan
+
+    @property
+    def finished(self) -> bool:
+        """Whether all passes are done, or the budget is used up."""
+        return len(self._run.trace) >= self._passes
+
+    @property
+    def _passes(self) -> int:
+        return max(min(self._settings.passes, self._run.budget.generations), 1)
+
+    def step(self) -> None:
+        """Run along all recordings once."""
+        filter_ = self._filter()
+        left = 1.0 - len(self._run.trace) / max(self._passes - 1, 1)
+        factor = self._settings.first_noise_factor ** max(left, 0.0)
+        misfits: list[float] = []
+        self._lost = 0
+        for data in self._samples:
+            misfits += self._along(filter_, data, factor)
+        n = 2 * self._problem.coordinates
+        self._value[: len(self._prior_std)] = filter_.mean[n:]
+        self._covariance = filter_.covariance[n:, n:]
+        usable = np.array(misfits)[np.isfinite(misfits)]
+        self._misfit = float(usable.mean()) if len(usable) else math.inf
+        self._run.note(
+            f"innovations {self._misfit:.3g} times their variance, {self._lost} steps lost",
+            self._members(self._value[None]).theta,
+            {"misfit": self._misfit, "lost": float(self._lost)},
+        )
+
+    def _filter(self) -> ExtendedKalman:
+        problem, settings = self._problem, self._settings
+        C, P = problem.coordinates, len(self._prior_std)
+        n = 2 * C
+        covariance = np.zeros((n + P, n + P))
+        covariance[n:, n:] = np.diag(self._prior_std**2)
+        steps = np.concatenate(
+            [
+                np.full(C, POSITION_STEP),
+                np.full(C, VELOCITY_STEP),
+                np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)[:P],
+            ]
+        )
+        drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)
+        model = settings.velocity_noise * problem.starts[0].velocity_std
+        noise = np.concatenate([np.zeros(C), model, drift]) ** 2
+        return ExtendedKalman(np.append(np.zeros(n), self._value[:P]), covariance, n, steps, noise)
+
+    def _along(self, filter_: ExtendedKalman, data: WindowData, factor: float) -> Iterator[float]:
+        """Run along one recording with the sensors' standard deviations times a factor."""
+        problem = self._problem
+        C, P = problem.coordinates, len(self._prior_std)
+        states = problem.starts[data.episode]
+        std = np.concatenate([states.position_std, states.velocity_std])
+        before = None
+        for w, start in enumerate(data.windows.start):
+            if before is None or start != before + 1:
+                filter_.restart(np.concatenate([data.start_position[w], data.start_velocity[w]]), std)
+            before = start
+            points = filter_.ask()
+            values = np.repeat(self._value[None], len(points), axis=0)
+            values[:, :P] = points[:, 2 * C :]
+            members = self._members(values)
+            predicted = problem.predict(
+                members.theta,
+                members.latency_s,
+                only(data, w),
+                points[:, None, :C],
+                points[:, None, C : 2 * C],
+            )
+            moved = np.concatenate([predicted.position[:, 0, 0], predicted.velocity[:, 0, 0]], axis=1)
+            if not np.isfinite(moved).all():
+                # The next step starts from the recording again.
+                self._lost, before = self._lost + 1, None
+                continue
+            noise = factor * data.std[w, 0]
+            yield filter_.tell(moved, predicted.observed[:, 0, 0], data.measured[w, 0], noise)
+            inside = np.clip(filter_.mean[2 * C :], self._low[:P], self._high[:P])
+            filter_.mean[2 * C :] = inside
+
+    def _members(self, values: FloatArray) -> Members:
+        theta = self._problem.space.from_scale(values[:, :-1])
+        return Members(theta, np.maximum(values[:, -1], 0.0))
+
+    def result(self) -> CalibrationResult:
+        """Return the last pass's parameters and the filter's own covariance."""
+        space = self._problem.space
+        K = len(space)
+        centre = self._members(self._value[None])
+        covariance = self._covariance[:K, :K]
+        latency = float(self._value[-1])
+        alarms = []
+        if not self._misfit < DIVERGED:
+            alarms.append(
+                f"the filter's innovations are {self._misfit:.1f} times their own variance: it diverged, and "
+                "its covariance means nothing"
+            )
+        spread = Z90 * math.sqrt(max(self._covariance[K, K], 0.0)) if self._free_latency else 0.0
+        plain = self._run.result(
+            self._coordinates,
+            centre,
+            centre,
+            settings=self._settings,
+            chi2=self._misfit,
+            alarms=alarms,
+            extra={"lost_steps": self._lost, "interval": "the filter's own covariance of the last pass"},
+        )
+        return dataclasses.replace(
+            plain,
+            interval=intervals(space, centre.theta[0], covariance),
+            covariance=covariance,
+            latency_interval_s=(
+                self._coordinates.clip_latency(latency - spread),
+                self._coordinates.clip_latency(latency + spread),
+            ),
+        )
+
+    def save(self) -> dict[str, Any]:
+        """Return the parameters and their covariance."""
+        return {
+            "value": self._value,
+            "covariance": self._covariance,
+            "lost": self._lost,
+            "misfit": self._misfit,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state."""
+        self._value, self._covariance = state["value"].copy(), state["covariance"]
+        self._lost, self._misfit = state["lost"], state["misfit"]
+
+
+def only(data: WindowData, w: int) -> WindowData:
+    """Return one window of several."""
+    one = slice(w, w + 1)
+    return dataclasses.replace(
+        data,
+        windows=dataclasses.replace(data.windows, start=data.windows.start[one]),
+        measured=data.measured[one],
+        std=data.std[one],
+        start_position=data.start_position[one],
+        start_velocity=data.start_velocity[one],
+        prior_mean=data.prior_mean[one],
+        prior_std=data.prior_std[one],
+    )

@@ -1,0 +1,372 @@
+"""`gauss-newton`: random draws, the best refined side by side, drawn again until the residual is explained.
+
+Many scattered starts beat one concentrated search here: a draw whose effort or speed limit is never reached
+sits on a plateau with a zero gradient, and only another draw leads away from it. The residual is that of
+`weki`, window innovations whitened for sensor noise and start-state error, so start states need no unknowns
+of their own; one batch of simulations holds all starts with all their finite differences.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.identifiability import uncertainty
+from deal_hw.calib.innovations import cut, is_noisy, whitened_residual
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.problem import Problem, WindowData
+from deal_hw.calib.refine import DAMPINGS as ALL_DAMPINGS
+from deal_hw.calib.refine import damped_step, value_bounds
+from deal_hw.calib.residuals import LATENCY_STEP_S, PARAMETER_STEP
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.types import FloatArray
+
+DAMPINGS = ALL_DAMPINGS[::2]
+"""Every second one: with ten starts each costs ten simulations of the recording."""
+
+DRAW_SHARE = 3
+"""Drawing takes at most one part in so many of a small budget's generations."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GaussNewtonSettings:
+    """Settings of `gauss-newton`.
+
+    Attributes:
+        draws: Parameter vectors that are scored before each multi-start.
+        starts: The best of them that are refined.
+        survivors: Starts that go on to each further stage.
+        noisy_ticks: Window lengths of the stages in control periods, where positions carry noise.
+        clean_ticks: The same where they carry none.
+        stage_generations: Most iterations of one stage.
+        converged: Relative gain of a start's cost below which it is at rest.
+        restart_chi2: A residual above this is not explained: draw again.
+    """
+
+    draws: int = 500
+    starts: int = 10
+    survivors: int = 4
+    noisy_ticks: tuple[int, ...] = (5, 20)
+    clean_ticks: tuple[int, ...] = (5, 10)
+    stage_generations: int = 12
+    converged: float = 1e-3
+    restart_chi2: float = 3.0
+
+
+class GaussNewton(Search):
+    """Multi-start Levenberg-Marquardt on whitened window innovations.
+
+    Args:
+        settings: How to run.
+    """
+
+    name = "gauss-newton"
+
+    def __init__(self, settings: GaussNewtonSettings | None = None) -> None:
+        self.settings = settings or GaussNewtonSettings()
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """Return the run before its first draw."""
+        return _MultiStart(run, rng, self.settings)
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """Residuals of several starts and their derivatives, all in one metric.
+
+    Attributes:
+        residual: Whitened residuals, (S, M).
+        cost: Their sums of squares, (S,); infinite where a start diverged.
+        gradient: Half the costs' gradients, (S, K + 1); 0 for a latency that is given.
+        hessian: Half their Gauss-Newton Hessians, (S, K + 1, K + 1).
+    """
+
+    residual: FloatArray
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class Innovations:
+    """Whitened window innovations as functions of parameters in their own scale and of the latency.
+
+    Args:
+        problem: Data and simulator.
+        ticks: Window length in control periods.
+        follow: Linearise around the start states that were most probable in the last iteration, not around
+            the smoothed ones; right once the simulator is nearly right.
+    """
+
+    def __init__(self, problem: Problem, ticks: int, follow: bool) -> None:
+        self.problem = problem
+        self.windows: list[WindowData] = cut(problem, ticks)
+        self.offsets: list[FloatArray] | None = None
+        if follow:
+            self.offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self.windows]
+        K = len(problem.space)
+        steps = np.append(np.full(K, PARAMETER_STEP), LATENCY_STEP_S)
+        self._steps = steps[: K + (problem.fixed_latency_s is None)]
+
+    def members(self, values: FloatArray) -> Members:
+        """Return values, (N, K + 1), in physical units."""
+        return Members(self.problem.space.from_scale(values[:, :-1]), values[:, -1])
+
+    def residual(self, values: FloatArray, centre: FloatArray) -> FloatArray:
+        """Return whitened residuals of values, (N, K + 1), in the metric of one of them, (K + 1,): (N, M)."""
+        offsets = None if self.offsets is None else list(self.offsets)
+        members, around = self.members(values), self.members(centre[None])
+        return whitened_residual(self.problem, members, around, self.windows, offsets)
+
+    def follow(self, centre: FloatArray) -> None:
+        """Move the start states to the most probable ones under a simulator, (K + 1,)."""
+        if self.offsets is not None:
+            around = self.members(centre[None])
+            whitened_residual(self.problem, around, around, self.windows, self.offsets)
+
+    def linear(self, values: FloatArray, centre: FloatArray) -> Linear:
+        """Return residuals and forward differences at several values, (S, K + 1), in one batch.
+
+        Args:
+            values: Where.
+            centre: Whose metric, (K + 1,).
+        """
+        S, C = values.shape
+        count = len(self._steps)
+        points = np.repeat(values[:, None], 1 + count, axis=1)
+        points[:, 1:, :count] += np.diag(self._steps)
+        flat = self.residual(points.reshape(-1, C), centre)
+        r = flat.reshape(S, 1 + count, -1)
+        base = r[:, 0]
+        # A column that diverges where its base does not says nothing about the way to go.
+        jac = np.nan_to_num((r[:, 1:] - base[:, None]) / self._steps[:, None], posinf=0.0, neginf=0.0)
+        clean = np.nan_to_num(base)
+        gradient, hessian = np.zeros((S, C)), np.zeros((S, C, C))
+        gradient[:, :count] = np.einsum("scm,sm->sc", jac, clean)
+        hessian[:, :count, :count] = np.einsum("scm,sdm->scd", jac, jac)
+        return Linear(base, costs(base), gradient, hessian)
+
+    def split(self, residual: FloatArray) -> tuple[FloatArray, ...]:
+        """Return one residual, (M,), by episodes: (W, H, channels) each."""
+        sizes = np.cumsum([d.measured.size for d in self.windows])[:-1]
+        parts = np.split(residual, sizes)
+        return tuple(p.reshape(d.measured.shape) for p, d in zip(parts, self.windows, strict=True))
+
+
+def costs(residual: FloatArray) -> FloatArray:
+    """Return sums of squares, (N,), of residuals, (N, M); infinite where one diverged."""
+    total = np.sum(residual**2, axis=1)
+    return np.where(np.isfinite(total), total, np.inf)
+
+
+class _MultiStart(Stepper):
+    """One run: draw, refine in stages, draw again.
+
+    Args:
+        run: Book-keeping.
+        rng: Draws.
+        settings: How to run.
+    """
+
+    def __init__(self, run: Run, rng: np.random.Generator, settings: GaussNewtonSettings) -> None:
+        self._run, self._rng, self._settings = run, rng, settings
+        self._problem = run.problem
+        self._coordinates = Coordinates(run.problem)
+        self._low, self._high = value_bounds(run.problem)
+        self._ticks = settings.noisy_ticks if is_noisy(run.problem) else settings.clean_ticks
+        self._stage, self._iteration, self._restarts = -1, 0, 0
+        self._innovations = Innovations(run.problem, self._ticks[0], follow=False)
+        C = len(run.problem.space) + 1
+        self._pool, self._scores = np.empty((0, C)), np.empty(0)
+        self._values, self._cost = np.empty((0, C)), np.empty(0)
+        self._best: tuple[float, FloatArray] = (math.inf, self._centre())
+        self._explained = False
+
+    def _centre(self) -> FloatArray:
+        middle = self._coordinates.members(np.full((1, self._coordinates.count), 0.5))
+        return self._value_of(middle)[0]
+
+    def _value_of(self, members: Members) -> FloatArray:
+        value = np.column_stack([self._problem.space.to_scale(members.theta), members.latency_s])
+        return np.asarray(np.clip(value, *self._bounds()))
+
+    def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        fixed = self._problem.fixed_latency_s
+        if fixed is None:
+            return self._low, self._high
+        return np.append(self._low[:-1], fixed), np.append(self._high[:-1], fixed)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the residual is explained or the budget is used up."""
+        return self._explained or len(self._run.trace) >= max(self._run.budget.generations, 1)
+
+    def step(self) -> None:
+        """Draw once more, or refine all starts by one iteration."""
+        if self._stage < 0:
+            self._draw()
+        else:
+            self._refine()
+
+    def _draw(self) -> None:
+        budget, settings = self._run.budget, self._settings
+        members = self._coordinates.members(self._coordinates.sample(self._rng, budget.population))
+        values = self._value_of(members)
+        # One metric for all draws, that of the range's centre, and absolute values: most draws are so far
+        # off that squares would rank them by their one worst window.
+        score = np.mean(np.abs(self._innovations.residual(values, self._centre())), axis=1)
+        self._pool = np.concatenate([self._pool, values])
+        self._scores = np.concatenate([self._scores, np.where(np.isfinite(score), score, np.inf)])
+        best = float(self._scores.min())
+        self._run.note(
+            f"{len(self._pool)} draws: best {best:.3g}",
+            members.theta,
+            {"stage": -1.0, "chi2": best**2, "starts": 0.0},
+        )
+        share = max(budget.generations // DRAW_SHARE, 1)
+        wanted = min(settings.draws, share * budget.population)
+        if self._best[0] == math.inf:
+            self._best = (math.inf, self._pool[int(np.argmin(self._scores))])
+        if len(self._pool) >= wanted:
+            order = np.argsort(self._scores, kind="stable")[: settings.starts]
+            self._values = self._pool[order]
+            self._begin_stage(0)
+
+    def _begin_stage(self, stage: int) -> None:
+        self._stage, self._iteration = stage, 0
+        self._innovations = Innovations(self._problem, self._ticks[stage], follow=stage > 0)
+
+    def _refine(self) -> None:
+        low, high = self._bounds()
+        centre = self._values[0]
+        linear = self._innovations.linear(self._values, centre)
+        steps = [
+            damped_step(value, linear.gradient[s], linear.hessian[s], damping, low, high, self._fixed)
+            for s, value in enumerate(self._values)
+            for damping in DAMPINGS
+        ]
+        S, D = len(self._values), len(DAMPINGS)
+        tried = np.repeat(self._values, D, axis=0) + np.stack(steps)
+        cost = costs(self._innovations.residual(tried, centre)).reshape(S, D)
+        chosen = np.argmin(cost, axis=1)
+        reached = cost[np.arange(S), chosen]
+        better = reached < linear.cost
+        moved = tried.reshape(S, D, -1)[np.arange(S), chosen]
+        self._values = np.where(better[:, None], moved, self._values)
+        after = np.where(better, reached, linear.cost)
+        with np.errstate(invalid="ignore"):
+            gain = np.where(np.isfinite(linear.cost), (linear.cost - after) / linear.cost, 0.0)
+        resting = np.nan_to_num(gain) < self._settings.converged
+        order = np.argsort(after, kind="stable")
+        self._values, self._cost = self._values[order], after[order]
+        self._iteration += 1
+        self._innovations.follow(self._values[0])
+        self._note(linear.residual.shape[1])
+        self._maybe_next(bool(resting[order[0]]), bool(resting.all()), linear.residual.shape[1])
+
+    @property
+    def _fixed(self) -> bool:
+        return self._problem.fixed_latency_s is not None
+
+    def _note(self, count: int) -> None:
+        chi2 = self._cost / count
+        self._run.note(
+            f"windows of {self._ticks[self._stage]} ticks: chi2 {chi2[0]:.3g}, worst start {chi2[-1]:.3g}",
+            self._innovations.members(self._values).theta,
+            {"stage": float(self._stage), "chi2": float(chi2[0]), "starts": float(len(chi2))},
+        )
+
+    def _maybe_next(self, best_rests: bool, all_rest: bool, count: int) -> None:
+        """Go on to the next stage, or end this multi-start, where no more can be gained."""
+        settings = self._settings
+        chi2 = float(self._cost[0]) / count
+        last = self._stage == len(self._ticks) - 1
+        if last and chi2 <= self._best[0]:
+            self._best = (chi2, self._values[0].copy())
+        elif self._best[0] == math.inf:
+            self._best = (math.inf, self._values[0].copy())
+        # Once the best start explains everything there is nothing to wait for in the others.
+        rests = all_rest or (best_rests and chi2 <= settings.restart_chi2)
+        if not rests and self._iteration < settings.stage_generations:
+            return
+        if not last:
+            self._values = self._values[: settings.survivors]
+            self._begin_stage(self._stage + 1)
+        elif chi2 <= settings.restart_chi2:
+            self._explained = True
+        else:
+            self._restarts += 1
+            self._pool, self._scores = self._pool[:0], self._scores[:0]
+            self._stage = -1
+            self._innovations = Innovations(self._problem, self._ticks[0], follow=False)
+
+    def result(self) -> CalibrationResult:
+        """Return the best start, with intervals from the normal equations there."""
+        problem, settings = self._problem, self._settings
+        innovations = Innovations(problem, self._ticks[-1], follow=True)
+        value = self._best[1]
+        innovations.follow(value)
+        linear = innovations.linear(value[None], value)
+        chi2 = float(linear.cost[0]) / linear.residual.shape[1]
+        theta = problem.space.from_scale(value[:-1])
+        latency = self._coordinates.clip_latency(float(value[-1]))
+        known = uncertainty(
+            problem.space,
+            theta,
+            latency,
+            linear.hessian[0],
+            chi2 if math.isfinite(chi2) else 1.0,
+            innovations.split(np.nan_to_num(linear.residual[0])),
+            problem.latency_range_s,
+            fixed_latency=self._fixed,
+            timing_std_s=problem.noise.timing_std_s,
+        )
+        last = self._values if len(self._values) else value[None]
+        plain = self._run.result(
+            self._coordinates,
+            innovations.members(value[None]),
+            innovations.members(last),
+            settings=settings,
+            chi2=chi2,
+            alarms=known.alarms,
+            extra={"restarts": self._restarts, "interval": "90 %, from the normal equations"},
+        )
+        return dataclasses.replace(
+            plain,
+            interval=known.interval,
+            covariance=known.covariance,
+            verdicts=known.verdicts,
+            null_directions=known.null_directions,
+            latency_interval_s=known.latency_interval_s,
+        )
+
+    def save(self) -> dict[str, Any]:
+        """Return the draws, the starts and where each stage stands."""
+        return {
+            "stage": self._stage,
+            "iteration": self._iteration,
+            "restarts": self._restarts,
+            "explained": self._explained,
+            "pool": self._pool,
+            "scores": self._scores,
+            "values": self._values,
+            "cost": self._cost,
+            "best": [self._best[0], self._best[1]],
+            "offsets": self._innovations.offsets,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state."""
+        self._begin_stage(max(state["stage"], 0))
+        self._stage, self._iteration = state["stage"], state["iteration"]
+        self._innovations.offsets = state["offsets"]
+        self._restarts, self._explained = state["restarts"], state["explained"]
+        self._pool, self._scores = state["pool"], state["scores"]
+        self._values, self._cost = state["values"], state["cost"]
+        self._best = (state["best"][0], state["best"][1])

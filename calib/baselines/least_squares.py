@@ -1,0 +1,259 @@
+"""`least-squares`: one-step prediction error from recorded states, minimised from one start.
+
+The plain textbook baseline, as the paper's Table 6 means it. Every control period starts from the state that
+the robot reported, the simulation predicts the next one, and `scipy.optimize.least_squares` (trust region,
+with the ranges as bounds) minimises the sum of squared differences, from the centre of the ranges on. Each
+recorded quantity is divided by how much it changes in one control period; that is all the weighing there is.
+No noise model, no latency but one that is given, no second start: errors in the recorded states go into the
+parameters, and a start on a plateau stays there. Parameters are in their own scale (log for positive ones).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.identifiability import intervals
+from deal_hw.calib.innovations import explained, samples_per_tick
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.problem import Problem, WindowData
+from deal_hw.calib.residuals import PARAMETER_STEP
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import InsufficientDataError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import FloatArray
+
+EXPLAINED_TICKS = 10
+"""Window length of the residual that the result states, in control periods."""
+
+DIVERGED = 1e3
+"""Difference, in typical changes, that stands for a simulation that diverged: scipy takes no infinities."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeastSquaresSettings:
+    """Settings of `least-squares`.
+
+    Attributes:
+        tolerance: Relative change of cost and parameters at which the search rests.
+    """
+
+    tolerance: float = 1e-8
+
+
+class LeastSquares(Search):
+    """Single-start least squares on the one-step prediction error.
+
+    The optimiser's state is inside scipy, so a run is one generation: interrupted in the middle of it, a run
+    begins anew, to the same numbers. The budget's generations bound the optimiser's iterations.
+
+    Args:
+        settings: How to run.
+    """
+
+    name = "least-squares"
+
+    def __init__(self, settings: LeastSquaresSettings | None = None) -> None:
+        self.settings = settings or LeastSquaresSettings()
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """Return the run before its only generation; nothing is drawn."""
+        problem, settings = run.problem, self.settings
+        latency_s = Coordinates(problem).clip_latency(0.0)
+
+        def solve() -> Found:
+            return _solve(problem, latency_s, run.budget.generations, settings.tolerance)
+
+        return OneShot(run, settings, solve, f"textbook s^2 inv(J'J), latency {latency_s:g} s")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a one-shot optimiser found.
+
+    Attributes:
+        theta: Physical values, (K,).
+        covariance: In each parameter's own scale, (K, K).
+        latency_s: Latency that was assumed [s].
+        iterations: Iterations of the optimiser.
+        message: Why it stopped.
+        steps: Physics steps that it simulated past the problem's own simulator.
+        alarms: Reasons to distrust it.
+        interval: 90 % intervals where the optimiser has its own, (K, 2); None: from the covariance.
+    """
+
+    theta: FloatArray
+    covariance: FloatArray
+    latency_s: float
+    iterations: int
+    message: str
+    steps: int = 0
+    alarms: tuple[str, ...] = ()
+    interval: FloatArray | None = None
+
+
+class OneShot(Stepper):
+    """A run of an optimiser that cannot be stopped in the middle: one generation.
+
+    Args:
+        run: Book-keeping.
+        settings: The method's settings, a dataclass.
+        solve: The optimiser.
+        interval: Where the intervals come from, in words.
+    """
+
+    def __init__(self, run: Run, settings: Any, solve: Callable[[], Found], interval: str) -> None:
+        self._run, self._settings, self._solve, self._interval = run, settings, solve, interval
+        self._found: Found | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the optimiser has run."""
+        return self._found is not None
+
+    def step(self) -> None:
+        """Run the optimiser to its end."""
+        found = self._solve()
+        self._found = found
+        self._run.note(
+            f"{found.iterations} iterations: {found.message}",
+            found.theta[None],
+            {"iterations": float(found.iterations)},
+        )
+
+    def result(self) -> CalibrationResult:
+        """Return what the optimiser found."""
+        found, problem = self._found, self._run.problem
+        if found is None:
+            raise InsufficientDataError("the optimiser has not run yet; call step() first")
+        coordinates = Coordinates(problem)
+        latency = coordinates.clip_latency(found.latency_s)
+        centre = Members(found.theta[None], np.array([latency]))
+        plain = self._run.result(
+            coordinates,
+            centre,
+            centre,
+            settings=self._settings,
+            chi2=explained(problem, centre, EXPLAINED_TICKS),
+            alarms=found.alarms,
+            extra={
+                "interval": self._interval,
+                "iterations": found.iterations,
+                "stopped": found.message,
+                "assumed_latency_s": found.latency_s,
+            },
+        )
+        interval = found.interval
+        if interval is None:
+            interval = intervals(problem.space, found.theta, found.covariance)
+        steps = plain.steps + found.steps
+        return dataclasses.replace(plain, interval=interval, covariance=found.covariance, steps=steps)
+
+    def save(self) -> dict[str, Any]:
+        """Return what was found."""
+        return {"found": None if self._found is None else dataclasses.asdict(self._found)}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state."""
+        saved = state["found"]
+        self._found = None if saved is None else Found(**{**saved, "alarms": tuple(saved["alarms"])})
+
+
+def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return s^2 inv(J'J) with the range as a flat prior, which keeps what the data cannot see finite.
+
+    Args:
+        space: The parameters.
+        jacobian: Derivatives in each parameter's own scale, (R, K).
+        residual: (R,).
+    """
+    variance = float(residual @ residual) / max(len(residual) - len(space), 1)
+    information = jacobian.T @ jacobian / max(variance, np.finfo(float).tiny)
+    return np.asarray(np.linalg.inv(information + np.diag(12.0 / space.width**2)))
+
+
+def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float) -> Found:
+    space = problem.space
+    error = OneStep(problem, latency_s)
+    step = PARAMETER_STEP * np.eye(len(space))
+
+    def residual(value: FloatArray) -> FloatArray:
+        return error.residual(value[None])[0]
+
+    def jacobian(value: FloatArray) -> FloatArray:
+        r = error.residual(np.concatenate([value[None], value + step]))
+        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
+
+    solution = least_squares(
+        residual,
+        space.to_scale(space.center),
+        jac=jacobian,
+        bounds=(space.to_scale(space.low), space.to_scale(space.high)),
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance,
+        max_nfev=max(iterations, 1),
+    )
+    theta = np.clip(space.from_scale(solution.x), space.low, space.high)
+    return Found(
+        theta=theta,
+        covariance=textbook_covariance(space, solution.jac, solution.fun),
+        latency_s=latency_s,
+        iterations=int(solution.nfev),
+        message=str(solution.message),
+        alarms=() if solution.status else (f"not converged after {solution.nfev} iterations",),
+    )
+
+
+class OneStep:
+    """Differences between what was recorded and what is predicted one control period ahead of each record.
+
+    Args:
+        problem: Data and simulator.
+        latency_s: Latency that is assumed [s].
+    """
+
+    def __init__(self, problem: Problem, latency_s: float) -> None:
+        self._problem, self._latency_s = problem, latency_s
+        self._data = problem.windows(samples_per_tick(problem))
+        self._recorded = [self._states(d) for d in self._data]
+        first = problem.episodes[self._data[0].episode]
+        # With all positions measured, velocities were recorded too; otherwise only what was measured counts.
+        counts = np.ones(2 * problem.coordinates, dtype=bool)
+        if first.measured is not None:
+            counts = first.measured.copy()
+        counts &= np.all([np.isfinite(r).all(axis=(0, 1)) for r in self._recorded], axis=0)
+        change = np.concatenate([r[1] - r[0] for r in self._recorded])
+        scale = np.sqrt(np.mean(change**2, axis=0))
+        counts &= scale > 0
+        if not counts.any():
+            raise InsufficientDataError("nothing that was recorded ever changes; move the robot")
+        self._counts, self._scale = counts, scale[counts]
+
+    def _states(self, data: WindowData) -> FloatArray:
+        """Return recorded (position, velocity) at the start and the end of each window, (2, W, 2 C)."""
+        episode = self._problem.episodes[data.episode]
+        whole = np.concatenate([episode.position, episode.velocity], axis=1)
+        return np.stack([whole[data.windows.start], whole[data.windows.samples()[:, -1]]])
+
+    def residual(self, values: FloatArray) -> FloatArray:
+        """Return the scaled differences of parameters in their own scale, (N, K): (N, R)."""
+        problem = self._problem
+        theta, latency = problem.space.from_scale(values), np.full(len(values), self._latency_s)
+        parts = []
+        for data, recorded in zip(self._data, self._recorded, strict=True):
+            smoothed = np.concatenate([data.start_position, data.start_velocity], axis=1)
+            start = np.where(np.isfinite(recorded[0]), recorded[0], smoothed)
+            C = problem.coordinates
+            predicted = problem.predict(theta, latency, data, start[:, :C], start[:, C:])
+            ahead = np.concatenate([predicted.position[:, :, -1], predicted.velocity[:, :, -1]], axis=-1)
+            difference = (ahead - recorded[1])[..., self._counts] / self._scale
+            parts.append(difference.reshape(len(values), -1))
+        return np.nan_to_num(np.concatenate(parts, axis=1), nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)

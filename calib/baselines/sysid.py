@@ -1,0 +1,107 @@
+"""`mujoco-sysid`: DeepMind's ``mujoco.sysid`` as an outside reference, on the same windows as every method.
+
+Its user knows windows, smoothed start states and ranges, and nothing of a latency: the controls are late by
+the latency that the problem or the settings give, by nothing otherwise. The start is the nominal model, the
+intervals are its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.baselines.least_squares import Found, OneShot, textbook_covariance
+from deal_hw.calib.coordinates import Coordinates
+from deal_hw.calib.innovations import cut
+from deal_hw.calib.outcome import Run
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.search import Search, Stepper
+from deal_hw.errors import ConfigurationError
+from deal_hw.sim.sysid_adapter import Recording, check_space, identify, require_sysid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SysidSettings:
+    """Settings of `mujoco-sysid`.
+
+    Attributes:
+        ticks: Window length in control periods.
+        latency_s: A latency that was found by other means, such as our scan [s]; None for the problem's where
+            one is given, and otherwise zero.
+    """
+
+    ticks: int = 10
+    latency_s: float | None = None
+
+
+class MujocoSysid(Search):
+    """``mujoco.sysid`` with its default optimiser.
+
+    That optimiser is one call, so a run is one generation: interrupted in the middle of it, a run begins
+    anew, to the same numbers. The budget's generations bound its iterations.
+
+    Args:
+        settings: How to run.
+    """
+
+    name = "mujoco-sysid"
+
+    def __init__(self, settings: SysidSettings | None = None) -> None:
+        self.settings = settings or SysidSettings()
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """Return the run before its only generation; nothing is drawn.
+
+        Raises:
+            ConfigurationError: A parameter has no counterpart, or joint positions were not measured.
+            MissingExtraError: ``mujoco.sysid`` is not installed.
+        """
+        problem, settings = run.problem, self.settings
+        require_sysid()
+        check_space(problem.space)
+        _check_channels(problem)
+        given = settings.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
+        source = "given" if given is not None else "none, as its user would have it"
+        latency_s = Coordinates(problem).clip_latency(given or 0.0)
+        words = f"its own, {1e3 * latency_s:g} ms of latency ({source})"
+        return OneShot(run, settings, lambda: _solve(run, settings.ticks, latency_s), words)
+
+
+def _check_channels(problem: Problem) -> None:
+    joints = range(problem.coordinates)[problem.robot.joints]
+    missing = [problem.robot.coordinates[j] for j in joints if j not in problem.channels]
+    if missing:
+        raise ConfigurationError(
+            f"mujoco-sysid fits joint positions, and those of {', '.join(missing)} were not measured; choose "
+            "another method"
+        )
+
+
+def _solve(run: Run, ticks: int, latency_s: float) -> Found:
+    problem = run.problem
+    recordings = [
+        Recording(problem.episodes[d.episode], d.windows, d.start_position, d.start_velocity)
+        for d in cut(problem, ticks)
+    ]
+    space = problem.space
+    found = identify(
+        problem.robot,
+        space,
+        recordings,
+        latency_s=latency_s,
+        iterations=run.budget.generations,
+        threads=problem.threads,
+    )
+    # From derivatives by the value to those by its logarithm, where that is the scale.
+    chain = np.where(space.log_scale, found.theta, 1.0)
+    interval = np.stack([found.theta - found.half_width, found.theta + found.half_width], axis=1)
+    return Found(
+        theta=found.theta,
+        covariance=textbook_covariance(space, found.jacobian * chain, found.residual),
+        latency_s=latency_s,
+        iterations=found.iterations,
+        message=found.message,
+        steps=found.steps,
+        interval=np.clip(interval, space.low[:, None], space.high[:, None]),
+    )

@@ -1,0 +1,137 @@
+"""From robot, result and recordings to what the report shows: the only part that simulates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from deal_hw.calib.coordinates import Members
+from deal_hw.calib.innovations import whitened_residual
+from deal_hw.calib.problem import Problem, WindowData
+from deal_hw.calib.refine import samples_in
+from deal_hw.calib.report.inputs import HalvesRow, Overlay, ReportInputs, Residuals
+from deal_hw.calib.validate import HELDOUT_WINDOW_S
+from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.episode import Episode
+from deal_hw.sim.model import RobotModel
+from deal_hw.types import FloatArray
+
+PANELS = 24
+"""Panels drawn of each sort of recordings, one a channel; more would make the page long and say the same."""
+
+WHITENED_SIZE = 600
+"""Samples times channels of a window that is whitened: its covariance matrix has so many rows."""
+
+
+def gather(
+    robot: RobotModel,
+    result: CalibrationResult,
+    episodes: Sequence[Episode],
+    holdout: Sequence[Episode] = (),
+    *,
+    telemetry: Sequence[str] = (),
+    halves: Sequence[HalvesRow] = (),
+    threads: int | None = None,
+) -> ReportInputs:
+    """Simulate what the report shows.
+
+    Args:
+        robot: The nominal model.
+        result: What the calibration found.
+        episodes: The fitted recordings.
+        holdout: Recordings that the search has not seen.
+        telemetry: Verdicts of the telemetry checks, in words.
+        halves: Agreement of disjoint halves of the data.
+        threads: Simulation threads.
+    """
+    overlays: list[Overlay] = []
+    residuals: list[Residuals] = []
+    left_out: list[str] = []
+    for group, heldout in ((episodes, False), (holdout, True)):
+        word = "held-out" if heldout else "fitted"
+        if not group:
+            continue
+        shown = group[: max(min(PANELS // len(group[0].channels), len(group)), 1)]
+        if len(group) > len(shown):
+            left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
+        problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
+        titles = [f"{word} recording {i + 1} of {len(group)}" for i in range(len(shown))]
+        overlays.extend(_overlays(problem, result, titles, heldout))
+        if not heldout:
+            residuals.extend(_residuals(problem, result, titles))
+    return ReportInputs(
+        robot=robot.description.name,
+        result=result,
+        overlays=tuple(overlays),
+        residuals=tuple(residuals),
+        tick_s=episodes[0].step_s if episodes else None,
+        telemetry=tuple(telemetry),
+        halves=tuple(halves),
+        left_out=tuple(left_out),
+    )
+
+
+def _overlays(
+    problem: Problem, result: CalibrationResult, titles: Sequence[str], heldout: bool
+) -> list[Overlay]:
+    theta = np.stack([result.space.nominal, result.estimate])
+    # The user's own model knows no latency: the same candidates as in the held-out error.
+    latency = np.array([0.0, result.latency_s])
+    length = samples_in(problem, HELDOUT_WINDOW_S)
+    found = []
+    for data in problem.windows(length):
+        predicted = problem.predict(theta, latency, data).observed
+        real = problem.measured(data.episode)
+        both = np.full((2, *real.shape), np.nan)
+        both[:, data.windows.samples()] = predicted
+        episode = problem.episodes[data.episode]
+        if episode.reported is not None:
+            real = np.where(episode.reported[:, None], real, np.nan)
+        found.append(
+            Overlay(
+                title=titles[data.episode],
+                heldout=heldout,
+                names=problem.channel_names,
+                units=_units(problem),
+                time_s=episode.sample * episode.step_s,
+                real=real,
+                nominal=both[0],
+                calibrated=both[1],
+                window_s=length * episode.period_s,
+            )
+        )
+    return found
+
+
+def _units(problem: Problem) -> tuple[str, ...]:
+    units = problem.robot.coordinate_units
+    every = (*units, *(f"{unit}/s" for unit in units))
+    return tuple(every[c] for c in problem.channels)
+
+
+def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str]) -> list[Residuals]:
+    centre = Members(result.estimate[None], np.array([result.latency_s]))
+    M = len(problem.channels)
+    length = max(min(samples_in(problem, HELDOUT_WINDOW_S), WHITENED_SIZE // M), 2)
+    found = []
+    try:
+        windows = problem.windows(length)
+    except InsufficientDataError:
+        return []
+    for data in windows:
+        whitened = _whitened(problem, centre, data)
+        episode = problem.episodes[data.episode]
+        time = (episode.sample * episode.step_s)[data.windows.samples()]
+        found.append(
+            Residuals(title=titles[data.episode], names=problem.channel_names, time_s=time, whitened=whitened)
+        )
+    return found
+
+
+def _whitened(problem: Problem, centre: Members, data: WindowData) -> FloatArray:
+    """Return the whitened residual of each window, (W, H, M); NaN where nothing was reported."""
+    whitened = whitened_residual(problem, centre, centre, [data]).reshape(data.measured.shape)
+    # A sample that nobody reported weighs nothing: its zero is no residual.
+    return np.where(np.isfinite(data.std) & np.isfinite(whitened), whitened, np.nan)

@@ -1,0 +1,180 @@
+"""The page itself: words and numbers for the template, and the file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+
+from deal_hw.calib.identifiability import MISMATCH_CHI2
+from deal_hw.calib.report import charts
+from deal_hw.calib.report.inputs import ReportInputs
+from deal_hw.calibration import CalibrationResult
+
+REPORT = "report.html"
+TEMPLATE = "report.html.j2"
+AT_BOUND = 1e-6
+"""A parameter so near an end of its range, as a share of the range, ended there."""
+
+_HIDDEN = ("latency_scan", "search_estimate", "versions", "settings", "budget")
+"""Provenance with a place of its own on the page."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table of parameters; positions are percent of the search range."""
+
+    name: str
+    unit: str
+    nominal: float
+    estimate: float
+    low: float
+    high: float
+    range_low: float
+    range_high: float
+    log: bool
+    verdict: str
+    at_bound: str
+    bar_left: float
+    bar_width: float
+    nominal_at: float
+    estimate_at: float
+    prior: str
+
+
+def write_report(path: Path, inputs: ReportInputs) -> None:
+    """Write the report, whole or not at all.
+
+    Args:
+        path: The file; a folder gets ``report.html``.
+        inputs: What to show.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    path = path / REPORT if path.is_dir() else path
+    text = render(inputs)
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        fresh.write_text(text, encoding="utf-8", errors="backslashreplace")
+        os.replace(fresh, path)
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+def render(inputs: ReportInputs) -> str:
+    """Return the page; all that comes from the user is escaped."""
+    # StrictUndefined: a name that the template has and this module lacks is an error, not a gap.
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["short"] = short
+    result = inputs.result
+    provenance = dict(result.provenance)
+    scan = _mapping(provenance.get("latency_scan"))
+    panels = sum(min(len(shown.names), charts.PANELS) for shown in inputs.overlays)
+    drawn = [(shown, *charts.residuals(shown)) for shown in inputs.residuals]
+    template = resources.files("deal_hw.calib.report").joinpath(TEMPLATE).read_text(encoding="utf-8")
+    return environment.from_string(template).render(
+        inputs=inputs,
+        result=result,
+        rows=parameter_rows(result),
+        verdict=verdict(result),
+        counts=[
+            (word, result.verdicts.count(word))
+            for word in ("identifiable", "weak", "not identifiable")
+            if word in result.verdicts
+        ],
+        weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
+        overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
+        panels_each=charts.PANELS,
+        residuals=drawn,
+        scan=charts.latency_scan(scan, inputs.tick_s),
+        correlations=charts.correlations(result),
+        trace=charts.trace(result.trace),
+        population=None
+        if result.population is None
+        else charts.population(result.space, result.population, result.estimate),
+        facts=[(key, _plain(value)) for key, value in provenance.items() if key not in _HIDDEN],
+        versions=_mapping(provenance.get("versions")),
+        settings=[
+            (f"{group}: {key}", _plain(value))
+            for group in ("settings", "budget")
+            for key, value in _mapping(provenance.get(group)).items()
+        ],
+    )
+
+
+def verdict(result: CalibrationResult) -> tuple[str, str]:
+    """Return in one word how it went, as a style, and in one sentence."""
+    if result.alarms:
+        return "bad", "Not to be trusted as it stands: see the alarms."
+    if math.isnan(result.chi2):
+        return "open", "Nothing says whether the model explains the recording: no residual test was made."
+    if result.chi2 > MISMATCH_CHI2:
+        factor = short(math.sqrt(result.chi2))
+        return "bad", f"The model does not explain the recording: residuals are {factor} times the noise."
+    if result.null_directions or "not identifiable" in result.verdicts:
+        return "open", "The model explains the recording, but the recording does not tell all parameters."
+    return "good", "The model explains the recording: what is left has the size of the sensor's noise."
+
+
+def parameter_rows(result: CalibrationResult) -> list[Row]:
+    """Return the table of the searched parameters."""
+    space = result.space
+    at = [
+        100 * np.clip(space.normalize(values), 0, 1)
+        for values in (result.interval[:, 0], result.interval[:, 1], space.nominal, result.estimate)
+    ]
+    unit = space.normalize(result.estimate)
+    rows = []
+    for k, p in enumerate(space):
+        bound = "lower" if unit[k] < AT_BOUND else "upper" if unit[k] > 1 - AT_BOUND else ""
+        prior = ""
+        if p.prior_mean is not None and p.prior_std is not None:
+            spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
+            prior = f"expected {p.prior_mean:.4g} {p.unit} within {spread}"
+        low, high = map(float, result.interval[k])
+        rows.append(
+            Row(
+                name=p.name,
+                unit=p.unit,
+                nominal=p.nominal,
+                estimate=float(result.estimate[k]),
+                low=low,
+                high=high,
+                range_low=p.low,
+                range_high=p.high,
+                log=p.scale == "log",
+                verdict=result.verdicts[k] if result.verdicts else "",
+                at_bound=bound,
+                bar_left=float(at[0][k]),
+                bar_width=max(float(at[1][k] - at[0][k]), 0.4),
+                nominal_at=float(at[2][k]),
+                estimate_at=float(at[3][k]),
+                prior=prior,
+            )
+        )
+    return rows
+
+
+def short(value: float) -> str:
+    """Return a number with four digits."""
+    return f"{value:.4g}" if math.isfinite(value) else "–"
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return dict(value) if isinstance(value, dict) else {}
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return json.dumps(value, ensure_ascii=False, default=str)

@@ -1,0 +1,184 @@
+"""`deal-hw data import` and `deal-hw data export`: recordings in and out of our own files."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from deal_hw.data.checks import Severity
+from deal_hw.errors import ConfigurationError, DatasetError
+
+if TYPE_CHECKING:
+    from deal_hw.data.importing.table import Table
+    from deal_hw.sim.joint_facts import JointFacts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Import:
+    """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/import.md."""
+
+    paths: tyro.conf.Positional[tuple[Path, ...]]
+    """CSV, NPZ or MCAP files, or folders of LeRobot datasets; of one robot."""
+    out: Path
+    """The dataset to make or add to."""
+    columns: Path | None = None
+    """A column map (YAML); without it the meaning of the channels is guessed from their names and said."""
+    model: Path | None = None
+    """The robot's MJCF: joint names, order and limits come from it."""
+    description: Path | None = None
+    """A robot description (JSON, as in dataset.json) to use instead of a minimal one."""
+    name: str = ""
+    """The robot's name; by default that of the model's or the first recording's file."""
+    device_periods: int = 1
+    """Device periods between two samples: the robot's own control rate over the recording's."""
+    force: bool = False
+    """Take recordings in although a check failed; what failed stays with them."""
+    dry_run: bool = False
+    """Check and tell, but write nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Write the episodes of a dataset for other software."""
+
+    path: tyro.conf.Positional[Path]
+    """A dataset (DIR), or an episode (DIR/episodes/000000.mcap)."""
+    out: Path
+    """The folder to write."""
+    format: Literal["lerobot"] = "lerobot"
+    """The layout: LeRobot v3.0 (Parquet; needs the extra lerobot)."""
+    task: str = "deal-hw"
+    """What the robot did, in words."""
+
+
+def import_recordings(config: Import) -> int:
+    """Run the verb.
+
+    Returns:
+        0.
+
+    Raises:
+        DatasetError: A recording cannot be read, understood or trusted.
+        ConfigurationError: The column map, model or description cannot be used.
+    """
+    from deal_hw.data.importing.columns import read_column_map
+    from deal_hw.data.importing.grid import common_period, to_trajectories
+    from deal_hw.data.importing.load import load_tables
+    from deal_hw.data.importing.store import minimal_description, write_dataset
+
+    if config.device_periods < 1:
+        raise ConfigurationError(f"--device-periods is {config.device_periods}; it is 1 or more")
+    columns = None if config.columns is None else read_column_map(config.columns)
+    facts = _joint_facts(config.model)
+    given = None if config.description is None else _description(config.description)
+    joints = given["joint_names"] if given is not None else None if facts is None else facts.names
+    tables = [table for path in config.paths for table in load_tables(path, columns, joints, _say)]
+    problems = {table.name: _examine(table, facts, config.force) for table in tables}
+    period = common_period(tables)
+    recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
+    for part in recordings:
+        how = part.trajectory.metadata["import"]
+        stretch = f", stretch {how['stretch'] + 1} of {how['stretches']}" if how["stretches"] > 1 else ""
+        _say(
+            f"{how['file']}{stretch}: {part.trajectory.duration_s:.4g} s at {1 / period:.6g} Hz, samples "
+            f"{how['method']}, largest shift {how['largest_shift_s'] * 1e3:.3g} ms"
+        )
+    if config.dry_run:
+        return 0
+    values = given or minimal_description(
+        recordings,
+        config.name or (config.model or config.paths[0]).stem,
+        tables[0].units,
+        1 / period,
+        mjcf=config.model,
+        rates_per_sample=config.device_periods,
+    )
+    dataset = write_dataset(config.out, recordings, values, {"plausibility": problems}, _say)
+    print(f"{dataset.folder}: {len(dataset.episodes)} episodes of {dataset.description['name']}")
+    return 0
+
+
+def export_recordings(config: Export) -> int:
+    """Run the verb.
+
+    Returns:
+        0.
+
+    Raises:
+        DatasetError: It cannot be read, or the folder cannot be written.
+        MissingExtraError: pyarrow is not installed.
+    """
+    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.export_lerobot import export_lerobot
+    from deal_hw.data.reader import read_trajectory
+
+    if config.path.is_dir():
+        dataset = Dataset.open(config.path, _say)
+        paths = [dataset.path(index) for index in range(len(dataset.episodes))]
+    else:
+        paths = [config.path]
+    trajectories = [read_trajectory(path) for path in paths]
+    robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
+    count = export_lerobot(trajectories, config.out, robot, config.task)
+    print(f"{config.out}: {count} LeRobot episodes of {robot}")
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _joint_facts(model: Path | None) -> JointFacts | None:
+    if model is None:
+        return None
+    from deal_hw.sim.joint_facts import joint_facts
+
+    facts = joint_facts(model)
+    if facts.left_out:
+        _say(
+            f"{model.name}: joints of several coordinates are not read from recordings: "
+            f"{', '.join(facts.left_out)}"
+        )
+    return facts
+
+
+def _description(path: Path) -> dict[str, Any]:
+    try:
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        missing = [key for key in ("name", "joint_names", "actuated", "state_rate_hz") if key not in values]
+    except OSError as error:
+        raise ConfigurationError(f"description {path} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigurationError(f"description {path} is not JSON: {error}") from error
+    if missing:
+        raise ConfigurationError(
+            f"description {path} lacks {', '.join(missing)}; see `description` in a dataset.json"
+        )
+    return values
+
+
+def _examine(table: Table, facts: JointFacts | None, force: bool) -> list[dict[str, Any]]:
+    """Check a recording and tell what is wrong; return what is worth keeping.
+
+    Raises:
+        DatasetError: A check failed, and that is not to be overlooked.
+    """
+    from deal_hw.data.plausibility import examine, require
+
+    limits = None
+    if facts is not None:
+        limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
+    verdicts = [verdict for verdict in examine(table, limits) if verdict.severity is not Severity.OK]
+    for verdict in verdicts:
+        _say(f"{table.name}: {verdict.severity} {verdict.name}: {verdict.message}")
+    if not force:
+        try:
+            require(verdicts, table.name)
+        except DatasetError as error:
+            raise DatasetError(f"{error}. Correct the column map, or overrule with --force") from error
+    return [verdict.to_json() for verdict in verdicts]

@@ -1,0 +1,280 @@
+"""Writes recordings as a LeRobot dataset, layout v3.0, without videos.
+
+Facts of the format, from the documentation of LeRobotDataset v3.0 and from the `meta/info.json` of published
+datasets: ``meta/info.json`` (version, fps, features, path templates), ``meta/tasks.parquet`` (text ->
+task_index, the text as a pandas index), ``meta/episodes/chunk-000/file-000.parquet`` (one row an episode:
+length, range of frames, file, statistics), ``meta/stats.json``, and ``data/chunk-000/file-000.parquet`` with
+one row a frame and one row group an episode. Frames lie on a uniform grid of ``fps``: ``timestamp`` is
+frame_index / fps.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.data.files import write_json
+from deal_hw.data.importing.grid import common_period, to_trajectories
+from deal_hw.data.importing.load import table_of
+from deal_hw.errors import DatasetError, InsufficientDataError, MissingExtraError
+from deal_hw.types import FloatArray, Trajectory
+
+VERSION = "v3.0"
+CHUNK_FILES = 1000
+FILE_MIB = 100
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Episode:
+    """Frames of one episode: by feature name, (F,) or (F, K)."""
+
+    frames: Mapping[str, FloatArray]
+    length: int
+
+
+def export_lerobot(
+    trajectories: Sequence[Trajectory], folder: Path, robot_type: str = "", task: str = "deal-hw"
+) -> int:
+    """Write a LeRobot dataset; return its number of episodes.
+
+    ``observation.state`` holds measured positions, ``action`` the position target in force at the frame,
+    each named ``<joint>.pos`` in rad or m; ``observation.velocity`` and ``observation.effort`` follow where
+    they were measured. ``command_age`` says how long before the frame the action came into force [s], so that
+    the exact timing survives. A gap in a recording starts another episode.
+
+    Args:
+        trajectories: Of one robot.
+        folder: What to write; it must not hold a dataset yet.
+        robot_type: Goes into ``info.json``.
+        task: What the robot did, in words.
+
+    Raises:
+        MissingExtraError: pyarrow is not installed.
+        DatasetError: The folder is taken, or the recordings do not fit one dataset.
+    """
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("pyarrow", "lerobot") from error
+    folder = Path(folder)
+    if (folder / "meta" / "info.json").exists():
+        raise DatasetError(f"{folder} holds a LeRobot dataset already; name another folder")
+    if not trajectories:
+        raise InsufficientDataError("no recording to export")
+    first = trajectories[0]
+    if any((t.joint_names, t.actuated) != (first.joint_names, first.actuated) for t in trajectories):
+        raise DatasetError("the recordings have different joints; export those of one robot at a time")
+    tables = [table_of(trajectory) for trajectory in trajectories]
+    period = common_period(tables)
+    episodes = [
+        episode
+        for table in tables
+        for part in to_trajectories(table, period_s=period)
+        for episode in _frames(part.trajectory, period)
+    ]
+    if not episodes:
+        raise InsufficientDataError("no recording has two regular samples with a command in force")
+    features = _features(first, episodes)
+    episodes = [_Episode({name: e.frames[name] for name in features}, e.length) for e in episodes]
+    try:
+        _write(folder, episodes, features, 1 / period, robot_type, task)
+    except OSError as error:
+        raise DatasetError(f"{folder} cannot be written: {error.strerror}") from error
+    return len(episodes)
+
+
+def _frames(trajectory: Trajectory, period: float) -> list[_Episode]:
+    """Return the runs of samples without a hole and with a command in force."""
+    index = np.round(trajectory.device_s / period).astype(np.int64)
+    known = trajectory.command_sequence >= 0
+    cuts = np.flatnonzero((np.diff(index) != 1) | (np.diff(known.astype(np.int64)) != 0)) + 1
+    runs = [run for run in np.split(np.arange(index.size), cuts) if run.size >= 2 and known[run[0]]]
+    return [
+        _Episode(
+            {
+                "observation.state": trajectory.position[run],
+                "observation.velocity": trajectory.velocity[run],
+                "observation.effort": trajectory.effort[run],
+                "action": trajectory.position_target[trajectory.command_sequence[run]],
+                "command_age": trajectory.command_age_s[run],
+            },
+            run.size,
+        )
+        for run in runs
+    ]
+
+
+def _features(first: Trajectory, episodes: Sequence[_Episode]) -> dict[str, dict[str, Any]]:
+    """Return the features that are known in every frame, as ``info.json`` lists them."""
+    names = {
+        "observation.state": [f"{joint}.pos" for joint in first.joint_names],
+        "observation.velocity": [f"{joint}.vel" for joint in first.joint_names],
+        "observation.effort": [f"{joint}.effort" for joint in first.joint_names],
+        "action": [f"{joint}.pos" for joint in first.actuated],
+        "command_age": None,
+    }
+    return {
+        name: {"dtype": "float32", "shape": [1 if labels is None else len(labels)], "names": labels}
+        for name, labels in names.items()
+        if all(np.isfinite(episode.frames[name]).all() for episode in episodes)
+    }
+
+
+_INDEX_FEATURES = {
+    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    "frame_index": {"dtype": "int64", "shape": [1], "names": None},
+    "episode_index": {"dtype": "int64", "shape": [1], "names": None},
+    "index": {"dtype": "int64", "shape": [1], "names": None},
+    "task_index": {"dtype": "int64", "shape": [1], "names": None},
+}
+
+
+def _write(
+    folder: Path,
+    episodes: Sequence[_Episode],
+    features: Mapping[str, dict[str, Any]],
+    fps: float,
+    robot_type: str,
+    task: str,
+) -> None:
+    import pyarrow.parquet as pq
+
+    (folder / "meta").mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    writer, written, file, begin = None, 0, 0, 0
+    for number, episode in enumerate(episodes):
+        frames = {**episode.frames, **_indices(number, episode.length, begin, fps)}
+        table = _arrow({**features, **_INDEX_FEATURES}, frames)
+        if writer is not None and written + table.nbytes > FILE_MIB * 2**20:
+            writer.close()
+            writer, written, file = None, 0, file + 1
+        place = {"chunk_index": file // CHUNK_FILES, "file_index": file % CHUNK_FILES}
+        if writer is None:
+            path = folder / DATA_PATH.format(**place)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            writer = pq.ParquetWriter(path, table.schema, compression="snappy")
+        writer.write_table(table)
+        written += table.nbytes
+        rows.append(_episode_row(number, episode.length, begin, place, task, frames))
+        begin += episode.length
+    if writer is not None:
+        writer.close()
+    _write_episodes(folder, rows)
+    _write_tasks(folder, task)
+    whole = {name: np.concatenate([episode.frames[name] for episode in episodes]) for name in features}
+    write_json(folder / "meta" / "stats.json", {name: _statistics(values) for name, values in whole.items()})
+    # Last of all: a folder with info.json is a whole dataset.
+    write_json(folder / "meta" / "info.json", _info(features, fps, len(episodes), begin, robot_type))
+
+
+def _info(
+    features: Mapping[str, dict[str, Any]], fps: float, episodes: int, frames: int, robot_type: str
+) -> dict[str, Any]:
+    whole = round(fps)
+    return {
+        "codebase_version": VERSION,
+        "robot_type": robot_type or None,
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "chunks_size": CHUNK_FILES,
+        "data_files_size_in_mb": FILE_MIB,
+        "video_files_size_in_mb": 200,
+        # Whole where it is: readers take it as an integer. A rate like 49.85 Hz must not be rounded.
+        "fps": whole if abs(fps - whole) < 1e-6 * fps else fps,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "features": {**features, **_INDEX_FEATURES},
+    }
+
+
+def _indices(number: int, length: int, begin: int, fps: float) -> dict[str, Any]:
+    frame = np.arange(length)
+    return {
+        "timestamp": frame / fps,
+        "frame_index": frame,
+        "episode_index": np.full(length, number),
+        "index": begin + frame,
+        "task_index": np.zeros(length, dtype=np.int64),
+    }
+
+
+def _arrow(features: Mapping[str, dict[str, Any]], frames: Mapping[str, Any]) -> Any:
+    import pyarrow as pa
+
+    columns = {}
+    for name, feature in features.items():
+        values = np.ascontiguousarray(frames[name], dtype=feature["dtype"])
+        flat = pa.array(values.reshape(-1))
+        # One column a joint stays a list even for one joint: shape [1] is a plain number only without names.
+        listed = feature["names"] is not None and values.ndim == 2
+        columns[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if listed else flat
+    return pa.table(columns)
+
+
+def _episode_row(
+    number: int, length: int, begin: int, place: Mapping[str, int], task: str, frames: Mapping[str, Any]
+) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "episode_index": number,
+        "tasks": [task],
+        "length": length,
+        "data/chunk_index": place["chunk_index"],
+        "data/file_index": place["file_index"],
+        "dataset_from_index": begin,
+        "dataset_to_index": begin + length,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+    }
+    for name, values in frames.items():
+        row |= {f"stats/{name}/{key}": value for key, value in _statistics(np.asarray(values)).items()}
+    return row
+
+
+def _statistics(values: FloatArray) -> dict[str, list[float] | list[int]]:
+    table = values.reshape(len(values), -1).astype(np.float64)
+    return {
+        "min": table.min(axis=0).tolist(),
+        "max": table.max(axis=0).tolist(),
+        "mean": table.mean(axis=0).tolist(),
+        "std": table.std(axis=0).tolist(),
+        "count": [len(table)],
+    }
+
+
+def _write_episodes(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = folder / EPISODES_PATH.format(chunk_index=0, file_index=0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table({key: [row[key] for row in rows] for key in rows[0]}), path)
+
+
+def _write_tasks(folder: Path, task: str) -> None:
+    """Write the one task; the pandas note makes its text the index, by which LeRobot looks it up."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    def column(name: str, pandas_type: str, numpy_type: str) -> dict[str, Any]:
+        types = {"pandas_type": pandas_type, "numpy_type": numpy_type, "metadata": None}
+        return {"name": name, "field_name": name, **types}
+
+    note = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [column("task_index", "int64", "int64"), column("task", "unicode", "object")],
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": pa.array([task])})
+    pq.write_table(
+        table.replace_schema_metadata({"pandas": json.dumps(note)}), folder / "meta" / "tasks.parquet"
+    )

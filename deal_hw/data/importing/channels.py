@@ -1,0 +1,106 @@
+"""What a source found in a file: named channels, not yet interpreted."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from deal_hw.errors import DatasetError
+from deal_hw.types import FloatArray
+
+_PICK = re.compile(r"(?P<array>.+)\[(?P<inside>[^\[\]]+)\]")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channels:
+    """Channels of one recording, as the file names them.
+
+    Attributes:
+        path: The file or folder.
+        kind: "csv", "npz", "mcap" or "lerobot".
+        digest: SHA-256 of what was read.
+        arrays: By name, (T,) or (T, K); those of one clock have one length.
+        labels: Names of the K columns of an array, where the file tells them.
+        joint_names: Names of the joints, where the file lists them.
+        part: Which recording of the file it is, such as "episode 3"; "" where there is only one.
+        notes: What the reader of the file left out or changed.
+    """
+
+    path: Path
+    kind: str
+    digest: str
+    arrays: Mapping[str, FloatArray]
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    joint_names: tuple[str, ...] = ()
+    part: str = ""
+    notes: tuple[str, ...] = ()
+
+    def column(self, name: str) -> FloatArray:
+        """Return one channel, (T,).
+
+        Args:
+            name: An array, or a column of one: ``dof_pos[3]``, ``/joint_states.position[elbow]``.
+
+        Raises:
+            DatasetError: There is no such channel, or it has several columns.
+        """
+        values = self.array(name)
+        if values.ndim == 1:
+            return values
+        if values.shape[1] == 1:
+            return values[:, 0]
+        raise DatasetError(
+            f"{self.path}: {name!r} has {values.shape[1]} columns; name one of them, such as {name}[0]"
+        )
+
+    def array(self, name: str) -> FloatArray:
+        """Return an array or one of its columns, (T,) or (T, K); errors as :meth:`column`."""
+        if name in self.arrays:
+            return self.arrays[name]
+        picked = _PICK.fullmatch(name)
+        if picked and picked["array"] in self.arrays:
+            return self._inside(picked["array"], picked["inside"])
+        near = difflib.get_close_matches(name, self.arrays, n=3) or list(self.arrays)[:12]
+        raise DatasetError(
+            f"{self.path} has no channel {name!r} ({len(self.arrays)} channels; near it: {', '.join(near)}); "
+            "correct the column map"
+        )
+
+    def _inside(self, array: str, inside: str) -> FloatArray:
+        values = self.arrays[array]
+        width = 1 if values.ndim == 1 else values.shape[1]
+        labels = self.labels.get(array, ())
+        if inside in labels:
+            index = labels.index(inside)
+        elif inside.isdigit() and int(inside) < width:
+            index = int(inside)
+        else:
+            names = f", named {', '.join(labels)}" if labels else ""
+            raise DatasetError(
+                f"{self.path}: {array!r} has no column {inside!r}; it has {width}, from 0{names}"
+            )
+        return values if values.ndim == 1 else values[:, index]
+
+
+def digest_of_file(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes.
+
+    Raises:
+        DatasetError: It cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def as_floats(values: object) -> FloatArray:
+    """Return an array as float64, contiguous."""
+    return np.ascontiguousarray(values, dtype=np.float64)

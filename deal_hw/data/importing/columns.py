@@ -1,0 +1,324 @@
+"""The column map: which channel of a file is time, position, target, ... of which joint.
+
+A YAML file such as::
+
+    time: {column: timestamp, unit: us}
+    position: "{joint}_pos"          # one channel a joint, or one array for all: dof_pos
+    target: "{joint}_cmd"
+    unit: deg
+    joints:
+      - shoulder                     # the same name in the file and in the model
+      - {name: elbow_joint, column: elbow, sign: -1, offset: 0.1}
+      - {name: jaw, normalised: {from: [0, 100], to: [-0.17, 1.75]}}
+
+A value x of the file becomes ``sign * scale(x) + offset`` in rad or m; offset and sign turn the file's zero
+and direction into the model's, for position and target alike; velocity and effort take the sign.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from deal_hw.errors import ConfigurationError, UnknownNameError
+
+TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds in one of each."""
+POSITION_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0, "mm": 1e-3}
+"""Radians or metres in one of each."""
+QUATERNION_ORDERS = ("wxyz", "xyzw")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeColumn:
+    """A channel of time.
+
+    Attributes:
+        column: The channel.
+        unit: One of :data:`TIME_UNITS`.
+    """
+
+    column: str
+    unit: str = "s"
+
+    def __post_init__(self) -> None:
+        if self.unit not in TIME_UNITS:
+            raise UnknownNameError("unit of time", self.unit, TIME_UNITS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Normalised:
+    """A linear scale without unit, such as 0..1 or -100..100 of a joint's travel.
+
+    Attributes:
+        file: Two values in the file.
+        robot: The same two in rad or m.
+    """
+
+    file: tuple[float, float]
+    robot: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        values = (*self.file, *self.robot)
+        if not all(map(math.isfinite, values)) or self.file[0] == self.file[1]:
+            raise ConfigurationError(
+                f"normalised: from {list(self.file)} to {list(self.robot)} is no scale; "
+                "give two different values of the file and the two positions that they stand for"
+            )
+
+    @property
+    def slope(self) -> float:
+        """Radians or metres in one unit of the file."""
+        return (self.robot[1] - self.robot[0]) / (self.file[1] - self.file[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointColumns:
+    """The channels of one joint and how they become SI.
+
+    Attributes:
+        name: The joint's name in the model.
+        column: Its name in the file, which replaces ``{joint}`` in patterns; "" for the same.
+        index: Its column in arrays of one column a joint; None: by label, else by its place in the list.
+        position, target, velocity, effort: Channels; None: by the map's pattern.
+        unit: Of position and target, one of :data:`POSITION_UNITS`.
+        target_unit: Of the target where it differs; "" for the same.
+        normalised: Replaces ``unit`` where the file's values have none.
+        target_normalised: The same for the target where it differs.
+        sign: 1 or -1.
+        offset: Added after sign and scale [rad or m].
+        slides: The joint's unit is m; needed beside ``normalised`` only.
+    """
+
+    name: str
+    column: str = ""
+    index: int | None = None
+    position: str | None = None
+    target: str | None = None
+    velocity: str | None = None
+    effort: str | None = None
+    unit: str = "rad"
+    target_unit: str = ""
+    normalised: Normalised | None = None
+    target_normalised: Normalised | None = None
+    sign: float = 1.0
+    offset: float = 0.0
+    slides: bool = False
+
+    def __post_init__(self) -> None:
+        for unit in (self.unit, self.target_unit or self.unit):
+            if unit not in POSITION_UNITS:
+                raise UnknownNameError("unit of position", unit, POSITION_UNITS)
+        if self.sign not in (1.0, -1.0) or not math.isfinite(self.offset):
+            raise ConfigurationError(
+                f"joint {self.name!r}: sign {self.sign:g}, offset {self.offset:g}; sign is 1 or -1, "
+                "offset in rad or m"
+            )
+
+    @property
+    def si_unit(self) -> str:
+        """Unit of the position after conversion, "rad" or "m"."""
+        return "m" if self.slides or self.unit in ("m", "mm") else "rad"
+
+    def scale(self, target: bool = False) -> tuple[float, float]:
+        """Return slope and constant that turn a value of the file into rad or m."""
+        both = self.target_normalised if target and self.target_normalised else self.normalised
+        if both is not None and not (target and self.target_unit and not self.target_normalised):
+            slope = both.slope
+            constant = both.robot[0] - slope * both.file[0]
+        else:
+            slope, constant = POSITION_UNITS[(target and self.target_unit) or self.unit], 0.0
+        return self.sign * slope, self.sign * constant + self.offset
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vector:
+    """Three or four channels that belong together.
+
+    Attributes:
+        columns: The channels; a single one is an array with all of them.
+        order: "wxyz" or "xyzw" for a quaternion.
+        unit: "rad" or "deg" (a second) for a gyroscope.
+    """
+
+    columns: tuple[str, ...]
+    order: str = "wxyz"
+    unit: str = "rad"
+
+    def __post_init__(self) -> None:
+        if self.order not in QUATERNION_ORDERS:
+            raise UnknownNameError("order of a quaternion", self.order, QUATERNION_ORDERS)
+        if self.unit not in ("rad", "deg"):
+            raise UnknownNameError("unit of a gyroscope", self.unit, ("rad", "deg"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnMap:
+    """What the channels of a file mean.
+
+    Attributes:
+        time: Time of the measured samples.
+        joints: The joints, in the order of the file's arrays.
+        position: Channel pattern: with ``{joint}`` one channel a joint, without one array for all.
+        target: The same for commanded positions.
+        velocity: The same; None where there is none.
+        effort: The same; None where there is none.
+        command_time: Time of the commands where they have stamps of their own.
+        orientation: Quaternion of the base.
+        gyro: Angular velocity of the base in its own frame.
+        source: Where the map comes from: a file, or what was guessed.
+    """
+
+    time: TimeColumn
+    joints: tuple[JointColumns, ...]
+    position: str | None = None
+    target: str | None = None
+    velocity: str | None = None
+    effort: str | None = None
+    command_time: TimeColumn | None = None
+    orientation: Vector | None = None
+    gyro: Vector | None = None
+    source: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        names = [joint.name for joint in self.joints]
+        if not names or len(set(names)) != len(names):
+            raise ConfigurationError(f"column map: joints {names}; name each joint once, and at least one")
+
+
+def read_column_map(path: Path) -> ColumnMap:
+    """Read a column map.
+
+    Raises:
+        ConfigurationError: It cannot be read or says something that a column map does not.
+    """
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"column map {path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"column map {path} is not YAML: {error}") from error
+    try:
+        return parse_column_map(values, (f"column map {Path(path).name}",))
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
+
+
+def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
+    """Return the column map in plain YAML values; errors as :func:`read_column_map`."""
+    top = _mapping("column map", values, {
+        "time", "command_time", "position", "target", "velocity", "effort", "joints", "unit", "target_unit",
+        "orientation", "gyro",
+    })  # fmt: skip
+    for name in ("time", "joints"):
+        if name not in top:
+            raise ConfigurationError(
+                f"column map: {name!r} is missing; it has {', '.join(sorted(top)) or 'nothing'}"
+            )
+    if not isinstance(top["joints"], list):
+        raise ConfigurationError("column map: joints is a list of names or of mappings with a name")
+    defaults = {name: str(top[name]) for name in ("unit", "target_unit") if top.get(name) is not None}
+    command_time = top.get("command_time")
+    patterns = {name: _text(name, top.get(name)) for name in ("position", "target", "velocity", "effort")}
+    return ColumnMap(
+        time=_time("time", top["time"]),
+        command_time=None if command_time is None else _time("command_time", command_time),
+        joints=tuple(_joint(entry, defaults) for entry in top["joints"]),
+        orientation=_vector("orientation", top.get("orientation"), 4),
+        gyro=_vector("gyro", top.get("gyro"), 3),
+        source=source,
+        **patterns,
+    )
+
+
+def _mapping(what: str, values: Any, allowed: set[str]) -> dict[str, Any]:
+    if not isinstance(values, dict):
+        raise ConfigurationError(f"{what} is {values!r}, not a mapping; it has {', '.join(sorted(allowed))}")
+    for key in values:
+        if key not in allowed:
+            raise UnknownNameError(f"entry of {what}", str(key), sorted(allowed))
+    return values
+
+
+def _text(what: str, value: Any) -> str | None:
+    if value is not None and not isinstance(value, (str, int)):
+        raise ConfigurationError(f"{what} is {value!r}; name a channel, or a pattern with {{joint}}")
+    return None if value is None else str(value)
+
+
+def _time(what: str, value: Any) -> TimeColumn:
+    if isinstance(value, (str, int)):
+        return TimeColumn(column=str(value))
+    values = _mapping(what, value, {"column", "unit"})
+    if "column" not in values:
+        raise ConfigurationError(f"{what} names no column, such as {what}: {{column: timestamp, unit: us}}")
+    return TimeColumn(column=str(values["column"]), unit=str(values.get("unit", "s")))
+
+
+_CHANNELS = ("position", "target", "velocity", "effort")
+_JOINT_KEYS = {
+    "name", "column", "index", *_CHANNELS, "unit", "target_unit", "normalised", "target_normalised", "sign",
+    "offset", "slides",
+}  # fmt: skip
+
+
+def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
+    if isinstance(entry, (str, int)):
+        entry = {"name": str(entry)}
+    values = _mapping("joint", entry, _JOINT_KEYS)
+    if "name" not in values:
+        raise ConfigurationError(f"joint {values!r} has no name; give its name in the model")
+    name = str(values["name"])
+    index = values.get("index")
+    if index is not None and (not isinstance(index, int) or index < 0):
+        raise ConfigurationError(f"joint {name!r}: index {index!r} is not a column number, from 0")
+    texts = {key: _text(f"joint {name!r}: {key}", values.get(key)) for key in _CHANNELS}
+    settings: dict[str, Any] = {**defaults, **texts}
+    settings.update({key: str(values[key]) for key in ("unit", "target_unit", "column") if key in values})
+    for key in ("sign", "offset"):
+        if key in values:
+            settings[key] = _number(f"joint {name!r}: {key}", values[key])
+    for key in ("normalised", "target_normalised"):
+        if values.get(key) is not None:
+            settings[key] = _normalised(f"joint {name!r}: {key}", values[key])
+    return JointColumns(name=name, index=index, slides=bool(values.get("slides", False)), **settings)
+
+
+def _number(what: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ConfigurationError(f"{what} is {value!r}, not a number")
+    return float(value)
+
+
+def _normalised(what: str, value: Any) -> Normalised:
+    values = _mapping(what, value, {"from", "to"})
+    pairs = []
+    for key in ("from", "to"):
+        pair = values.get(key)
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise ConfigurationError(
+                f"{what}: {key} is {pair!r}; give two numbers, such as {{from: [0, 1], to: [-0.2, 1.7]}}"
+            )
+        pairs.append((_number(what, pair[0]), _number(what, pair[1])))
+    return Normalised(file=pairs[0], robot=pairs[1])
+
+
+def _vector(what: str, value: Any, size: int) -> Vector | None:
+    if value is None:
+        return None
+    if isinstance(value, str):
+        value = {"column": value}
+    values = _mapping(what, value, {"column", "columns", "order", "unit"})
+    columns: Sequence[Any] = values.get("columns") or [values.get("column")]
+    if len(columns) not in (1, size) or any(not isinstance(name, (str, int)) for name in columns):
+        raise ConfigurationError(f"{what}: name {size} columns, or one array of {size}")
+    return Vector(
+        columns=tuple(map(str, columns)),
+        order=str(values.get("order", "wxyz")),
+        unit=str(values.get("unit", "rad")).removesuffix("/s"),
+    )

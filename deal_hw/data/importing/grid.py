@@ -1,0 +1,304 @@
+"""Puts a recording on a uniform time grid and makes trajectories of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.data.importing.table import Table
+from deal_hw.errors import DatasetError
+from deal_hw.types import FloatArray, IntArray, Status, Trajectory
+
+EVEN = 0.02
+"""Steps between samples that differ by no more than this from a whole number of periods count as even."""
+GAP_PERIODS = 3.0
+"""A longer pause between samples splits a recording: nothing is invented across it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gains:
+    """What the robot's own servo was set to, in the order of the actuated joints (A); NaN where unknown.
+
+    Attributes:
+        stiffness: kp.
+        damping: kd.
+        effort_limit: [N or N·m].
+        speed_limit: Of the set-point; infinite where it is not limited.
+    """
+
+    stiffness: tuple[float, ...]
+    damping: tuple[float, ...]
+    effort_limit: tuple[float, ...]
+    speed_limit: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """An uninterrupted stretch of a recording on a uniform grid.
+
+    Attributes:
+        trajectory: What calibration reads; ``metadata["import"]`` says where it comes from.
+        orientation: Base orientation at its samples, quaternion w x y z, (T, 4); None where there is none.
+        gyro: Angular velocity of the base in its own frame at its samples, (T, 3) [rad/s]; None: none.
+    """
+
+    trajectory: Trajectory
+    orientation: FloatArray | None
+    gyro: FloatArray | None
+
+
+def period_of(table: Table) -> float:
+    """Return the sampling period of a recording [s]: its own, not rounded.
+
+    It is the time between samples over the number of periods that it takes, gaps left out, so that stamps do
+    not drift against the grid as they would with the median step.
+
+    Raises:
+        DatasetError: There are fewer than three samples, or the clock stands still.
+    """
+    steps = np.diff(_clock(table)[0])
+    steps = steps[steps > 0]
+    if steps.size < 2:
+        raise DatasetError(f"{table.name}: {steps.size + 1} samples at different times; that is no recording")
+    median = float(np.median(steps))
+    inside = steps[steps <= GAP_PERIODS * median]
+    return float(np.sum(inside) / np.sum(np.maximum(np.round(inside / median), 1)))
+
+
+def grid_rate(table: Table) -> float:
+    """Return the sampling rate [Hz]; a description's device rate must be a multiple of it."""
+    return 1.0 / period_of(table)
+
+
+def common_period(tables: Sequence[Table]) -> float:
+    """Return one period for several recordings of a robot [s], so that they share one description.
+
+    Raises:
+        DatasetError: They were recorded at rates that differ by more than 2 %.
+    """
+    periods = np.array([period_of(table) for table in tables])
+    middle = float(np.median(periods))
+    if np.any(np.abs(periods / middle - 1) > EVEN):
+        rates = ", ".join(f"{table.name}: {1 / p:.4g} Hz" for table, p in zip(tables, periods, strict=True))
+        raise DatasetError(
+            f"recordings of different rates do not fit one dataset ({rates}); import them apart"
+        )
+    return middle
+
+
+def to_trajectories(
+    table: Table, gains: Gains | None = None, period_s: float | None = None, purpose: str = "import"
+) -> list[Recording]:
+    """Put a recording on a uniform grid; gaps split it.
+
+    Where the stamps are even (each step within 2 % of whole periods) every sample keeps its values and only
+    its stamp moves to the grid, the commands' stamps along with it: smoothing a measurement would cost more
+    than a step that is 2 % off. Otherwise positions are interpolated linearly at the grid's times, and
+    commands keep their own. A command is in force from its time on. Samples that were lost within a stretch
+    of even stamps stay absent.
+
+    Args:
+        table: The recording.
+        gains: What the servo was set to; None: unknown.
+        period_s: The grid's period [s]; None: the recording's own.
+        purpose: Goes into the metadata.
+
+    Returns:
+        The stretches of at least two samples, in order.
+
+    Raises:
+        DatasetError: The clock goes backwards, or there are too few samples or no commands.
+    """
+    if not table.command_s.size:
+        raise DatasetError(
+            f"{table.name}: no commands; name the commanded positions as `target` in the column map"
+        )
+    clock, rows = _clock(table)
+    period = period_of(table) if period_s is None else period_s
+    limit = GAP_PERIODS * period
+    cuts = np.flatnonzero(np.diff(clock) > limit) + 1
+    stretches = [part for part in np.split(np.arange(clock.size), cuts) if part.size >= 2]
+    if not stretches:
+        raise DatasetError(f"{table.name}: no two samples follow within {limit:.3g} s")
+    recordings = []
+    for number, part in enumerate(stretches):
+        facts = {
+            **table.source,
+            "stretch": number,
+            "stretches": len(stretches),
+            "rows_left_out": int(table.time_s.size - clock.size),
+            "period_s": period,
+        }
+        recordings.append(_recording(table, rows[part], clock[part], period, gains, purpose, facts))
+    return recordings
+
+
+def _clock(table: Table) -> tuple[FloatArray, IntArray]:
+    """Return stamps and rows of the samples that can be used: finite positions, one sample a stamp."""
+    sound = np.isfinite(table.time_s) & np.isfinite(table.position).all(axis=1)
+    rows = np.flatnonzero(sound)
+    clock = table.time_s[rows]
+    back = np.flatnonzero(np.diff(clock) < 0)
+    if back.size:
+        raise DatasetError(
+            f"{table.name}: the clock goes backwards {back.size} times, first after {clock[back[0]]:.6g} s; "
+            "cut the file there, or sort it if its rows were only mixed up"
+        )
+    first = np.concatenate(([True], np.diff(clock) > 0)) if clock.size else np.empty(0, dtype=bool)
+    return clock[first], rows[first]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """Samples and commands of a stretch on the grid.
+
+    Attributes:
+        index: Grid index of each sample, (T,).
+        values: By name, (T, K).
+        sent_s: Commands since the first sample, all of the table, (C,) [s].
+        method: "kept" or "interpolated".
+        shift_s: Largest distance of a sample of the grid to the nearest stamp [s].
+    """
+
+    index: IntArray
+    values: dict[str, FloatArray]
+    sent_s: FloatArray
+    method: str
+    shift_s: float
+
+
+def _recording(
+    table: Table,
+    rows: IntArray,
+    clock: FloatArray,
+    period: float,
+    gains: Gains | None,
+    purpose: str,
+    facts: dict[str, Any],
+) -> Recording:
+    values = {"position": table.position[rows], "velocity": _velocity(table, rows, clock)}
+    values["effort"] = (
+        np.full(values["position"].shape, np.nan) if table.effort is None else table.effort[rows]
+    )
+    if table.orientation is not None:
+        values["orientation"] = _one_hemisphere(table.orientation[rows])
+    if table.gyro is not None:
+        values["gyro"] = table.gyro[rows]
+    index = np.round(np.diff(clock) / period).clip(1).cumsum().astype(np.int64)
+    index = np.concatenate(([0], index))
+    # A few ppm between this recording's clock and the grid's add up: evenness is judged step by step.
+    even = bool(np.all(np.abs(np.diff(clock) - np.diff(index) * period) <= EVEN * period))
+    put = _keep if even else _interpolate
+    placed = put(clock, index, period, values, table.command_s)
+    orientation = placed.values.pop("orientation", None)
+    gyro = placed.values.pop("gyro", None)
+    metadata = {
+        "purpose": purpose,
+        "import": {**facts, "method": placed.method, "largest_shift_s": placed.shift_s},
+    }
+    device_s = np.asarray(placed.index * period, dtype=np.float64)
+    trajectory = _trajectory(table, device_s, placed.sent_s, placed.values, gains, metadata)
+    return Recording(trajectory=trajectory, orientation=orientation, gyro=gyro)
+
+
+def _keep(
+    clock: FloatArray, index: IntArray, period: float, values: dict[str, FloatArray], command_s: FloatArray
+) -> _Placed:
+    """Move the stamps to the grid and the commands' stamps along with them."""
+    grid_s = index * period
+    sent_s = np.interp(command_s, clock, grid_s)
+    sent_s = np.where(command_s < clock[0], command_s - clock[0], sent_s)
+    sent_s = np.where(command_s > clock[-1], command_s - clock[-1] + grid_s[-1], sent_s)
+    off = clock - clock[0] - grid_s
+    # Only differences of time count, so the grid may lie where it fits best.
+    shift_s = float(np.max(off) - np.min(off)) / 2
+    return _Placed(index, dict(values), sent_s, "kept", shift_s)
+
+
+def _interpolate(
+    clock: FloatArray, index: IntArray, period: float, values: dict[str, FloatArray], command_s: FloatArray
+) -> _Placed:
+    """Read the measurements at the grid's times, by straight lines; commands keep their own times."""
+    origin = clock[0] + float(np.median(clock - clock[0] - index * period))
+    first = np.ceil((clock[0] - origin) / period - EVEN)
+    number = np.arange(first, (clock[-1] - origin) / period + EVEN)
+    times = origin + number * period
+    after = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
+    nearest = np.minimum(np.abs(clock[after] - times), np.abs(clock[after - 1] - times))
+    read = {
+        name: np.stack([np.interp(times, clock, column) for column in array.T], axis=1)
+        for name, array in values.items()
+    }
+    if "orientation" in read:
+        read["orientation"] /= np.linalg.norm(read["orientation"], axis=1, keepdims=True)
+    begin = (number - number[0]).astype(np.int64)
+    return _Placed(begin, read, command_s - times[0], "interpolated", float(np.max(nearest)))
+
+
+def _one_hemisphere(quaternion: FloatArray) -> FloatArray:
+    """Return quaternions, each with the sign nearer to the one before: q and -q are one orientation."""
+    turn = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
+    sign = np.where(np.cumsum(np.concatenate(([False], turn))) % 2 == 1, -1.0, 1.0)
+    return quaternion * sign[:, None]
+
+
+def _velocity(table: Table, rows: IntArray, clock: FloatArray) -> FloatArray:
+    """Return measured velocities; differences of the positions where the file has none."""
+    difference = np.gradient(table.position[rows], clock, axis=0)
+    if table.velocity is None:
+        return np.asarray(difference)
+    return np.where(np.isfinite(table.velocity[rows]), table.velocity[rows], difference)
+
+
+def _trajectory(
+    table: Table,
+    device_s: FloatArray,
+    sent_s: FloatArray,
+    measured: dict[str, FloatArray],
+    gains: Gains | None,
+    metadata: dict[str, Any],
+) -> Trajectory:
+    # A command from before the stretch counts if it is still in force at its start; later ones see no sample.
+    order = np.argsort(sent_s, kind="stable")
+    sent_s, target = sent_s[order], table.target[order]
+    begin = max(int(np.searchsorted(sent_s, 1e-9, side="right")) - 1, 0)
+    end = int(np.searchsorted(sent_s, device_s[-1] + 1e-9, side="right"))
+    sent_s, target = sent_s[begin:end], target[begin:end]
+    # Stamps that agree to the nanosecond are one moment: rounding must not hand over a period late.
+    in_force = np.searchsorted(sent_s, device_s + 1e-9, side="right") - 1
+    age = np.full(device_s.size, np.nan)
+    known = in_force >= 0
+    age[known] = np.maximum(device_s[known] - sent_s[in_force[known]], 0.0)
+    C, A = target.shape
+    nothing = (math.nan,) * A
+    unknown = Gains(stiffness=nothing, damping=nothing, effort_limit=nothing, speed_limit=nothing)
+
+    def each(setting: tuple[float, ...]) -> FloatArray:
+        return np.tile(np.array(setting, dtype=np.float64), (C, 1)).reshape(C, A)
+
+    servo = gains or unknown
+    return Trajectory(
+        joint_names=table.joint_names,
+        actuated=table.actuated,
+        receive_s=device_s,
+        device_s=device_s,
+        position=measured["position"],
+        velocity=measured["velocity"],
+        effort=measured["effort"],
+        status=np.full(device_s.size, int(Status.ARMED)),
+        command_sequence=in_force.astype(np.int64),
+        command_age_s=age,
+        sent_s=sent_s,
+        sent_sequence=np.arange(C),
+        asked_position=target,
+        position_target=target,
+        stiffness=each(servo.stiffness),
+        damping=each(servo.damping),
+        effort_limit=each(servo.effort_limit),
+        speed_limit=each(servo.speed_limit),
+        metadata=metadata,
+    )

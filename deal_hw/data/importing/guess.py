@@ -1,0 +1,313 @@
+"""Guesses a column map from the names of the channels; the caller says what was guessed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.data.importing.channels import Channels
+from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
+from deal_hw.errors import DatasetError
+from deal_hw.types import FloatArray
+
+_WORDS = {
+    "position": "pos position positions q qpos angle angles meas measured measurement actual state states "
+    "observation obs encoder present",
+    "target": "target targets cmd cmds command commands commanded des desired ref reference setpoint goal "
+    "action actions sent",
+    "velocity": "vel velocity velocities dq qd qvel speed speeds",
+    "effort": "effort efforts torque torques tau load current force forces",
+}
+_ROLE = {word: role for role, words in _WORDS.items() for word in words.split()}
+_FILLERS = {"dof", "joint", "joints", "motor", "motors"}
+_UNITS = {"rad": "rad", "radians": "rad", "deg": "deg", "degrees": "deg", "mm": "mm"}
+_TIME_NAMES = ("time", "timestamp", "timestamps", "t", "stamp", "log_time")
+_TIME_SUFFIXES = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "ns": "ns"}
+_SPLIT = re.compile(r"[^A-Za-z0-9]+")
+
+
+@dataclass(frozen=True, slots=True)
+class _Guess:
+    """What the name of a channel says.
+
+    Attributes:
+        channel: Its name.
+        stem: The words that are left, lower case: the joint; empty for an array of all joints.
+        original: The same in the file's own letters.
+        role: "position", "target", "velocity", "effort", or "" where it is none of them.
+        unit: One of the units of position; "" where the name tells none.
+    """
+
+    channel: str
+    stem: tuple[str, ...]
+    original: str
+    role: str
+    unit: str
+
+
+def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> ColumnMap:
+    """Guess what the channels of a file mean.
+
+    Known layouts: one channel a joint, named like it with a word such as ``_pos``, ``_target``, ``_cmd``,
+    ``_vel``, ``_effort``; or arrays with one column a joint, such as ``dof_pos`` and ``des_dof_pos``,
+    ``observation.state`` and ``action``, ``/joint_states.position`` and ``/joint_command.position``.
+
+    Args:
+        channels: What the file holds.
+        joints: Names of the model's joints; None: as the file names them.
+
+    Raises:
+        DatasetError: No time or no joint can be made out; it says how to write a column map.
+    """
+    time = _guess_time(channels, channels.arrays, ("",))
+    if time is None:
+        raise _unguessed(channels, "which channel is the time")
+    guesses = [_read_name(name, joints or ()) for name in channels.arrays]
+    arrays = {
+        guess.role: guess
+        for guess in guesses
+        if guess.role and not guess.stem and _is_wide(channels, guess.channel)
+    }
+    if "position" in arrays:
+        return _from_arrays(channels, time, arrays, joints)
+    return _from_columns(channels, time, guesses, joints)
+
+
+def describe(columns: ColumnMap) -> list[str]:
+    """Return what a column map says, one line each, for the operator to check."""
+    lines = [f"time: {columns.time.column} [{columns.time.unit}]"]
+    if columns.command_time is not None:
+        lines.append(f"time of commands: {columns.command_time.column} [{columns.command_time.unit}]")
+    for kind in ("position", "target", "velocity", "effort"):
+        pattern = getattr(columns, kind)
+        if pattern:
+            lines.append(f"{kind}: {pattern}")
+    for joint in columns.joints:
+        own = [f"{kind} {getattr(joint, kind)}" for kind in ("position", "target", "velocity", "effort")]
+        own = [text for text in own if not text.endswith(" None")]
+        if not own:
+            place = "" if joint.index is None else f"column {joint.index} of the arrays, "
+            own = [f"{place}in the file {joint.column or joint.name}"]
+        unit = "normalised" if joint.normalised else joint.unit
+        lines.append(f"joint {joint.name}: {', '.join(own)} [{unit}]")
+    return lines
+
+
+def _read_name(channel: str, joints: Iterable[str]) -> _Guess:
+    words = [word for word in _SPLIT.split(channel) if word]
+    lower = [word.lower() for word in words]
+    joint = _joint_in(lower, joints)
+    rest = list(range(len(words)))
+    if joint is not None:
+        begin, length = joint
+        rest = [i for i in rest if not begin <= i < begin + length]
+    roles = {_ROLE[lower[i]] for i in rest if lower[i] in _ROLE}
+    units = [_UNITS[lower[i]] for i in rest if lower[i] in _UNITS]
+    left = [i for i in rest if lower[i] not in _ROLE and lower[i] not in _UNITS and lower[i] not in _FILLERS]
+    if joint is not None:
+        # Other words beside the joint's name say something that is not known here.
+        role = "" if left else _role(roles)
+        begin, length = joint
+        return _Guess(channel, tuple(lower[begin : begin + length]), "", role, units[0] if units else "")
+    named = [i for i in rest if lower[i] not in _ROLE and lower[i] not in _UNITS]
+    stem = tuple(lower[i] for i in left)
+    return _Guess(
+        channel, stem, "_".join(words[i] for i in named), _role(roles, bool(stem)), units[0] if units else ""
+    )
+
+
+def _role(roles: set[str], bare: bool = True) -> str:
+    """Return the one role of a channel; a joint's bare name is its position, "target velocity" is no role."""
+    if "target" in roles and roles <= {"target", "position"}:
+        return "target"
+    if len(roles - {"position"}) == 1:
+        return next(iter(roles - {"position"})) if "target" not in roles else ""
+    return "position" if roles == {"position"} or (not roles and bare) else ""
+
+
+def _joint_in(words: list[str], joints: Iterable[str]) -> tuple[int, int] | None:
+    """Return where the longest name of a joint stands among the words of a channel: first word, words."""
+    best: tuple[int, int] | None = None
+    for name in joints:
+        whole = [word.lower() for word in _SPLIT.split(name) if word]
+        for parts in (whole, [word for word in whole if word not in _FILLERS]):
+            for begin in range(len(words) - len(parts) + 1 if parts else 0):
+                if words[begin : begin + len(parts)] == parts and (best is None or len(parts) > best[1]):
+                    best = begin, len(parts)
+    return best
+
+
+def _key(name: str) -> tuple[str, ...]:
+    """Return the words of a joint's name without those that every joint has."""
+    words = [word.lower() for word in _SPLIT.split(name) if word]
+    return tuple(word for word in words if word not in _FILLERS) or tuple(words)
+
+
+def _is_wide(channels: Channels, name: str) -> bool:
+    return channels.arrays[name].ndim == 2
+
+
+def _from_arrays(
+    channels: Channels, time: TimeColumn, arrays: dict[str, _Guess], joints: Sequence[str] | None
+) -> ColumnMap:
+    array = arrays["position"].channel
+    width = channels.arrays[array].shape[1]
+    own = channels.labels.get(array, ()) or channels.joint_names
+    names = [name.removesuffix(".pos") for name in own]
+    by_order = len(names) != width
+    if by_order:
+        if joints is None or len(joints) != width:
+            raise _unguessed(channels, f"which joints the {width} columns of {array!r} are")
+        names = list(joints)
+    found = _rename(channels, names, joints)
+    topic = array.rpartition(".")[0]
+    command_time = None
+    if "target" in arrays and len(channels.arrays[arrays["target"].channel]) != len(channels.arrays[array]):
+        command_time = _guess_command_time(channels, arrays["target"].channel)
+    elif "command_time" in channels.arrays:
+        command_time = _guess_command_time(channels, "")
+    if topic.startswith("/"):
+        time = _guess_time(channels, channels.arrays, (f"{topic}.",)) or time
+        command_time = _guess_command_time(channels, arrays["target"].channel) if "target" in arrays else None
+    unit = arrays["position"].unit or "rad"
+    fits = {role: guess.channel for role, guess in arrays.items()}
+    return ColumnMap(
+        time=time,
+        command_time=command_time,
+        position=fits["position"],
+        target=fits.get("target"),
+        velocity=_of_same_rows(channels, fits, "velocity"),
+        effort=_of_same_rows(channels, fits, "effort"),
+        joints=tuple(
+            JointColumns(name=model, column=name, index=index if by_order else None, unit=unit)
+            for model, name, index in found
+        ),
+        source=("guessed",),
+    )
+
+
+def _of_same_rows(channels: Channels, fits: dict[str, str], role: str) -> str | None:
+    array = fits.get(role)
+    if array is None or channels.arrays[array].shape != channels.arrays[fits["position"]].shape:
+        return None
+    return array
+
+
+def _rename(channels: Channels, names: list[str], joints: Sequence[str] | None) -> list[tuple[str, str, int]]:
+    """Return name in the model, name in the file and column of each joint of the file that the model has."""
+    if joints is None:
+        return [(name, name, index) for index, name in enumerate(names)]
+    by_key = {_key(name): name for name in joints}
+    found = [(by_key[_key(name)], name, index) for index, name in enumerate(names) if _key(name) in by_key]
+    if not found:
+        raise _unguessed(
+            channels, f"which of the model's joints ({', '.join(joints)}) the file's ({', '.join(names)}) are"
+        )
+    return found
+
+
+def _from_columns(
+    channels: Channels, time: TimeColumn, guesses: list[_Guess], joints: Sequence[str] | None
+) -> ColumnMap:
+    names = {_key(name): name for name in joints} if joints is not None else {}
+    found: dict[str, dict[str, _Guess]] = {}
+    with_target = {guess.stem for guess in guesses if guess.role == "target"}
+    for guess in guesses:
+        if (
+            guess.channel == time.column
+            or not guess.role
+            or not guess.stem
+            or _is_wide(channels, guess.channel)
+        ):
+            continue
+        key = _key(" ".join(guess.stem))
+        # Without a model any column could be a position: only those with a target or a known word are.
+        if joints is None and guess.stem not in with_target and not _has_role_word(guess.channel):
+            continue
+        if joints is not None and key not in names:
+            continue
+        name = names.get(key) or next((g.original for g in guesses if g.stem == guess.stem), guess.original)
+        found.setdefault(name, {}).setdefault(guess.role, guess)
+    found = {name: roles for name, roles in found.items() if "position" in roles}
+    if not found:
+        raise _unguessed(channels, "which channels are the joints' positions")
+    ordered = [name for name in (joints or found) if name in found]
+    own_time = channels.arrays.get("command_time")
+    return ColumnMap(
+        time=time,
+        command_time=_guess_command_time(channels, "") if own_time is not None else None,
+        joints=tuple(_joint(name, found[name]) for name in ordered),
+        source=("guessed",),
+    )
+
+
+def _has_role_word(channel: str) -> bool:
+    return any(word.lower() in _ROLE for word in _SPLIT.split(channel))
+
+
+def _joint(name: str, roles: dict[str, _Guess]) -> JointColumns:
+    unit = roles["position"].unit or "rad"
+    target = roles.get("target")
+    chosen: dict[str, Any] = {role: guess.channel for role, guess in roles.items()}
+    return JointColumns(
+        name=name,
+        unit=unit,
+        target_unit=target.unit if target is not None and target.unit else "",
+        **chosen,
+    )
+
+
+def _guess_time(channels: Channels, names: Iterable[str], prefixes: tuple[str, ...]) -> TimeColumn | None:
+    """Return the channel of time under one of the prefixes; its unit by its name, else by its steps."""
+    by_lower = {name.lower(): name for name in names if channels.arrays[name].ndim == 1}
+    for prefix in prefixes:
+        for base in ("header.stamp", *_TIME_NAMES):
+            if (name := by_lower.get(f"{prefix}{base}")) is not None:
+                known = "s" if base in ("header.stamp", "log_time") else ""
+                if base != "header.stamp" or np.ptp(channels.arrays[name]) > 0:
+                    return TimeColumn(column=name, unit=known or _unit_of(channels.arrays[name]))
+            for suffix, unit in _TIME_SUFFIXES.items():
+                for joined in (
+                    f"{prefix}{base}_{suffix}",
+                    f"{prefix}{base} [{suffix}]",
+                    f"{prefix}{base}[{suffix}]",
+                ):
+                    if (name := by_lower.get(joined)) is not None:
+                        return TimeColumn(column=name, unit=unit)
+    stamped = [name for name in by_lower.values() if name.endswith((".header.stamp", ".log_time"))]
+    return TimeColumn(column=stamped[0]) if stamped else None
+
+
+def _guess_command_time(channels: Channels, target: str) -> TimeColumn | None:
+    topic = target.rpartition(".")[0]
+    if topic.startswith("/"):
+        return _guess_time(channels, channels.arrays, (f"{topic}.",))
+    for name in ("command_time", "time_command", "target_time", "command_time_s"):
+        if name in channels.arrays:
+            return TimeColumn(column=name, unit=_unit_of(channels.arrays[name]))
+    raise _unguessed(channels, f"which channel is the time of {target!r}")
+
+
+def _unit_of(stamps: FloatArray) -> str:
+    """Return the unit of time in which a recording has between 5 and 5000 samples a second."""
+    steps = np.diff(stamps[np.isfinite(stamps)])
+    step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+    for unit, longest in (("s", 0.2), ("ms", 200.0), ("us", 2e5)):
+        if step <= longest:
+            return unit
+    return "ns"
+
+
+def _unguessed(channels: Channels, what: str) -> DatasetError:
+    names = [
+        name if values.ndim == 1 else f"{name}[{values.shape[1]}]" for name, values in channels.arrays.items()
+    ]
+    shown = ", ".join(names[:24]) + (", ..." if len(names) > 24 else "")
+    return DatasetError(
+        f"{channels.path}: cannot tell {what}; say it in a column map (docs/import.md). Channels: "
+        f"{shown or 'none'}"
+    )

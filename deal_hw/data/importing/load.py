@@ -1,0 +1,185 @@
+"""From a path to tables and trajectories: the door of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from mcap.records import Chunk, Metadata
+
+from deal_hw.data.dataset import INDEX_NAME, Dataset
+from deal_hw.data.importing.channels import Channels
+from deal_hw.data.importing.columns import ColumnMap
+from deal_hw.data.importing.csv_source import read_csv
+from deal_hw.data.importing.grid import Gains, Recording, common_period, to_trajectories
+from deal_hw.data.importing.guess import describe, guess_columns
+from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
+from deal_hw.data.importing.mcap_source import read_mcap
+from deal_hw.data.importing.npz_source import read_npz
+from deal_hw.data.importing.table import Table, build_table
+from deal_hw.data.mcap_scan import Found, scan
+from deal_hw.data.reader import read_trajectory
+from deal_hw.data.recorder import METADATA_NAME
+from deal_hw.errors import DatasetError
+from deal_hw.types import Trajectory
+
+Say = Callable[[str], None]
+_READERS: dict[str, Callable[[Path], Channels]] = {
+    ".csv": read_csv, ".tsv": read_csv, ".txt": read_csv, ".npz": read_npz, ".mcap": read_mcap,
+}  # fmt: skip
+_HEAD_BYTES = 1 << 20
+
+
+def read_channels(path: Path) -> list[Channels]:
+    """Read a file or a LeRobot folder; one entry a recording in it.
+
+    Raises:
+        DatasetError: There is no such file, or it is of no known kind.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if is_lerobot(path):
+            return read_lerobot(path)
+        raise DatasetError(
+            f"{path} is a folder but no LeRobot dataset (it has no meta/info.json); name a file"
+        )
+    if not path.exists():
+        raise DatasetError(f"{path} does not exist")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DatasetError(
+            f"{path}: files ending in {path.suffix or 'nothing'!r} are not known; "
+            f"known: {', '.join(_READERS)}, and LeRobot folders"
+        )
+    return [reader(path)]
+
+
+def load_tables(
+    path: Path, columns: ColumnMap | None = None, joints: Sequence[str] | None = None, say: Say | None = None
+) -> list[Table]:
+    """Read the recordings in a file, in SI units, on their own stamps.
+
+    Args:
+        path: A CSV, NPZ or MCAP file, or the folder of a LeRobot dataset.
+        columns: What its channels mean; None: guessed from their names.
+        joints: Names of the model's joints; None: as the map, or the file, names them.
+        say: Called with sentences on what was guessed and left out.
+
+    Raises:
+        DatasetError: It cannot be read or understood.
+    """
+    tables = []
+    for number, channels in enumerate(read_channels(path)):
+        used = columns if columns is not None else guess_columns(channels, joints)
+        if say is not None:
+            _tell(say, channels, used, joints, columns is None and number == 0)
+        tables.append(build_table(channels, used, joints))
+    if not tables:
+        raise DatasetError(f"{path} holds no recording")
+    return tables
+
+
+def load_recordings(
+    paths: Sequence[Path],
+    columns: ColumnMap | None = None,
+    joints: Sequence[str] | None = None,
+    gains: Gains | None = None,
+    say: Say | None = None,
+) -> list[Recording]:
+    """Read recordings of one robot onto one grid; episodes and datasets of deal-hw come as they are.
+
+    Args:
+        paths: As for :func:`load_tables`; or episodes and datasets recorded by deal-hw.
+        columns: What the channels mean; None: guessed.
+        joints: Names of the model's joints.
+        gains: What the robot's servos were set to, in the order of the joints with commands; None: unknown.
+        say: Called with sentences on what was guessed and left out.
+
+    Raises:
+        DatasetError: One cannot be read or understood, or they do not fit each other.
+    """
+    own: list[Recording] = []
+    tables: list[Table] = []
+    for path in map(Path, paths):
+        if is_dataset(path):
+            dataset = Dataset.open(path, say or (lambda text: None))
+            episodes = [dataset.path(index) for index in range(len(dataset.episodes))]
+            own += [Recording(read_trajectory(episode), None, None) for episode in episodes]
+        elif is_episode(path):
+            own.append(Recording(read_trajectory(path), None, None))
+        else:
+            tables += load_tables(path, columns, joints, say)
+    if not tables:
+        return own
+    different = [table for table in tables if table.joint_names != tables[0].joint_names]
+    if different:
+        raise DatasetError(
+            f"{different[0].name} has the joints {', '.join(different[0].joint_names)}, "
+            f"{tables[0].name} {', '.join(tables[0].joint_names)}; import them apart"
+        )
+    period = common_period(tables)
+    return own + [part for table in tables for part in to_trajectories(table, gains, period)]
+
+
+def is_dataset(path: Path) -> bool:
+    """Say whether a folder is a dataset of deal-hw."""
+    return (Path(path) / INDEX_NAME).is_file()
+
+
+def is_episode(path: Path) -> bool:
+    """Say whether an MCAP file was written by deal-hw: it says so before its first message."""
+    path = Path(path)
+    if path.suffix.lower() != ".mcap" or not path.is_file():
+        return False
+    with open(path, "rb") as file:
+        head = file.read(_HEAD_BYTES)
+    for item in scan(head):
+        if not isinstance(item, Found) or isinstance(item.record, Chunk):
+            return False
+        if isinstance(item.record, Metadata):
+            return item.record.name == METADATA_NAME
+    return False
+
+
+def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
+    """Return a trajectory as a table: commands at the device time from which they were in force."""
+    seen = trajectory.command_sequence
+    order = {int(number): row for row, number in enumerate(trajectory.sent_sequence)}
+    numbers, first = np.unique(seen, return_index=True)
+    known = [(order[int(n)], int(at)) for n, at in zip(numbers, first, strict=True) if int(n) in order]
+    rows = np.array([row for row, _ in known], dtype=np.int64)
+    at = np.array([sample for _, sample in known], dtype=np.int64)
+    age = np.nan_to_num(trajectory.command_age_s[at]) if at.size else np.empty(0)
+    units = trajectory.metadata.get("description", {}).get("position_units")
+    return Table(
+        joint_names=trajectory.joint_names,
+        actuated=trajectory.actuated,
+        units=tuple(units) if units else ("rad",) * len(trajectory.joint_names),
+        time_s=trajectory.device_s,
+        position=trajectory.position,
+        velocity=trajectory.velocity,
+        effort=trajectory.effort,
+        command_s=trajectory.device_s[at] - age if at.size else np.empty(0),
+        target=trajectory.position_target[rows],
+        orientation=None,
+        gyro=None,
+        source={"file": name, "part": "", "kind": "deal-hw", "sha256": "", "columns": [], "notes": []},
+    )
+
+
+def _tell(
+    say: Say, channels: Channels, columns: ColumnMap, joints: Sequence[str] | None, guessed: bool
+) -> None:
+    name = f"{channels.path.name} {channels.part}".strip()
+    for note in channels.notes:
+        say(f"{name}: {note}")
+    if guessed:
+        say(f"{name}: no column map given; guessed:")
+        for line in describe(columns):
+            say(f"  {line}")
+        if not (columns.target or any(joint.target for joint in columns.joints)):
+            say("  no commanded positions found")
+        missing = [joint for joint in joints or () if joint not in {known.name for known in columns.joints}]
+        if missing:
+            say(f"  not in the file: {', '.join(missing)}")

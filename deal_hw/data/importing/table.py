@@ -1,0 +1,264 @@
+"""One recording in SI units, on the stamps it came with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.data.importing.channels import Channels
+from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
+from deal_hw.errors import DatasetError
+from deal_hw.types import FloatArray
+
+_QUANTITIES = ("pos", "position", "vel", "velocity", "effort", "torque")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """T measured samples and C commands of one recording.
+
+    Attributes:
+        joint_names: The J joints.
+        actuated: The A joints that have commands, in the order of the joints.
+        units: Unit of each position, "rad" or "m", (J,).
+        time_s: Stamps of the samples since the first of them, as recorded, (T,) [s].
+        position: (T, J) [rad or m].
+        velocity: (T, J) [rad/s or m/s]; None where the file has none.
+        effort: (T, J), in whatever unit the file has; None where it has none.
+        command_s: Stamps of the commands on the same clock and zero, (C,) [s].
+        target: Commanded positions, (C, A) [rad or m].
+        orientation: Base orientation, quaternion w x y z, (T, 4); None where the file has none.
+        gyro: Angular velocity of the base in its own frame, (T, 3) [rad/s]; None where the file has none.
+        source: Where it comes from and what was changed on the way: plain JSON values.
+    """
+
+    joint_names: tuple[str, ...]
+    actuated: tuple[str, ...]
+    units: tuple[str, ...]
+    time_s: FloatArray
+    position: FloatArray
+    velocity: FloatArray | None
+    effort: FloatArray | None
+    command_s: FloatArray
+    target: FloatArray
+    orientation: FloatArray | None
+    gyro: FloatArray | None
+    source: dict[str, Any]
+
+    @property
+    def actuated_index(self) -> tuple[int, ...]:
+        """Index of each actuated joint among the joints, (A,)."""
+        return tuple(self.joint_names.index(name) for name in self.actuated)
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.source['file']} {self.source['part']}".strip()
+
+
+def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | None = None) -> Table:
+    """Pick and convert the channels that a column map names.
+
+    Rows without any position are left out (a log of several rates has such), and so are rows without any
+    target; both are counted in ``source``.
+
+    Args:
+        channels: What the file holds.
+        columns: What it means.
+        joints: Names of the model's joints: the table follows their order, and others are refused. None: the
+            map's order.
+
+    Raises:
+        DatasetError: A channel is missing or does not fit the others, or a joint is not the model's.
+    """
+    ordered = _ordered(channels, columns, joints)
+    time_s, command_s = _times(channels, columns)
+    measured = {
+        kind: [_joint_channel(channels, columns, joint, place, kind) for joint, place in ordered]
+        for kind in ("position", "velocity", "effort", "target")
+    }
+    absent = [
+        joint.name for (joint, _), values in zip(ordered, measured["position"], strict=True) if values is None
+    ]
+    if absent:
+        raise DatasetError(
+            f"{channels.path}: no position of {', '.join(absent)}; give `position` in the column map"
+        )
+    position = _stack(channels, "position", measured["position"], time_s.size)
+    velocity = _stack(channels, "velocity", measured["velocity"], time_s.size)
+    effort = _stack(channels, "effort", measured["effort"], time_s.size)
+    actuated = [
+        joint for (joint, _), values in zip(ordered, measured["target"], strict=True) if values is not None
+    ]
+    targets = [values for values in measured["target"] if values is not None]
+    target = _stack(channels, "target", targets, command_s.size, columns.command_time is not None)
+    if position is None:
+        raise DatasetError(f"{channels.path}: the column map names no position")
+    if target is None:
+        command_s, target = np.empty(0), np.empty((0, 0))
+    orientation, gyro = _orientation(channels, columns.orientation), _gyro(channels, columns.gyro)
+    for name, values in (("orientation", orientation), ("gyro", gyro)):
+        if values is not None and len(values) != time_s.size:
+            raise DatasetError(f"{channels.path}: {name} has {len(values)} rows, time has {time_s.size}")
+    kept = ~np.isnan(position).all(axis=1)
+    sent = ~np.isnan(target).all(axis=1) if target.size else np.zeros(command_s.size, dtype=bool)
+    if not kept.any():
+        raise DatasetError(f"{channels.path}: every position is empty; is it the right channel?")
+    zero_s = float(time_s[kept][0])
+    return Table(
+        joint_names=tuple(joint.name for joint, _ in ordered),
+        actuated=tuple(joint.name for joint in actuated),
+        units=tuple(joint.si_unit for joint, _ in ordered),
+        time_s=time_s[kept] - zero_s,
+        position=position[kept],
+        velocity=None if velocity is None else velocity[kept],
+        effort=None if effort is None else effort[kept],
+        command_s=command_s[sent] - zero_s,
+        target=target[sent],
+        orientation=None if orientation is None else orientation[kept],
+        gyro=None if gyro is None else gyro[kept],
+        source={
+            "file": channels.path.name,
+            "part": channels.part,
+            "kind": channels.kind,
+            "sha256": channels.digest,
+            "columns": list(columns.source),
+            "notes": list(channels.notes),
+            "rows_without_position": int(np.sum(~kept)),
+            "rows_without_target": int(np.sum(~sent)),
+        },
+    )
+
+
+def _ordered(
+    channels: Channels, columns: ColumnMap, joints: Sequence[str] | None
+) -> list[tuple[JointColumns, int]]:
+    """Return the map's joints in the model's order, each with its place in the map."""
+    placed = {joint.name: (joint, place) for place, joint in enumerate(columns.joints)}
+    if joints is None:
+        return list(placed.values())
+    unknown = [name for name in placed if name not in joints]
+    if unknown:
+        raise DatasetError(
+            f"{channels.path}: the column map names {', '.join(unknown)}, which the model does not have; "
+            f"its joints: {', '.join(joints)}"
+        )
+    return [placed[name] for name in joints if name in placed]
+
+
+def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArray]:
+    """Return the stamps of samples and commands since the first sample, (T,) and (C,) [s]."""
+    raw, unit = channels.column(columns.time.column), TIME_UNITS[columns.time.unit]
+    finite = raw[np.isfinite(raw)]
+    # The first one is taken off before scaling: an epoch in ns times 1e-9 keeps 0.2 us only.
+    zero = float(finite[0]) if finite.size else 0.0
+    time_s = (raw - zero) * unit
+    if columns.command_time is None:
+        return time_s, time_s
+    its_unit = TIME_UNITS[columns.command_time.unit]
+    return time_s, (channels.column(columns.command_time.column) - zero * (unit / its_unit)) * its_unit
+
+
+def _joint_channel(
+    channels: Channels, columns: ColumnMap, joint: JointColumns, place: int, kind: str
+) -> FloatArray | None:
+    """Return one quantity of one joint in SI, (T,); None where the map or the file has none."""
+    given: str | None = getattr(joint, kind)
+    pattern: str | None = getattr(columns, kind) if given is None else given
+    if pattern is None or pattern.lower() in ("", "none"):
+        return None
+    if given is not None or "{joint}" in pattern:
+        values = channels.column(pattern.replace("{joint}", joint.column or joint.name))
+    else:
+        found = _from_array(channels, pattern, columns, joint, place)
+        if found is None:
+            return None
+        values = found
+    slope, constant = joint.scale(target=kind == "target")
+    if kind in ("position", "target"):
+        return slope * values + constant
+    return (slope if kind == "velocity" else joint.sign) * values
+
+
+def _from_array(
+    channels: Channels, name: str, columns: ColumnMap, joint: JointColumns, place: int
+) -> FloatArray | None:
+    """Return a joint's column: by its index, else by its label, else by its place in the map."""
+    values = channels.array(name)
+    if values.ndim == 1:
+        if len(columns.joints) == 1:
+            return values
+        raise DatasetError(
+            f"{channels.path}: {name!r} is one channel but there are {len(columns.joints)} joints; "
+            "write a pattern with {joint}"
+        )
+    labels = [_plain(label) for label in channels.labels.get(name, ()) or channels.joint_names]
+    if joint.index is None and len(labels) == values.shape[1]:
+        own = _plain(joint.column or joint.name)
+        if own in labels:
+            return values[:, labels.index(own)]
+        if any(_plain(other.column or other.name) in labels for other in columns.joints):
+            return None  # The labels are those of the map's joints, and this one is not among them.
+    index = place if joint.index is None else joint.index
+    if index >= values.shape[1]:
+        raise DatasetError(
+            f"{channels.path}: {name!r} has {values.shape[1]} columns, joint {joint.name!r} would be number "
+            f"{index}; list the joints in the order of the array, or give each its index"
+        )
+    return values[:, index]
+
+
+def _plain(label: str) -> str:
+    """Return a label without the quantity that LeRobot appends, as in elbow.pos."""
+    stem, _, quantity = label.rpartition(".")
+    return stem if stem and quantity in _QUANTITIES else label
+
+
+def _stack(
+    channels: Channels, kind: str, columns: Sequence[FloatArray | None], rows: int, own_time: bool = False
+) -> FloatArray | None:
+    """Return the joints' channels as (T, J); None where there are none; a joint without is NaN."""
+    present = [values for values in columns if values is not None]
+    if not present:
+        return None
+    sizes = {values.size for values in present}
+    if sizes != {rows}:
+        hint = (
+            ""
+            if own_time or kind != "target"
+            else "; give `command_time` if commands have stamps of their own"
+        )
+        raise DatasetError(
+            f"{channels.path}: {kind} has {sorted(sizes)} rows, its time has {rows}; they must be of "
+            f"one length{hint}"
+        )
+    return np.stack([np.full(rows, np.nan) if values is None else values for values in columns], axis=1)
+
+
+def _vector(channels: Channels, vector: Vector) -> FloatArray:
+    if len(vector.columns) == 1:
+        return channels.array(vector.columns[0])
+    return np.stack([channels.column(name) for name in vector.columns], axis=1)
+
+
+def _orientation(channels: Channels, vector: Vector | None) -> FloatArray | None:
+    if vector is None:
+        return None
+    values = _vector(channels, vector)
+    if values.ndim != 2 or values.shape[1] != 4:
+        raise DatasetError(
+            f"{channels.path}: orientation has shape {values.shape}; a quaternion has 4 columns"
+        )
+    return values[:, [3, 0, 1, 2]] if vector.order == "xyzw" else values
+
+
+def _gyro(channels: Channels, vector: Vector | None) -> FloatArray | None:
+    if vector is None:
+        return None
+    values = _vector(channels, vector)
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise DatasetError(f"{channels.path}: gyro has shape {values.shape}; it has 3 columns, x y z")
+    return np.deg2rad(values) if vector.unit == "deg" else values

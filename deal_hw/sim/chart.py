@@ -1,0 +1,40 @@
+"""Charts of orientation: a floating base's state as plain coordinates around a reference orientation.
+
+An orientation is given as the rotation vector, in the body's own frame, that leads to it from a reference:
+``q = reference * exp(r)``. Near the reference this is as good as three plain coordinates, so least squares,
+Kalman steps and critics need not know that there is a base. Quaternions are MuJoCo's: unit, (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from deal_hw.types import FloatArray
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def to_quaternion(rotation_vector: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the orientations, (..., 4), that lie at rotation vectors, (..., 3), from references, (..., 4)."""
+    shape = np.broadcast_shapes(rotation_vector.shape[:-1], reference.shape[:-1])
+    step = _rotation(np.broadcast_to(rotation_vector, (*shape, 3)), vectors=True)
+    whole = _rotation(np.broadcast_to(reference, (*shape, 4))) * step
+    return np.asarray(whole.as_quat(scalar_first=True)).reshape(*shape, 4)
+
+
+def to_vector(quaternion: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the rotation vectors, (..., 3) [rad], of orientations, (..., 4), from references, (..., 4).
+
+    Orientations that are not finite (a diverged member) come out as NaN.
+    """
+    shape = np.broadcast_shapes(quaternion.shape[:-1], reference.shape[:-1])
+    q = np.broadcast_to(quaternion, (*shape, 4))
+    finite = np.isfinite(q).all(axis=-1, keepdims=True)
+    step = _rotation(np.broadcast_to(reference, (*shape, 4))).inv() * _rotation(np.where(finite, q, IDENTITY))
+    return np.where(finite, step.as_rotvec().reshape(*shape, 3), np.nan)
+
+
+def _rotation(values: FloatArray, *, vectors: bool = False) -> Rotation:
+    flat = np.array(values).reshape(-1, values.shape[-1])
+    return Rotation.from_rotvec(flat) if vectors else Rotation.from_quat(flat, scalar_first=True)

@@ -1,0 +1,100 @@
+"""What a parameter kind is: a name, the elements it is for, and the function that writes its values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import mujoco
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import Scale
+from deal_hw.sim.fields import Array, Fields
+
+HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+
+Apply = Callable[[Fields, Sequence[str], Array], None]
+Element = Literal["body", "joint", "geom", "actuator"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kind:
+    """One kind of physical parameter.
+
+    Attributes:
+        name: Name in ``Parameter.kind`` and in params.yaml.
+        element: What its elements are.
+        quantity: Last part of a parameter's name, ``<element>.<quantity>``.
+        unit: SI unit; for joints and actuators that of a hinge.
+        unit_slide: SI unit for a slide joint where that differs.
+        writes: MjModel fields that it changes; empty for a kind that no field holds.
+        along: What moves along, in words.
+        apply: Writes values (N,) for the named elements into the fields of N simulations; None for a kind
+            that the simulator's surroundings apply.
+        baseline: Value that a model has for an element; None: it has none, so params.yaml must say.
+        usable: Raises where the element cannot have this parameter.
+        scale: Usual scale.
+        spread: Usual half width of the range on a linear scale, in the unit.
+        least: No value may lie below.
+        most: No value may lie above.
+        order: Kinds of lower order are applied first.
+        relative: Writes what it finds in the fields times or plus something, so that they are reset before.
+    """
+
+    name: str
+    element: Element
+    quantity: str
+    unit: str
+    writes: tuple[str, ...]
+    along: str
+    apply: Apply | None
+    baseline: Callable[[Any, int], float] | None
+    unit_slide: str = ""
+    usable: Callable[[Any, int, str], None] | None = None
+    scale: Scale = "log"
+    spread: float = 0.0
+    least: float = 0.0
+    most: float = float("inf")
+    order: int = 2
+    relative: bool = False
+
+    def unit_of(self, model: Any, index: int) -> str:
+        """Return the unit for one element of a model."""
+        if not self.unit_slide:
+            return self.unit
+        joint = index if self.element == "joint" else joint_of(model, index)
+        slides = joint >= 0 and int(model.jnt_type[joint]) == SLIDE
+        return self.unit_slide if slides else self.unit
+
+
+def joint_of(model: Any, actuator: int) -> int:
+    """Return the joint that an actuator drives, or -1."""
+    return (
+        int(model.actuator_trnid[actuator, 0]) if int(model.actuator_trntype[actuator]) in _OF_JOINT else -1
+    )
+
+
+def one_dof_joint(model: Any, joint: int, name: str) -> None:
+    """Refuse ball and free joints, whose degrees of freedom have no names of their own."""
+    if int(model.jnt_type[joint]) not in (HINGE, SLIDE):
+        raise ConfigurationError(f"joint {name!r} is a ball or free joint; name hinges and slides")
+
+
+def moving_body(model: Any, body: int, name: str) -> None:
+    """Refuse bodies whose mass no motion shows: fixed to the world, or without mass."""
+    if model.body_weldid[body] == 0:
+        raise ConfigurationError(
+            f"body {name!r} is fixed to the world: no motion shows its mass; leave it out or give it a joint"
+        )
+    if model.body_mass[body] <= 0:
+        raise ConfigurationError(f"body {name!r} has no mass in the model: there is nothing to scale")
+
+
+def touching_geom(model: Any, geom: int, name: str) -> None:
+    """Refuse geoms that touch nothing."""
+    if not model.geom_contype[geom] and not model.geom_conaffinity[geom]:
+        raise ConfigurationError(
+            f"geom {name!r} touches nothing (contype and conaffinity are 0): no contact shows this parameter"
+        )

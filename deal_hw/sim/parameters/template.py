@@ -1,0 +1,85 @@
+"""A commented params.yaml for any MJCF, as a start to edit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.sim.fields import element_id, element_names
+from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.parameters.kind import Kind, joint_of
+
+_HEAD = """\
+# Parameters of {title} for `deal-hw calibrate --parameters`. Remove what you know or do not want to search.
+# Every key is explained in docs/parameters.md. Nominal values are the model's; a value of 0 has no ratio, so
+# such lines are commented out: give them a `nominal` or a `range` and remove the #.
+# Measure what you can: `weighed: 0.35` fixes a mass, `prior: {{mean: 0.35, std: 0.02}}` says what you expect.
+parameters:
+"""
+_ON = (
+    "dof_frictionloss", "dof_damping", "dof_armature", "servo_stiffness", "servo_damping", "motor_gain",
+)  # fmt: skip
+_OFF = ("servo_effort_limit", "encoder_bias", "body_mass")
+
+
+def template(model: Any, title: str = "this model") -> str:
+    """Return a params.yaml with friction, damping and armature of every joint and gains of every actuator.
+
+    Masses, effort limits and encoder biases follow as comments: without a measured mass or a known torque
+    the common scale of masses, frictions and gains cannot be seen in any motion.
+
+    Args:
+        model: The MjModel.
+        title: What the head of the file calls the model.
+    """
+    lines = [_HEAD.format(title=title)]
+    for name in _ON:
+        lines += _section(model, KIND_TABLE[name], active=True)
+    for name in _OFF:
+        lines += _section(model, KIND_TABLE[name], active=False)
+    if not any(line.startswith("  - ") for line in lines):
+        raise ConfigurationError(
+            f"{title} has no named joint or actuator with a friction, damping, armature or gain above 0; "
+            "name them in the MJCF and give them values"
+        )
+    return "".join(lines)
+
+
+def _section(model: Any, kind: Kind, *, active: bool) -> list[str]:
+    rows = list(_rows(model, kind))
+    if not rows:
+        return []
+    lines = [f"  # {kind.name} [{rows[0][2]}]; moves along: {kind.along}\n"]
+    for element, value, unit in rows:
+        searchable = active and (kind.scale == "linear" or value > 0) and not _doubled(model, kind, element)
+        text = f"- {{kind: {kind.name}, elements: {_quoted(element)}}}"
+        lines.append(f"  {'' if searchable else '# '}{text}  # {value:.6g} {unit}\n")
+    return lines
+
+
+def _doubled(model: Any, kind: Kind, actuator: str) -> bool:
+    """Return whether a servo's damping adds to a joint damping that is searched: one is enough."""
+    if kind.name != "servo_damping":
+        return False
+    joint = joint_of(model, element_id(model, "actuator", actuator))
+    return joint >= 0 and np.ravel(model.dof_damping[model.jnt_dofadr[joint]])[0] > 0
+
+
+def _rows(model: Any, kind: Kind) -> Iterable[tuple[str, float, str]]:
+    for index, name in enumerate(element_names(model, kind.element)):
+        if not name or (kind.element == "body" and index == 0):
+            continue
+        try:
+            if kind.usable is not None:
+                kind.usable(model, index, name)
+        except ConfigurationError:
+            continue
+        yield name, 0.0 if kind.baseline is None else kind.baseline(model, index), kind.unit_of(model, index)
+
+
+def _quoted(name: str) -> str:
+    """Return a name that YAML reads as text whatever it looks like."""
+    return '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,285 @@
+"""A user's params.yaml: which parameters of an MJCF are searched, in which range, and what is known of them.
+
+The format is described in docs/parameters.md. Nominal values come from the MJCF itself, so that the file says
+only what the user wants to change.
+"""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.parameters import Parameter, ParameterSpace, Scale
+from deal_hw.sim.fields import element_id, element_names
+from deal_hw.sim.parameters import check_space, find_kind
+from deal_hw.sim.parameters.kind import Kind
+
+RATIO: Final = 5.0
+"""Half width of a log range that the file does not give: a factor to either side of the nominal value."""
+
+_KEYS: Final = (
+    "kind", "elements", "group", "name", "nominal", "range", "ratio", "scale", "known", "weighed", "prior",
+)  # fmt: skip
+_GROUPS: Final = ("each", "together")
+_SCALES: Final[Mapping[str, Scale]] = {"log": "log", "linear": "linear"}
+
+
+def read_space(path: Path, model: Any) -> ParameterSpace:
+    """Return the parameter space that a YAML file describes for a model.
+
+    Args:
+        path: The file.
+        model: The MjModel that gives names and nominal values.
+
+    Raises:
+        ConfigurationError: The file cannot be used; the message says which entry, and what to write instead.
+        UnknownNameError: A kind or an element is not known; the message lists the names.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        raise ConfigurationError(f"cannot read {path}: {err}") from err
+    return parse_space(text, model, source=str(path))
+
+
+def parse_space(text: str, model: Any, source: str = "params.yaml") -> ParameterSpace:
+    """Return the parameter space that YAML text describes; see :func:`read_space`.
+
+    Args:
+        text: The YAML text.
+        model: The MjModel.
+        source: What messages call the text.
+    """
+    try:
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as err:
+        raise ConfigurationError(f"{source} is not YAML: {err}") from err
+    if not isinstance(content, Mapping) or list(content) != ["parameters"]:
+        raise ConfigurationError(f"{source} must hold one key, `parameters`, with a list of entries")
+    entries = content["parameters"]
+    if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
+        raise ConfigurationError(f"{source}: `parameters` must be a list with at least one entry")
+    parameters: list[Parameter] = []
+    for number, entry in enumerate(entries, 1):
+        try:
+            parameters += _parameters(entry, model)
+        except ConfigurationError as err:
+            err.args = (f"{source}, entry {number}: {err}",)
+            raise
+    names = [p.name for p in parameters]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigurationError(f"{source}: parameter names repeat: {twice}; give one of them a `name`")
+    space = ParameterSpace(parameters)
+    try:
+        check_space(model, space)
+    except ConfigurationError as err:
+        err.args = (f"{source}: {err}",)
+        raise
+    return space
+
+
+def write_space(space: ParameterSpace) -> str:
+    """Return YAML text that :func:`parse_space` reads back to the same space."""
+    # ASCII only: with allow_unicode PyYAML writes a next-line character as it is and reads it as a space.
+    return yaml.safe_dump({"parameters": [_entry(p) for p in space.parameters]}, sort_keys=False)
+
+
+def _entry(p: Parameter) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "kind": p.kind, "elements": list(p.elements), "group": "together", "name": p.name,
+        "nominal": float(p.nominal), "range": [float(p.low), float(p.high)], "scale": p.scale,
+    }  # fmt: skip
+    if p.known:
+        entry["known"] = True
+    if p.prior_mean is not None and p.prior_std is not None:
+        entry["prior"] = {"mean": float(p.prior_mean), "std": float(p.prior_std)}
+    return entry
+
+
+def _parameters(entry: Any, model: Any) -> list[Parameter]:
+    if not isinstance(entry, Mapping):
+        raise ConfigurationError(f"an entry must have keys ({', '.join(_KEYS)}), got {entry!r}")
+    for key in entry:
+        if key not in _KEYS:
+            raise _unknown("key", str(key), _KEYS)
+    kind = find_kind(_text(entry, "kind"))
+    elements = _elements(entry.get("elements"), kind, model)
+    group = _choice(entry, "group", _GROUPS, "each")
+    if group == "each" and "name" in entry and len(elements) > 1:
+        raise ConfigurationError(
+            f"`name` is for one parameter, but group `each` makes {len(elements)}; use group: together"
+        )
+    if group == "together" and "name" not in entry and len(elements) > 1:
+        raise ConfigurationError(f"group `together` of {len(elements)} elements needs a `name`")
+    groups = [tuple(elements)] if group == "together" else [(name,) for name in elements]
+    return [_parameter(entry, kind, names, model) for names in groups]
+
+
+def _elements(value: Any, kind: Kind, model: Any) -> list[str]:
+    patterns = [value] if isinstance(value, str) else value
+    if not isinstance(patterns, Sequence) or not patterns or not all(isinstance(x, str) for x in patterns):
+        raise ConfigurationError(
+            f"`elements` must be a {kind.element} name, a pattern such as '*_hip', or a list of them; "
+            f"got {value!r}"
+        )
+    names = [name for name in element_names(model, kind.element) if name]
+    if kind.element == "body":
+        names.remove("world")
+    chosen: list[str] = []
+    for pattern in patterns:
+        literal = pattern in names
+        found = [pattern] if literal else [name for name in names if fnmatch.fnmatchcase(name, pattern)]
+        if not found:
+            raise _unknown(f"MuJoCo {kind.element}", pattern, names)
+        if not literal:
+            found = _usable_ones(found, kind, model, pattern)
+        chosen += [name for name in found if name not in chosen]
+    return chosen
+
+
+def _usable_ones(names: list[str], kind: Kind, model: Any, pattern: str) -> list[str]:
+    """Return what a pattern means: the elements that can have the parameter; a name is taken at its word."""
+    if kind.usable is None:
+        return names
+    kept, reason = [], ""
+    for name in names:
+        try:
+            kind.usable(model, element_id(model, kind.element, name), name)
+        except ConfigurationError as err:
+            reason = str(err)
+        else:
+            kept.append(name)
+    if not kept:
+        raise ConfigurationError(f"{pattern!r} matches nothing that can have {kind.name}: {reason}")
+    return kept
+
+
+def _parameter(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], model: Any) -> Parameter:
+    name = _text(entry, "name") if "name" in entry else f"{elements[0]}.{kind.quantity}"
+    scale = _SCALES[_choice(entry, "scale", tuple(_SCALES), kind.scale)]
+    known, value = _known(entry, name)
+    nominal = _nominal(entry, kind, elements, model, name) if value is None else value
+    low, high = _range(entry, kind, scale, nominal, name, known=known)
+    mean, std = _prior(entry, name)
+    units = {kind.unit_of(model, element_id(model, kind.element, e)) for e in elements}
+    if len(units) > 1:
+        raise ConfigurationError(f"parameter {name!r} groups hinges with slides: their units differ, {units}")
+    return Parameter(
+        name=name, kind=kind.name, elements=elements, unit=units.pop(), nominal=nominal, low=low, high=high,
+        scale=scale, known=known, prior_mean=mean, prior_std=std,
+    )  # fmt: skip
+
+
+def _nominal(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], model: Any, name: str) -> float:
+    if "nominal" in entry:
+        return _number(entry["nominal"], f"nominal of {name!r}")
+    if kind.baseline is None:
+        raise ConfigurationError(f"parameter {name!r}: an MJCF has no {kind.name}; give `nominal`")
+    values = [kind.baseline(model, element_id(model, kind.element, e)) for e in elements]
+    if not all(math.isclose(v, values[0], rel_tol=1e-6, abs_tol=1e-12) for v in values):
+        pairs = ", ".join(f"{e} {v:g}" for e, v in zip(elements, values, strict=True))
+        raise ConfigurationError(
+            f"parameter {name!r} sets elements together that differ in the model ({pairs}); give `nominal`"
+        )
+    return values[0]
+
+
+def _range(
+    entry: Mapping[str, Any], kind: Kind, scale: Scale, nominal: float, name: str, *, known: bool
+) -> tuple[float, float]:
+    if "range" in entry and "ratio" in entry:
+        raise ConfigurationError(f"parameter {name!r}: give `range` or `ratio`, not both")
+    if "range" in entry:
+        ends = entry["range"]
+        if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
+            raise ConfigurationError(f"parameter {name!r}: `range` must be [low, high], got {ends!r}")
+        low, high = (_number(end, f"range of {name!r}") for end in ends)
+        if low >= high:
+            hint = "they are reversed" if low > high else "for a fixed value use `known`"
+            raise ConfigurationError(
+                f"parameter {name!r}: range [{low:g}, {high:g}] must have low < high; {hint}"
+            )
+        return low, high
+    if "ratio" not in entry and scale == "linear":
+        width = kind.spread or abs(nominal) or 1.0
+        return max(nominal - width, kind.least), min(nominal + width, kind.most)
+    ratio = _number(entry.get("ratio", RATIO), f"ratio of {name!r}")
+    if not ratio > 1:
+        raise ConfigurationError(f"parameter {name!r}: `ratio` must be above 1, got {ratio:g}")
+    if nominal <= 0:
+        if known:
+            # Not searched: any range that holds the value will do.
+            return nominal - 1.0, nominal + 1.0
+        raise ConfigurationError(
+            f"parameter {name!r}: its value in the model is {nominal:g}, and a ratio of that is no range; "
+            "give `nominal` above 0 or `range`"
+        )
+    return max(nominal / ratio, kind.least), min(nominal * ratio, kind.most)
+
+
+def _known(entry: Mapping[str, Any], name: str) -> tuple[bool, float | None]:
+    """Return whether the value is known, and the value if the file gives one."""
+    if "known" in entry and "weighed" in entry:
+        raise ConfigurationError(f"parameter {name!r}: give `known` or `weighed`, not both")
+    value = entry.get("known", entry.get("weighed", False))
+    if isinstance(value, bool):
+        return value, None
+    if "nominal" in entry:
+        raise ConfigurationError(f"parameter {name!r}: `known` holds a value already; leave out `nominal`")
+    return True, _number(value, f"known value of {name!r}")
+
+
+def _prior(entry: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
+    if "prior" not in entry:
+        return None, None
+    prior = entry["prior"]
+    if not isinstance(prior, Mapping) or set(prior) != {"mean", "std"}:
+        raise ConfigurationError(f"parameter {name!r}: `prior` must have `mean` and `std`, got {prior!r}")
+    return _number(prior["mean"], f"prior of {name!r}"), _number(prior["std"], f"prior of {name!r}")
+
+
+def _number(value: Any, what: str) -> float:
+    # YAML 1.1 reads 1e-3 as text: without a point or a sign it is no number there.
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            pass
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigurationError(f"the {what} must be a number, got {value!r}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ConfigurationError(f"the {what} must be finite, got {value!r}")
+    return number
+
+
+def _text(entry: Mapping[str, Any], key: str) -> str:
+    value = entry.get(key)
+    if not isinstance(value, str) or not value:
+        raise ConfigurationError(f"`{key}` must be a text, got {value!r}")
+    return value
+
+
+def _choice(entry: Mapping[str, Any], key: str, allowed: Sequence[str], default: str) -> str:
+    value = entry.get(key, default)
+    if value not in allowed:
+        raise _unknown(key, str(value), allowed)
+    return str(value)
+
+
+def _unknown(what: str, given: str, allowed: Iterable[str]) -> UnknownNameError:
+    error = UnknownNameError(what, given, allowed)
+    near = difflib.get_close_matches(given, error.allowed, n=1)
+    if near:
+        error.args = (f"{error}; did you mean {near[0]!r}?",)
+    return error

@@ -1,0 +1,230 @@
+"""Sim-to-sim targets: a robot whose parameters are hidden, recorded as a sensor would see it.
+
+The stand-in for a real robot in benches of robots that have no emulator on a wire: it gives an
+:class:`~deal_hw.sim.episode.Episode` on the device's grid, as aligning a recording would, and the truth beside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import savgol_coeffs
+
+from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim import chart
+from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.episode import Episode
+from deal_hw.sim.leg_odometry import HEIGHT_STD, VELOCITY_STD, leg_odometry, smooth_orientation
+from deal_hw.sim.model import RobotModel
+from deal_hw.types import FloatArray
+
+Behaviour = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""Command of the next control period, (A,), from reported position (C,), velocity (C,) and time [s]."""
+
+ORIENTATION_SMOOTHER = (7, 3)
+"""Samples and order of the polynomial through reported orientations."""
+
+PLACE_STD = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensing:
+    """How a target is observed.
+
+    Attributes:
+        joint_std: Noise of joint positions, (J,) [m or rad]; None: the whole state is reported exactly.
+        joint_resolution: Quantisation of joint positions, (J,).
+        orientation_std: Noise of the IMU's orientation [rad].
+        gyro_std: Noise of the IMU's angular velocity [rad/s].
+        feet: Sphere geoms of the feet, from which base velocity and height are estimated.
+    """
+
+    joint_std: tuple[float, ...] | None = None
+    joint_resolution: tuple[float, ...] = ()
+    orientation_std: float = 0.0
+    gyro_std: float = 0.0
+    feet: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TargetRecording:
+    """A recording of a target, and what really happened.
+
+    Attributes:
+        episode: What the sensors saw.
+        position: True positions at the samples, in the episode's charts, (T, C).
+        velocity: True velocities at the samples, (T, C).
+    """
+
+    episode: Episode
+    position: FloatArray
+    velocity: FloatArray
+
+
+def record_target(
+    robot: RobotModel,
+    space: ParameterSpace,
+    theta: FloatArray,
+    behaviour: Behaviour,
+    *,
+    seconds: float,
+    latency_s: float = 0.0,
+    sensing: Sensing | None = None,
+    rng: np.random.Generator,
+    start: FloatArray | None = None,
+    settle_s: float = 1.0,
+) -> TargetRecording:
+    """Run a behaviour on a target and record it.
+
+    Args:
+        robot: The nominal model.
+        space: The hidden parameters.
+        theta: Their true values, (K,).
+        behaviour: What is asked of it.
+        seconds: Length of the recording [s].
+        latency_s: Total latency, a whole number of physics steps [s].
+        sensing: How it is observed; exactly and wholly by default.
+        rng: Draws the noise.
+        start: Joint positions to start at, (J,); the default pose by default. The base starts where the model
+            has it.
+        settle_s: How long the start pose is held before the recording begins [s].
+
+    Raises:
+        CalibrationError: The target diverged.
+    """
+    description, step_s = robot.description, robot.step_s
+    period = round(1.0 / (description.control_rate_hz * step_s))
+    stride = round(1.0 / (description.state_rate_hz * step_s))
+    if period % stride:
+        raise ConfigurationError(
+            f"{description.name}: states every {stride} steps do not divide control periods of {period}"
+        )
+    late = round(latency_s / step_s)
+    batch = ServoBatch(robot, space, 1, threads=1)
+    batch.set_parameters(np.asarray(theta, dtype=float)[None])
+    rest = _settle(robot, batch, start, settle_s)
+    ticks = math.ceil(seconds * description.control_rate_hz)
+    sensor = _Sensor(robot, sensing or Sensing(), rng)
+    samples = [batch.position[0]], [batch.velocity[0]]
+    path = np.repeat(rest[None], late, axis=0)
+    targets = np.empty((ticks, len(rest)))
+    for tick in range(ticks):
+        seen = sensor.joints(samples[0][-1])
+        targets[tick] = behaviour(seen, samples[1][-1], tick / description.control_rate_hz)
+        path = np.concatenate([path, np.repeat(targets[tick : tick + 1], period, axis=0)])
+        position, velocity = batch.advance(path[None, tick * period : (tick + 1) * period], stride)
+        if not np.isfinite(position).all():
+            raise CalibrationError(
+                f"the target {description.name} diverged after {tick / description.control_rate_hz:.2f} s"
+            )
+        samples[0].extend(position[0])
+        samples[1].extend(velocity[0])
+    true_x, true_v = np.array(samples[0]), np.array(samples[1])
+    return sensor.report(true_x, true_v, np.repeat(targets, period, axis=0), rest, stride)
+
+
+def _settle(robot: RobotModel, batch: ServoBatch, start: FloatArray | None, seconds: float) -> FloatArray:
+    """Bring the target to rest in its start pose; return the command that holds it, (A,)."""
+    description = robot.description
+    joints = np.array(description.default_position if start is None else start, dtype=float)
+    position = np.concatenate([batch.position[0][: robot.joints.start], joints])
+    batch.set_state(position, np.zeros_like(position))
+    servo = description.actuation == "position"
+    rest = joints[list(description.actuated_index)] if servo else np.zeros(len(description.actuated))
+    if seconds > 0:
+        batch.advance(np.repeat(rest[None, None], round(seconds / robot.step_s), axis=1))
+    return rest
+
+
+class _Sensor:
+    def __init__(self, robot: RobotModel, sensing: Sensing, rng: np.random.Generator) -> None:
+        self._robot, self._sensing, self._rng = robot, sensing, rng
+
+    def joints(self, position: FloatArray) -> FloatArray:
+        """Return a state as its joints are reported, (C,)."""
+        if self._sensing.joint_std is None:
+            return position
+        seen = position.copy()
+        seen[..., self._robot.joints] = self._noisy(position[..., self._robot.joints])
+        return seen
+
+    def _noisy(self, joints: FloatArray) -> FloatArray:
+        noisy = joints + self._rng.standard_normal(joints.shape) * self._sensing.joint_std
+        if self._sensing.joint_resolution:
+            noisy = np.round(noisy / self._sensing.joint_resolution) * self._sensing.joint_resolution
+        return np.asarray(noisy)
+
+    def report(
+        self, true_x: FloatArray, true_v: FloatArray, target: FloatArray, rest: FloatArray, stride: int
+    ) -> TargetRecording:
+        """Return the recording of a true trajectory, (T, C), in the identity's chart."""
+        robot, T = self._robot, len(true_x)
+        C = true_x.shape[1]
+        orientation = None
+        position, velocity = self.joints(true_x), true_v.copy()
+        measured = estimate = reference = None
+        if robot.base is not None:
+            orientation = chart.to_quaternion(true_x[:, robot.rotation], chart.IDENTITY)
+        if self._sensing.joint_std is not None:
+            velocity[:, robot.joints] = np.nan
+            measured = np.zeros(2 * C, dtype=bool)
+            measured[:C][robot.joints] = True
+            measured[:C][robot.rotation] = measured[C:][robot.rotation] = True
+        if orientation is not None and measured is not None:
+            position, velocity, reference, estimate = self._base(position, velocity, orientation, stride)
+        elif orientation is not None:
+            reference = orientation
+            position = true_x.copy()
+            position[:, robot.rotation] = 0.0
+        truth = true_x.copy()
+        if orientation is not None and reference is not None:
+            truth[:, robot.rotation] = chart.to_vector(orientation, reference)
+        as_rows = np.ones((len(target), 1))
+        description = robot.description
+        episode = Episode(
+            step_s=robot.step_s,
+            sample=np.arange(T) * stride,
+            position=position,
+            velocity=velocity,
+            target=target,
+            stiffness=as_rows * description.stiffness,
+            damping=as_rows * description.damping,
+            effort_limit=as_rows * description.effort_limit,
+            speed_limit=as_rows * description.speed_limit,
+            usable=np.ones(T, dtype=bool),
+            start_setpoint=rest,
+            reference=reference,
+            measured=measured,
+            estimate_std=estimate,
+            exact=self._sensing.joint_std is None,
+        )
+        return TargetRecording(episode, truth, true_v)
+
+    def _base(
+        self, position: FloatArray, velocity: FloatArray, orientation: FloatArray, stride: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return position, velocity, reference and spread with the base as an IMU and the legs give it."""
+        robot, sensing, rng = self._robot, self._sensing, self._rng
+        T, C = position.shape
+        reported = chart.to_quaternion(rng.standard_normal((T, 3)) * sensing.orientation_std, orientation)
+        gyro = velocity[:, robot.rotation] + rng.standard_normal((T, 3)) * sensing.gyro_std
+        length, order = ORIENTATION_SMOOTHER
+        reference = smooth_orientation(reported, savgol_coeffs(length, order, use="dot"))
+        period_s = stride * robot.step_s
+        joints = position[:, robot.joints]
+        speed = np.gradient(joints, period_s, axis=0)
+        for j in range(joints.shape[1]):
+            slope = savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
+            speed[length // 2 : T - length // 2, j] = np.convolve(joints[:, j], slope[::-1], mode="valid")
+        legs = leg_odometry(robot, sensing.feet, reference, gyro, joints, speed)
+        position, velocity = position.copy(), velocity.copy()
+        position[:, :2], position[:, 2] = 0.0, legs.height
+        position[:, robot.rotation] = chart.to_vector(reported, reference)
+        velocity[:, :3], velocity[:, robot.rotation] = legs.velocity, gyro
+        spread = np.full(2 * C, np.inf)
+        spread[:2], spread[2], spread[C : C + 3] = PLACE_STD, HEIGHT_STD, VELOCITY_STD
+        return position, velocity, reference, spread

@@ -1,0 +1,1 @@
+"""The ant of gymnasium: facts and its model, prepared from the installed package."""

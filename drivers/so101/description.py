@@ -1,0 +1,132 @@
+"""Facts about the SO-101 arm: six Feetech STS3215 servos in position mode, proportional control only.
+
+Joint names are those of mujoco_menagerie and LeRobot; :data:`RECORDED_NAMES` gives those of the public
+recordings (isaac-sim2real/sage).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Final
+
+from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
+from deal_hw.parameters import Parameter, ParameterSpace
+
+JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+RANGE_RAD: Final = (
+    (-1.91986, 1.91986),
+    (-1.7453293, 1.7453293),
+    (-1.69, 1.69),
+    (-1.658063, 1.658063),
+    (-2.7438473, 2.7438473),
+    (-0.174533, 1.7453292),
+)
+RECORDED_NAMES: Final = {
+    "Rotation": "shoulder_pan",
+    "Pitch": "shoulder_lift",
+    "Elbow": "elbow_flex",
+    "Wrist_Pitch": "wrist_flex",
+    "Wrist_Roll": "wrist_roll",
+    "Jaw": "gripper",
+}
+TICK_RAD: Final = 2 * math.pi / 4096
+JAW_TRAVEL_RAD: Final = 1524 * TICK_RAD
+"""Travel of the jaw that the public recordings write as 0 to 1: 1524 encoder ticks."""
+
+STIFFNESS_NM_RAD: Final = 11.0
+JOINT_DAMPING_NMS_RAD: Final = 0.6
+FRICTIONLOSS_NM: Final = 0.052
+ARMATURE_KGM2: Final = 0.028
+EFFORT_LIMIT_NM: Final = 2.94
+ENCODER_BIAS_RAD: Final = 0.15
+
+DESCRIPTION: Final = RobotDescription(
+    name="so101",
+    joint_names=JOINTS,
+    actuated=JOINTS,
+    position_units=("rad",) * 6,
+    default_position=(0.0,) * 6,
+    stiffness=(STIFFNESS_NM_RAD,) * 6,
+    damping=(0.0,) * 6,
+    effort_limit=(EFFORT_LIMIT_NM,) * 6,
+    speed_limit=(math.inf,) * 6,
+    control_rate_hz=50.0,
+    device_rate_hz=500.0,
+    state_rate_hz=50.0,
+    limits=SafetyLimits(
+        target=tuple((low + 0.05, high - 0.05) for low, high in RANGE_RAD),
+        target_step=(0.3,) * 6,
+        target_distance=(0.6,) * 6,
+        trip_position=tuple((low - 0.1, high + 0.1) for low, high in RANGE_RAD),
+        trip_velocity=(8.0,) * 6,
+        stiffness=(1000.0,) * 6,
+        damping=(10.0,) * 6,
+        effort=(EFFORT_LIMIT_NM,) * 6,
+        speed=(math.inf,) * 6,
+        state_age_s=0.1,
+        action_age_s=0.04,
+        ease_in_s=1.0,
+    ),
+    sensor=SensorModel(noise=(0.5e-3,) * 6, resolution=(TICK_RAD,) * 6, velocity_window_s=0.04),
+    mjcf=Path(__file__).parent / "assets" / "so101.xml",
+    sources={
+        "joint_names": "mujoco_menagerie robotstudio_so101/so101.xml @ 191a7ba; LeRobot uses the same",
+        "default_position": "middle of each calibrated travel",
+        "stiffness": "static droop of a real arm at P = 16; the published 998 N·m/rad is 90 times as much",
+        "damping": "the servo takes no D gain; its back-EMF is joint damping in the model",
+        "effort_limit": "forcerange of the same so101.xml: the servo's stall torque",
+        "speed_limit": "the servo follows the set-point as it comes",
+        "control_rate_hz": "nearest whole rate to the public recordings' 49.8 Hz",
+        "device_rate_hz": "assumed; the servo's loop rate is not published",
+        "state_rate_hz": "nearest whole rate to the public recordings' 49.8 Hz",
+        "limits": "joint ranges of the same so101.xml",
+        "sensor": "12-bit encoder, a tick is 1.5 mrad; speeds are differenced: the servo's own are coarse",
+        "mjcf": "own model of lines; kinematics and inertials from the same so101.xml",
+    },
+)
+
+
+def _rows() -> list[Parameter]:
+    rows = (
+        ("stiffness", "servo_stiffness", "N·m/rad", STIFFNESS_NM_RAD),
+        ("damping", "dof_damping", "N·m·s/rad", JOINT_DAMPING_NMS_RAD),
+        ("frictionloss", "dof_frictionloss", "N·m", FRICTIONLOSS_NM),
+        ("armature", "dof_armature", "kg·m²", ARMATURE_KGM2),
+    )
+    return [
+        Parameter.around(f"{joint}.{name}", kind, (joint,), unit, value)
+        for name, kind, unit, value in rows
+        for joint in JOINTS
+    ]
+
+
+def parameter_space() -> ParameterSpace:
+    """Return 30 parameters: servo stiffness, damping, frictionloss, armature and encoder bias of each joint.
+
+    Frictionloss, damping and armature are the published model's, which call themselves guesses. At
+    shoulder_pan and wrist_roll no gravity acts, so that these and the stiffness scale almost together there:
+    only their ratios are known, but for the small share of the links' own inertia. The bias is that of the
+    calibrated zero (middle of the travel) against the model's.
+    """
+    return ParameterSpace(
+        [
+            *_rows(),
+            *(
+                Parameter(
+                    name=f"{joint}.encoder_bias", kind="encoder_bias", elements=(joint,), unit="rad",
+                    nominal=0.0, low=-ENCODER_BIAS_RAD, high=ENCODER_BIAS_RAD, scale="linear",
+                )
+                for joint in JOINTS
+            ),
+        ]
+    )  # fmt: skip
+
+
+def unbiased_space() -> ParameterSpace:
+    """Return the 24 parameters without the encoder biases."""
+    return ParameterSpace(_rows())
+
+
+SPACES: Final = {"default": parameter_space, "unbiased": unbiased_space}
+"""Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

@@ -1,0 +1,278 @@
+"""The report: one file that needs nothing, escapes everything, and says what the result says."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deal_hw.calib.folder import read_result, write_result
+from deal_hw.calib.report.charts import autocorrelation
+from deal_hw.calib.report.figure import envelope
+from deal_hw.calib.report.gather import gather
+from deal_hw.calib.report.inputs import HalvesRow, Overlay, ReportInputs, Residuals
+from deal_hw.calib.report.page import parameter_rows, render, verdict, write_report
+from deal_hw.calibration import CalibrationResult
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.sim.episode import align
+from deal_hw.sim.model import load_model
+from deal_hw.testing.simulated_episode import simulated_episode
+
+HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"
+
+
+def space(count: int = 2, name: str = "p") -> ParameterSpace:
+    """Return parameters on a log range from 1 to 100."""
+    return ParameterSpace(
+        Parameter(name=f"{name}{k}", kind="k", elements=("e",), unit="kg", nominal=10, low=1, high=100)
+        for k in range(count)
+    )
+
+
+def result(searched: ParameterSpace, **changes: Any) -> CalibrationResult:
+    """Return a result at the centre of its range."""
+    K = len(searched)
+    values = {
+        "method": "weki",
+        "estimate": np.full(K, 10.0),
+        "interval": np.tile([5.0, 20.0], (K, 1)),
+        "covariance": np.eye(K) * 0.01,
+        "population": np.full((5, K), 12.0),
+        "verdicts": ("identifiable",) * K,
+        "latency_s": 0.012,
+        "latency_interval_s": (0.011, 0.013),
+        "chi2": 1.05,
+        "heldout_nrmse": {"nominal": 0.1, "calibrated": 0.02, "null": 0.3},
+        "trace": tuple({"generation": float(i), "misfit": 10.0 / (i + 1)} for i in range(6)),
+        "steps": 1000,
+        "seconds": 1.5,
+        "provenance": {"latency_scan": {"ticks": [11, 12, 13], "chi2": [2.0, 1.05, 1.9]}, "seed": 3},
+    }
+    return CalibrationResult(space=searched, **{**values, **changes})
+
+
+def inputs(found: CalibrationResult, channels: int = 2, samples: int = 200, name: str = "q") -> ReportInputs:
+    """Return what a report shows, with series of noise."""
+    rng = np.random.default_rng(0)
+    names = tuple(f"{name}{m}" for m in range(channels))
+    real = rng.normal(size=(samples, channels))
+    overlays = tuple(
+        Overlay(
+            title=f"{name} {heldout}", heldout=heldout, names=names, units=("rad",) * channels,
+            time_s=np.arange(samples) * 0.01, real=real, nominal=real + 1, calibrated=real, window_s=0.2,
+        )
+        for heldout in (False, True)
+    )  # fmt: skip
+    whitened = rng.normal(size=(samples // 20, 20, channels))
+    time = np.arange(samples).reshape(-1, 20) * 0.01
+    residuals = (Residuals(title=name, names=names, time_s=time, whitened=whitened),)
+    return ReportInputs(robot=name, result=found, overlays=overlays, residuals=residuals, tick_s=1e-3)
+
+
+class Tags(HTMLParser):
+    """Collects the tags and attributes of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note one tag."""
+        self.tags.append(tag)
+        self.attributes.extend((k, v or "") for k, v in attrs)
+
+    def handle_data(self, data: str) -> None:
+        """Note what is read."""
+        self.words.append(data)
+
+
+def test_page_loads_nothing_from_elsewhere() -> None:
+    """No address, script, image or style sheet: references stay inside the page, and a policy forbids others."""
+    text = render(inputs(result(space())))
+    page = Tags(text)
+    assert "http:" not in text and "https:" not in text and "@import" not in text
+    assert not {"script", "img", "link", "iframe", "object"} & set(page.tags)
+    references = [v for k, v in page.attributes if k in ("href", "xlink:href", "src")]
+    assert references and all(v.startswith("#") for v in references)
+    assert "default-src 'none'" in text
+    identities = [v for k, v in page.attributes if k == "id"]
+    assert {v.removeprefix("#") for v in references} <= set(identities)
+
+
+def test_names_of_the_user_are_escaped_everywhere() -> None:
+    """A hostile parameter, channel, robot, alarm and path is shown as written, and is no markup."""
+    searched = space(3, HOSTILE)
+    found = result(
+        searched,
+        method=HOSTILE,
+        alarms=(HOSTILE,),
+        null_directions=(HOSTILE,),
+        trace=({HOSTILE: 1.0}, {HOSTILE: 2.0}),
+        provenance={"dataset": HOSTILE, HOSTILE: {HOSTILE: HOSTILE}, "settings": {HOSTILE: HOSTILE}},
+    )
+    given_ = dataclasses.replace(
+        inputs(found, name=HOSTILE),
+        telemetry=(HOSTILE,),
+        left_out=(HOSTILE,),
+        halves=(HalvesRow(name=HOSTILE, first=(1, 0, 2), second=(3, 2.5, 4)),),
+    )
+    page = Tags(render(given_))
+    assert "script" not in page.tags
+    assert sum(HOSTILE in words for words in page.words) >= 12
+    assert page.tags.count("svg") == 7
+
+
+def test_alarms_come_first() -> None:
+    """The first thing under the title is that the result is not to be trusted, and why."""
+    text = render(inputs(result(space(), alarms=("the rail is bent",))))
+    assert text.index("Not to be trusted") < text.index("the rail is bent") < text.index('id="parameters"')
+
+
+@pytest.mark.parametrize(
+    ("changes", "style", "words"),
+    [
+        ({}, "good", "explains the recording"),
+        ({"chi2": 4.0}, "bad", "residuals are 2 times the noise"),
+        ({"chi2": float("nan")}, "open", "no residual test"),
+        ({"null_directions": ("a and b",)}, "open", "does not tell all parameters"),
+        ({"alarms": ("x",)}, "bad", "Not to be trusted"),
+    ],
+)
+def test_verdict_says_in_words_how_it_went(changes: dict[str, Any], style: str, words: str) -> None:
+    """Explained or not, with the factor over the noise: chi2 4 is twice the noise."""
+    found = verdict(result(space(), **changes))
+    assert found[0] == style and words in found[1]
+
+
+def test_bars_lie_where_the_search_scale_puts_them() -> None:
+    """On a log range from 1 to 100: 10 is the middle; 5 to 20 begins at ln 5 / ln 100 = 34.9 %, 30.1 % wide."""
+    row = parameter_rows(result(space(1)))[0]
+    assert row.estimate_at == pytest.approx(50) and row.nominal_at == pytest.approx(50)
+    assert row.bar_left == pytest.approx(34.95, abs=0.01) and row.bar_width == pytest.approx(30.10, abs=0.01)
+    assert row.at_bound == ""
+
+
+def test_parameter_at_the_end_of_its_range_is_marked() -> None:
+    """An estimate of 100 in a range up to 100 ended at its upper bound."""
+    found = result(space(1), estimate=np.array([100.0]))
+    assert parameter_rows(found)[0].at_bound == "upper"
+    assert "ended at its upper bound" in render(inputs(found))
+
+
+def test_a_bare_result_makes_a_page_too() -> None:
+    """A method without covariance, population, verdicts, scan or recordings leaves gaps in words, not errors."""
+    found = result(
+        space(), covariance=None, population=None, verdicts=(), trace=(), provenance={}, heldout_nrmse={},
+        chi2=float("nan"),
+    )  # fmt: skip
+    text = render(ReportInputs(robot="r", result=found))
+    assert (
+        "No recording was given" in text
+        and "The method gives none" in text
+        and "nothing says whether" in text
+    )
+
+
+def test_large_robot_stays_below_the_limit(tmp_path: Path) -> None:
+    """24 parameters, 36 channels and 8000 samples in two recordings stay below 3 MB."""
+    found = result(space(24))
+    write_report(tmp_path, inputs(found, channels=36, samples=8000))
+    size = (tmp_path / "report.html").stat().st_size
+    assert 100_000 < size < 3_000_000
+    assert "The first 24 of 36 channels" in (tmp_path / "report.html").read_text()
+
+
+@given(
+    st.lists(st.one_of(st.floats(-1e3, 1e3), st.just(float("nan"))), min_size=1, max_size=300),
+    st.integers(2, 20),
+)
+def test_thinning_keeps_extremes_and_gaps(values: list[float], buckets: int) -> None:
+    """Whatever the series: at most three points a bucket, in order, with the lowest and the highest."""
+    y = np.array(values)
+    time, thin = envelope(np.arange(len(y), dtype=float), y, buckets)
+    assert len(thin) <= max(3 * buckets, 2 * buckets) and np.all(np.diff(time) > 0)
+    assert bool(np.isnan(thin).any()) == bool(np.isnan(y).any())
+    if np.isfinite(y).any():
+        assert np.nanmin(thin) == np.nanmin(y) and np.nanmax(thin) == np.nanmax(y)
+
+
+def test_autocorrelation_of_an_alternating_series() -> None:
+    """+1, -1, +1, ... has -1 at odd lags and +1 at even ones; 2 windows of 10 give a band of 2 / sqrt(20)."""
+    rho, band = autocorrelation(np.tile([1.0, -1.0], (2, 5)))
+    assert rho[:4].tolist() == [-1, 1, -1, 1] and band == pytest.approx(0.4472, abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def gathered() -> ReportInputs:
+    """Simulate a cart-pole with 7 ms latency and sensor noise, and gather at the true parameters."""
+    robot, searched = load_model(DESCRIPTION), k9_space().with_ratio(3.0)
+    truth = searched.unnormalize(np.linspace(0.3, 0.7, len(searched)))
+    episodes = [
+        align(
+            simulated_episode(
+                DESCRIPTION, searched, truth, seconds=2.5, latency_ticks=7, sensor=True, seed=seed
+            ),
+            DESCRIPTION,
+        )
+        for seed in (1, 2)
+    ]
+    K = len(searched)
+    found = CalibrationResult(
+        method="truth", space=searched, estimate=truth, interval=np.stack([truth, truth], axis=1),
+        covariance=np.eye(K) * 1e-4, latency_s=0.007, latency_interval_s=(0.007, 0.007),
+    )  # fmt: skip
+    return gather(robot, found, episodes[:1], episodes[1:], telemetry=["fine"], threads=1)
+
+
+def test_gathered_series_show_what_the_models_predict(gathered: ReportInputs) -> None:
+    """The true parameters predict both recordings better than the nominal ones, in every channel."""
+    assert [shown.heldout for shown in gathered.overlays] == [False, True]
+    for shown in gathered.overlays:
+        assert shown.names == ("cart", "pole") and shown.units == ("m", "rad")
+        assert shown.real.shape == shown.nominal.shape == shown.calibrated.shape == (len(shown.time_s), 2)
+        error = [
+            np.sqrt(np.nanmean((m - shown.real) ** 2, axis=0)) for m in (shown.nominal, shown.calibrated)
+        ]
+        assert np.all(error[1] < error[0])
+
+
+def test_gathered_residuals_of_the_truth_are_white(gathered: ReportInputs) -> None:
+    """At the truth whitened residuals have unit variance within 20 % and no correlation above 0.25."""
+    (shown,) = gathered.residuals
+    assert 0.8 < np.nanstd(shown.whitened) < 1.2
+    for m in range(2):
+        assert np.max(np.abs(autocorrelation(shown.whitened[..., m])[0])) < 0.25
+
+
+def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tmp_path: Path) -> None:
+    """Everything is written and read back; without inputs there is no report."""
+    robot = load_model(DESCRIPTION)
+    files = write_result(tmp_path / "a", robot, gathered.result, gathered)
+    assert set(files) == {"result.json", "distribution.json", "trace.npz", "report.html", "calibrated.xml"}
+    assert all(file.is_file() for file in files.values())
+    digest = gathered.result.distribution().digest()
+    assert f"method truth, distribution {digest}" in files["calibrated.xml"].read_text()
+    assert read_result(tmp_path / "a").method == "truth"
+    assert "report.html" not in write_result(tmp_path / "b", robot, gathered.result)
+
+
+def test_numbers_survive_a_model_that_cannot_be_written(gathered: ReportInputs, tmp_path: Path) -> None:
+    """The model is written last: its error leaves result.json in place."""
+    own = tmp_path / "calibrated.xml"
+    shutil.copy(DESCRIPTION.mjcf, own)
+    robot = load_model(dataclasses.replace(DESCRIPTION, mjcf=own))
+    with pytest.raises(ConfigurationError, match="the model itself"):
+        write_result(tmp_path, robot, gathered.result)
+    assert read_result(tmp_path).estimate.tolist() == gathered.result.estimate.tolist()

@@ -1,0 +1,124 @@
+"""The verb `calibrate` stopped by Ctrl-C, resumed, and watched."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deal_hw.calibration import Progress, ProgressCallback
+from deal_hw.cli import calibrate as verb
+from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
+from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.control.excitation import RichBehaviour, RichConfig
+from deal_hw.data.dataset import Dataset
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.truth import nominal_truth
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of random set-points."""
+    folder = tmp_path_factory.mktemp("run") / "dataset"
+    behaviour = RichBehaviour(DESCRIPTION, None, RichConfig(duration_s=2.2, balance_s=0.0), 1)
+    with Dataset.create_or_open(folder, DESCRIPTION) as store:
+        path = store.next_episode_path()
+        VirtualCartpole(nominal_truth("sensor", 4, actuation_ticks=9)).run(
+            behaviour, 2.2, path, {"profile": "rich", "purpose": "collect", "robot": "cartpole"}
+        )
+        store.note_episode(path)
+    return folder
+
+
+def command(dataset: Path, out: Path, *more: str) -> list[str]:
+    """Return the arguments of a short calibration of two parameters."""
+    words = ["calibrate", str(dataset), "--out", str(out), "--free", "cart.mass", "servo.stiffness"]
+    words += ["--latency", "0.009", "--population", "12", "--generations", "8", "--quiet"]
+    return [*words, *more]
+
+
+def stop_after(monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
+    """Let a Ctrl-C come in while the progress is reported for the n-th time."""
+
+    @contextlib.contextmanager
+    def watching(*_: Any) -> Iterator[ProgressCallback]:
+        left = calls
+
+        def progress(_: Progress) -> None:
+            nonlocal left
+            left -= 1
+            if left == 0:
+                raise KeyboardInterrupt
+
+        yield progress
+
+    monkeypatch.setattr(verb, "watching", watching)
+
+
+def test_stopped_calibration_says_how_to_go_on_and_does(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit status 130 and the way to resume; then the numbers of a run that was never stopped."""
+    assert main(command(dataset, tmp_path / "whole")) == EXIT_OK
+    checkpoint = tmp_path / "parts" / "calibration" / "checkpoint.npz"
+    with pytest.MonkeyPatch.context() as patch:
+        stop_after(patch, 4)
+        assert main(command(dataset, tmp_path / "parts")) == EXIT_INTERRUPTED
+    told = capsys.readouterr().err
+    assert str(checkpoint) in told and "--resume" in told
+    assert checkpoint.exists()
+    assert main(command(dataset, tmp_path / "parts", "--resume")) == EXIT_OK
+    assert not checkpoint.exists()
+    whole, parts = (
+        json.loads((tmp_path / name / "calibration" / "result.json").read_text())
+        for name in ("whole", "parts")
+    )
+    for part in (whole, parts):
+        del part["seconds"], part["provenance"]["search_seconds"]
+    assert parts == whole
+
+
+def test_stopped_before_the_first_generation_keeps_nothing(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then there is nothing to resume, and both the stop and the attempt say so."""
+    stop_after(monkeypatch, 1)
+    assert main(command(dataset, tmp_path)) == EXIT_INTERRUPTED
+    assert "nothing is kept" in capsys.readouterr().err
+    assert main(command(dataset, tmp_path, "--resume")) == EXIT_ERROR
+    assert "nothing to resume" in capsys.readouterr().err
+
+
+def test_other_settings_are_not_resumed(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another seed is another run: its checkpoint is refused and kept; without --resume it is replaced."""
+    checkpoint = tmp_path / "calibration" / "checkpoint.npz"
+    with pytest.MonkeyPatch.context() as patch:
+        stop_after(patch, 3)
+        assert main(command(dataset, tmp_path)) == EXIT_INTERRUPTED
+    before = checkpoint.read_bytes()
+    assert main(command(dataset, tmp_path, "--resume", "--seed", "1")) == EXIT_ERROR
+    assert "cannot be resumed" in capsys.readouterr().err
+    assert checkpoint.read_bytes() == before
+    assert main(command(dataset, tmp_path, "--seed", "1")) == EXIT_OK
+    assert not checkpoint.exists()
+
+
+def test_view_of_the_search_is_written(dataset: Path, tmp_path: Path) -> None:
+    """`--watch-save` writes a recording of population, trace and motion, and changes no number."""
+    pytest.importorskip("rerun")
+    view = tmp_path / "view" / "search.rrd"
+    assert main(command(dataset, tmp_path / "watched", "--watch-save", str(view))) == EXIT_OK
+    assert main(command(dataset, tmp_path / "plain")) == EXIT_OK
+    data = view.read_bytes()
+    assert data[:3] == b"RRF"
+    watched, plain = (
+        json.loads((tmp_path / name / "calibration" / "result.json").read_text())["parameters"]
+        for name in ("watched", "plain")
+    )
+    assert watched == plain

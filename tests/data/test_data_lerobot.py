@@ -1,0 +1,185 @@
+"""LeRobot datasets, out and in again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deal_hw.data.export_lerobot import export_lerobot
+from deal_hw.data.importing.grid import period_of, to_trajectories
+from deal_hw.data.importing.lerobot_source import read_lerobot
+from deal_hw.data.importing.load import load_tables
+from deal_hw.data.importing.table import Table
+from deal_hw.errors import DatasetError
+from deal_hw.types import Trajectory
+
+MakeTable = Callable[..., Table]
+MakeTrajectory = Callable[..., Trajectory]
+
+
+def some_table(samples: int, joints: int, actuated: int, rate_hz: float, seed: int) -> Table:
+    """Return a recording of random numbers that float32 holds exactly."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(samples) / rate_hz
+    names = tuple(f"joint_{i}" for i in range(joints))
+    return Table(
+        joint_names=names, actuated=names[:actuated], units=("rad",) * joints, time_s=time_s,
+        position=rng.integers(-999, 999, (samples, joints)) / 256.0,
+        velocity=rng.integers(-999, 999, (samples, joints)) / 256.0, effort=None, command_s=time_s,
+        target=rng.integers(-999, 999, (samples, actuated)) / 256.0, orientation=None, gyro=None,
+        source={"file": "x", "part": ""},
+    )  # fmt: skip
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    lengths=st.lists(st.integers(3, 60), min_size=1, max_size=4),
+    joints=st.integers(1, 7),
+    data=st.data(),
+    rate_hz=st.sampled_from([20.0, 30.0, 50.0, 49.84996391, 200.0]),
+)
+def test_round_trip(
+    lengths: list[int],
+    joints: int,
+    data: st.DataObject,
+    rate_hz: float,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """Any number of episodes, lengths and joints comes back: values bit by bit, times to a microsecond."""
+    actuated = data.draw(st.integers(1, joints))
+    folder = tmp_path_factory.mktemp("lerobot") / "out"
+    tables = [some_table(length, joints, actuated, rate_hz, seed) for seed, length in enumerate(lengths)]
+    parts = [part.trajectory for table in tables for part in to_trajectories(table)]
+    assert export_lerobot(parts, folder, "test", "move about") == len(lengths)
+    back = load_tables(folder)
+    assert [table.source["part"] for table in back] == [f"episode {i}" for i in range(len(lengths))]
+    for before, after in zip(tables, back, strict=True):
+        assert (after.joint_names, after.actuated) == (before.joint_names, before.actuated)
+        np.testing.assert_array_equal(after.position, before.position)
+        np.testing.assert_array_equal(after.target, before.target)
+        np.testing.assert_array_equal(after.velocity, before.velocity)
+        np.testing.assert_allclose(after.time_s, before.time_s, atol=1e-9)
+        np.testing.assert_allclose(after.command_s, before.command_s, atol=1e-6)
+        assert period_of(after) == pytest.approx(1 / rate_hz, rel=1e-9)
+
+
+def test_layout(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
+    """The files of layout v3.0 with what a reader looks for: versions, paths, ranges, statistics, tasks."""
+    assert (
+        export_lerobot([make_trajectory(), make_trajectory()], tmp_path / "out", "cartpole", "swing up") == 2
+    )
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 200 and isinstance(info["fps"], int)
+    assert info["robot_type"] == "cartpole" and info["splits"] == {"train": "0:2"}
+    # The first command comes into force after the first sample: that one has no action and is no frame.
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (2, 1598, 1)
+    state = info["features"]["observation.state"]
+    assert state == {"dtype": "float32", "shape": [2], "names": ["cart.pos", "pole.pos"]}
+    assert info["features"]["action"]["names"] == ["cart.pos"]
+    assert {"timestamp", "frame_index", "episode_index", "index", "task_index"} < set(info["features"])
+    table = pq.read_table(tmp_path / "out" / info["data_path"].format(chunk_index=0, file_index=0))
+    assert set(table.column_names) == set(info["features"])
+    assert table.schema.field("observation.state").type == pa.list_(pa.float32(), 2)
+    assert table.schema.field("action").type == pa.list_(pa.float32(), 1)
+    assert table.column("index").to_pylist() == list(range(1598))
+    np.testing.assert_allclose(table.column("timestamp").to_pylist()[799:802], [0, 0.005, 0.01], atol=1e-7)
+    file = pq.ParquetFile(tmp_path / "out" / "data/chunk-000/file-000.parquet")
+    assert file.num_row_groups == 2
+    episodes = pq.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [(e["dataset_from_index"], e["dataset_to_index"], e["length"]) for e in episodes] == [
+        (0, 799, 799), (799, 1598, 799),
+    ]  # fmt: skip
+    assert episodes[1]["tasks"] == ["swing up"] and episodes[1]["data/file_index"] == 0
+    stats = json.loads((tmp_path / "out/meta/stats.json").read_text())
+    position = make_trajectory().position[1:].astype(np.float32)
+    np.testing.assert_allclose(stats["observation.state"]["max"], position.max(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(stats["observation.state"]["std"], position.std(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(episodes[0]["stats/action/mean"], stats["action"]["mean"], atol=1e-9)
+    tasks = pq.read_table(tmp_path / "out/meta/tasks.parquet")
+    assert tasks.to_pylist() == [{"task_index": 0, "task": "swing up"}]
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
+
+
+def test_timing_of_slower_commands_survives(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
+    """50 Hz commands, received 1 ms after a sample, come back at that time and not at the next frame."""
+    export_lerobot([make_trajectory()], tmp_path / "out")
+    (table,) = load_tables(tmp_path / "out")
+    sent = np.unique(np.round(table.command_s + 0.005, 6))
+    np.testing.assert_allclose(sent, 0.001 + 0.02 * np.arange(200), atol=2e-6)
+
+
+def test_gap_starts_another_episode(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
+    """LeRobot's frames are evenly spaced, so that a hole cannot be inside an episode."""
+    whole = make_trajectory()
+    keep = np.delete(np.arange(800), [400])
+    names = (
+        "receive_s",
+        "device_s",
+        "position",
+        "velocity",
+        "effort",
+        "status",
+        "command_sequence",
+        "command_age_s",
+    )
+    cut = make_trajectory(**{name: getattr(whole, name)[keep] for name in names})
+    assert export_lerobot([cut], tmp_path / "out") == 2
+    assert [table.time_s.size for table in load_tables(tmp_path / "out")] == [399, 399]
+
+
+def test_refusals(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
+    """A folder that is taken, robots that differ, and folders that are no dataset are refused."""
+    export_lerobot([make_trajectory()], tmp_path / "out")
+    with pytest.raises(DatasetError, match="already"):
+        export_lerobot([make_trajectory()], tmp_path / "out")
+    other = make_trajectory(joint_names=("slider", "pole"))
+    with pytest.raises(DatasetError, match="different joints"):
+        export_lerobot([make_trajectory(), other], tmp_path / "two")
+    with pytest.raises(DatasetError, match="no episodes \\[7\\]"):
+        read_lerobot(tmp_path / "out", episodes=(7,))
+    with pytest.raises(DatasetError, match=r"no meta/info\.json"):
+        read_lerobot(tmp_path / "none")
+    (tmp_path / "out/data/chunk-000/file-000.parquet").write_bytes(b"torn")
+    with pytest.raises(DatasetError, match="cannot be read as data"):
+        read_lerobot(tmp_path / "out")
+
+
+def test_older_layout(tmp_path: Path) -> None:
+    """v2.1: one file an episode, lists of any length type, names nested; extra columns stay away."""
+    names = {"motors": ["pan", "lift"]}
+    features: dict[str, Any] = {
+        "observation.state": {"dtype": "float32", "shape": [2], "names": names},
+        "action": {"dtype": "float32", "shape": [2], "names": names},
+        "observation.images.top": {"dtype": "video", "shape": [3, 4, 4], "names": None},
+        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    }
+    (tmp_path / "meta").mkdir()
+    info = {"codebase_version": "v2.1", "fps": 30, "features": features}
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    folder = tmp_path / "data/chunk-000"
+    folder.mkdir(parents=True)
+    for episode in (0, 1):
+        frame = np.arange(4)
+        columns = {
+            "observation.state": [[float(i), 10.0 * episode] for i in frame],
+            "action": [[float(i) + 0.5, 1.0] for i in frame],
+            "timestamp": pa.array((frame / 30).astype(np.float32)),
+            "frame_index": frame,
+            "episode_index": np.full(4, episode),
+            "task_index": np.zeros(4, dtype=np.int64),
+        }
+        pq.write_table(pa.table(columns), folder / f"episode_{episode:06d}.parquet")
+    first, second = load_tables(tmp_path, joints=("lift", "pan"))
+    assert first.joint_names == ("lift", "pan")
+    assert second.position.tolist() == [[10, 0], [10, 1], [10, 2], [10, 3]]
+    assert second.target[:, 1].tolist() == [0.5, 1.5, 2.5, 3.5]
+    np.testing.assert_allclose(second.time_s, np.arange(4) / 30, atol=1e-12)

@@ -1,0 +1,209 @@
+"""params.yaml: what it may say, what it must not say, and the template."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deal_hw.drivers.go2.description import DESCRIPTION, JOINTS
+from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.sim.parameters.template import template
+from deal_hw.sim.parameters.yaml_space import parse_space, read_space, write_space
+
+MODEL = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
+
+
+def _entry(text: str) -> ParameterSpace:
+    return parse_space(f"parameters:\n  - {{{text}}}\n", MODEL)
+
+
+def test_pattern_each_gives_one_parameter_an_element_with_the_models_value() -> None:
+    """Four hips, nominal 0.6 from the MJCF, a factor 5 to either side: 0.12 to 3."""
+    space = _entry("kind: dof_damping, elements: '*_hip_joint'")
+    assert space.names == tuple(f"{leg}_hip_joint.damping" for leg in ("FL", "FR", "RL", "RR"))
+    p = space["FL_hip_joint.damping"]
+    assert (p.nominal, p.unit, p.scale) == (0.6, "N·m·s/rad", "log")
+    assert (p.low, p.high) == pytest.approx((0.12, 3.0))
+
+
+def test_pattern_together_gives_one_parameter_for_all() -> None:
+    """Symmetry: one value for the four calves."""
+    space = _entry("kind: servo_stiffness, elements: ['F?_calf*', RL_calf_joint, 'R*_calf_joint'], "
+                   "group: together, name: calf.stiffness, ratio: 2")  # fmt: skip
+    p = space["calf.stiffness"]
+    assert p.elements == ("FL_calf_joint", "FR_calf_joint", "RL_calf_joint", "RR_calf_joint")
+    assert (p.low, p.high) == (20.0, 80.0)
+
+
+def test_pattern_skips_what_cannot_have_the_parameter_and_a_name_does_not() -> None:
+    """`*` means the twelve hinges, not the free joint; naming the free joint is a mistake."""
+    assert len(_entry("kind: dof_armature, elements: '*'")) == 12
+    with pytest.raises(ConfigurationError, match="ball or free joint"):
+        _entry("kind: dof_armature, elements: base, nominal: 1")
+
+
+def test_weighed_known_and_prior() -> None:
+    """A weighed value is not searched; a prior's mean is a value, its std in the scale."""
+    assert _entry("kind: body_mass, elements: base, weighed: 7.1").known == {"base.mass": 7.1}
+    assert _entry("kind: body_mass, elements: base, known: true").known == {"base.mass": 6.921}
+    space = _entry("kind: body_mass, elements: base, prior: {mean: 7, std: 0.02}")
+    mean, std = space.prior
+    assert (mean[0], std[0]) == (7.0, 0.02)
+    assert ParameterSpace.from_json(space.to_json()).to_json() == space.to_json()
+
+
+def test_linear_kinds_get_their_usual_width() -> None:
+    """Encoder bias: 0 within 0.1 rad."""
+    p = _entry("kind: encoder_bias, elements: FL_hip_joint")["FL_hip_joint.encoder_bias"]
+    assert (p.nominal, p.low, p.high, p.scale) == (0.0, -0.1, 0.1, "linear")
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("kind: dof_dampin, elements: '*'", r"known: .*dof_frictionloss.*; did you mean 'dof_damping'\?"),
+        ("kind: dof_damping, elements: FL_hip", r"known: .*FL_hip_joint.*; did you mean 'FL_hip_joint'\?"),
+        ("kind: dof_damping, elements: 'X*'", "unknown MuJoCo joint 'X\\*'"),
+        ("kind: dof_damping, elements: []", "must be a joint name, a pattern"),
+        ("kind: dof_damping, elements: FL_hip_joint, range: [0.7, 0.9]", "nominal value 0.6 lies outside"),
+        ("kind: dof_damping, elements: FL_hip_joint, range: [0.9, 0.1]", "they are reversed"),
+        ("kind: dof_damping, elements: FL_hip_joint, range: [0.6, 0.6]", "for a fixed value use `known`"),
+        ("kind: dof_damping, elements: FL_hip_joint, range: [0, 1]", "log scale needs a positive range"),
+        ("kind: dof_damping, elements: FL_hip_joint, range: 3", r"must be \[low, high\]"),
+        ("kind: dof_damping, elements: FL_hip_joint, ratio: 0.5", "must be above 1"),
+        ("kind: dof_damping, elements: FL_hip_joint, range: [0.1, 1], ratio: 2", "not both"),
+        ("kind: dof_damping, elements: FL_hip_joint, nominal: .nan", "must be finite"),
+        ("kind: dof_damping, elements: FL_hip_joint, nominal: much", "must be a number"),
+        ("kind: dof_damping, elements: FL_hip_joint, scale: lin", r"unknown scale 'lin'.*'linear'"),
+        ("kind: dof_damping, elements: FL_hip_joint, rang: [0.1, 1]", r"unknown key 'rang'.*'range'"),
+        ("kind: dof_damping, elements: FL_hip_joint, nominal: 0", "a ratio of that is no range"),
+        ("kind: servo_speed_limit, elements: FL_hip_joint", "an MJCF has no servo_speed_limit"),
+        ("kind: dof_damping, elements: '*', group: together", "needs a `name`"),
+        ("kind: dof_damping, elements: '*', name: all", "group: together"),
+        ("kind: body_mass, elements: [base, FL_hip], group: together, name: m", "base 6.921, FL_hip 0.678"),
+        ("kind: body_mass, elements: base, known: 7, nominal: 6", "leave out `nominal`"),
+        ("kind: body_mass, elements: base, known: 7, weighed: 6", "not both"),
+        ("kind: body_mass, elements: base, prior: {mean: 7}", "`mean` and `std`"),
+        ("kind: body_mass, elements: base, prior: {mean: 7, std: 0}", "above 0"),
+        ("kind: body_mass, elements: base, prior: {mean: 99, std: 1}", "mean 99 lies outside"),
+        ("kind: geom_friction, elements: FL_foot", "overruled by geom 'floor'"),
+        ("kind: geom_friction, elements: FL_hip", "touches nothing"),
+        ("kind: motor_gain, elements: FL_hip_joint", "use servo_stiffness"),
+        ("kind: 3, elements: '*'", "`kind` must be a text"),
+    ],
+)
+def test_mistakes_say_what_to_write(entry: str, message: str) -> None:
+    """Every message names the entry and what is allowed."""
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        _entry(entry)
+    assert str(caught.value).startswith("params.yaml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "parameters: []", "parameters: x", "parameters: [1]", "other: 1", "a: [", "- !!python/none x"],
+)
+def test_texts_that_are_no_parameters_are_refused(text: str) -> None:
+    """Whatever the file holds, the error is ours; nothing is constructed from tags."""
+    with pytest.raises(ConfigurationError, match=r"params\.yaml"):
+        parse_space(text, MODEL)
+
+
+def test_repeated_names_and_repeated_elements_are_refused() -> None:
+    """Two entries of one name, and two names for one thing."""
+    one = "  - {kind: dof_damping, elements: FL_hip_joint}\n"
+    with pytest.raises(ConfigurationError, match="names repeat"):
+        parse_space("parameters:\n" + one + one, MODEL)
+    other = "  - {kind: dof_damping, elements: FL_hip_joint, name: other}\n"
+    with pytest.raises(ConfigurationError, match="both set dof_damping"):
+        parse_space("parameters:\n" + one + other, MODEL)
+
+
+def test_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    """The path is in the message."""
+    with pytest.raises(ConfigurationError, match=r"cannot read .*absent\.yaml"):
+        read_space(tmp_path / "absent.yaml", MODEL)
+
+
+def test_template_parses_to_friction_damping_armature_and_stiffness(tmp_path: Path) -> None:
+    """12 joints x 4; the servo's damping is left out, as it adds to the joint's."""
+    path = tmp_path / "params.yaml"
+    path.write_text(template(MODEL, "go2.xml"), encoding="utf-8")
+    space = read_space(path, MODEL)
+    assert len(space) == 48
+    assert {p.kind for p in space} == {"dof_frictionloss", "dof_damping", "dof_armature", "servo_stiffness"}
+
+
+def test_every_line_of_the_template_can_be_switched_on() -> None:
+    """Taking the # away gives lines that parse, one at a time."""
+    lines = [x for x in template(MODEL).splitlines() if x.startswith("  # - {")]
+    assert len(lines) > 20
+    for line in lines:
+        assert len(parse_space("parameters:\n" + line.replace("# - {", "- {", 1), MODEL)) == 1
+
+
+def test_template_of_a_model_with_nothing_to_search_says_so() -> None:
+    """Names and values above 0 are needed."""
+    empty = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    with pytest.raises(ConfigurationError, match="name them in the MJCF"):
+        template(empty)
+
+
+def test_awkward_names_survive_the_template() -> None:
+    """A joint named like a YAML value or a pattern is still that joint."""
+    names = ("yes", "1e3", "a: b", "null", "#x", "j[1]")
+    bodies = "".join(
+        f'<body name="{n}"><joint name="{n}" damping="1"/><geom size="1"/></body>' for n in names
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    assert [p.elements for p in parse_space(template(model), model)] == [(n,) for n in names]
+
+
+_kinds = st.sampled_from(["dof_damping", "dof_frictionloss", "dof_armature", "servo_stiffness"])
+
+
+@st.composite
+def _parameters(draw: st.DrawFn, number: int) -> Parameter:
+    scale = draw(st.sampled_from(["log", "linear"]))
+    low = draw(st.floats(1e-6, 1e3))
+    high = low * draw(st.floats(1.001, 1e3))
+    nominal = min(max(low, low + (high - low) * draw(st.floats(0, 1))), high)
+    prior = draw(st.booleans())
+    kind = draw(_kinds)
+    unit = {"dof_armature": "kg·m²", "dof_damping": "N·m·s/rad", "dof_frictionloss": "N·m"}.get(
+        kind, "N·m/rad"
+    )
+    return Parameter(
+        name=f"p{number}." + draw(st.text(min_size=0, max_size=5)).replace("\x00", ""), kind=kind,
+        elements=(JOINTS[number],), unit=unit, nominal=nominal, low=low, high=high, scale=scale,
+        known=draw(st.booleans()), prior_mean=nominal if prior else None,
+        prior_std=draw(st.floats(1e-3, 10)) if prior else None,
+    )  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_written_space_reads_back(data: st.DataObject) -> None:
+    """Any space of valid parameters survives the round trip bit by bit."""
+    count = data.draw(st.integers(1, 6))
+    space = ParameterSpace(data.draw(_parameters(number)) for number in range(count))
+    assert parse_space(write_space(space), MODEL).to_json() == space.to_json()
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.text(max_size=60), st.sampled_from(["", "parameters:\n - ", "parameters:\n - {kind: dof_damping, "])
+)
+def test_any_text_parses_or_is_refused(text: str, head: str) -> None:
+    """No text raises anything but our own error."""
+    try:
+        assert len(parse_space(head + text, MODEL).parameters)
+    except DealHwError as error:
+        assert isinstance(error, ConfigurationError | UnknownNameError)

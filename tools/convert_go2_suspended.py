@@ -1,0 +1,83 @@
+r"""Turns the public recording of a suspended Unitree Go2 into an NPZ file and its column map.
+
+The recording: iit-DLSLab/sim2real-robot-identification (BSD-3-Clause), datasets/go2/traj_0.pt at commit
+06739ea: the base held in the air, all twelve joints under P-D control by the robot's own drivers (kp 20 and
+kd 1.5 in that project's configuration), position set-points, 200 samples a second. Its keys: time (T) [s],
+dof_pos and des_dof_pos (T, 12) [rad]; columns leg by leg FL, FR, RL, RR, in each leg hip, thigh, calf (that
+project's collecting script).
+
+Fetch it and convert it:
+
+    git clone https://github.com/iit-DLSLab/sim2real-robot-identification
+    python tools/convert_go2_suspended.py sim2real-robot-identification/datasets/go2/traj_0.pt --out go2
+
+then check it, and import it for a model of the Go2 whose base is fixed:
+
+    deal-hw data import go2/traj_0.npz --columns go2/columns.yaml --model go2_suspended.xml \
+        --out runs/go2/dataset
+
+Keep the licence text of the source beside the converted file when you pass it on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+KEYS = ("time", "dof_pos", "des_dof_pos")
+JOINTS = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
+COLUMNS = """\
+# Suspended Go2 of iit-DLSLab/sim2real-robot-identification (BSD-3-Clause): what the arrays of the NPZ mean.
+# Leg by leg as its collecting script writes them; the hips of the right legs are commanded against the left.
+time: time
+position: dof_pos
+target: des_dof_pos
+unit: rad
+joints:
+"""
+
+
+def convert(source: Path, out: Path) -> Path:
+    """Write the NPZ file and the column map and return the path of the former.
+
+    Args:
+        source: The torch file.
+        out: Folder to write to.
+
+    Raises:
+        SystemExit: The file is not what its source says it is.
+    """
+    # weights_only: a torch file is a pickle and could otherwise run anything.
+    data = torch.load(source, map_location="cpu", weights_only=True)
+    if not isinstance(data, dict) or any(key not in data for key in KEYS):
+        raise SystemExit(f"{source} has no {', '.join(KEYS)}; it is not a recording of that project")
+    arrays = {key: np.asarray(data[key].numpy(), dtype=np.float64) for key in KEYS}
+    shapes = {key: values.shape for key, values in arrays.items()}
+    count = arrays["time"].shape[0]
+    if shapes != {"time": (count,), "dof_pos": (count, 12), "des_dof_pos": (count, 12)}:
+        raise SystemExit(f"{source} has the shapes {shapes}, expected (T,), (T, 12), (T, 12)")
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{source.stem}.npz"
+    np.savez_compressed(path, joint_names=np.array(JOINTS), **arrays)
+    lines = "".join(f"  - {joint}\n" for joint in JOINTS)
+    (out / "columns.yaml").write_text(COLUMNS + lines, encoding="utf-8")
+    return path
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("source", type=Path, help="datasets/go2/traj_0.pt of the source project")
+    parser.add_argument("--out", type=Path, required=True, help="folder for traj_0.npz and columns.yaml")
+    options = parser.parse_args(arguments)
+    print(convert(options.source, options.out))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
