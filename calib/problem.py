@@ -38,6 +38,9 @@ VELOCITY_PRIOR_STD = {"m": 3.0, "rad": 30.0}
 EXACT_STD = 1e-5
 """What residuals are measured by where nothing is noisy [m or rad]: far above rounding, far below sensors."""
 
+SLOWEST_JITTER_S = 0.01
+"""Sampling periods above this are too long to tell a jitter of the samples' time [s]."""
+
 UNSEEN_STD = 1e-6
 """Prior on a base's place on the floor where nobody measured it: no trajectory depends on it."""
 
@@ -148,7 +151,9 @@ class Problem:
         return found
 
     def _noise_model(self, floor: float) -> NoiseModel:
-        if self.known_std is not None or self.exact:
+        # At a low sample rate what is left of the motion itself grows with speed like a jitter's noise does.
+        slow = self.episodes[0].period_s > SLOWEST_JITTER_S
+        if self.known_std is not None or self.exact or slow:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
         # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.

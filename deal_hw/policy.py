@@ -19,8 +19,17 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError
 from deal_hw.types import FloatArray
 
-Quantity = Literal["position", "velocity", "sin_position", "cos_position", "action"]
+Quantity = Literal[
+    "position", "velocity", "sin_position", "cos_position", "action",
+    "gravity", "heading", "angular_velocity", "linear_velocity", "height", "command",
+]  # fmt: skip
 Observation = npt.NDArray[np.float32]
+
+AXES = ("x", "y", "z")
+BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", "height")
+"""What a floating base adds, in the base's frame: the directions of gravity and of the world's x axis (unit
+vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
+BASE_SIZE = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +37,9 @@ class ObservationTerm:
     """One entry of the observation.
 
     Attributes:
-        quantity: What is observed. Positions are relative to the default pose; "action" is a former action.
-        joint: The joint it belongs to.
+        quantity: What is observed. Positions are relative to the default pose; "action" is a former action;
+            "command" is the wanted velocity of the base: x and y [m/s], z [rad/s], the same at all delays.
+        joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z.
         scale: The factor applied to it [1/unit].
         delay: How many control periods ago; 0 is now (for actions 1 is the last one).
     """
@@ -77,13 +87,21 @@ class PolicySpec:
 
     def __post_init__(self) -> None:
         for term in self.observation:
-            if term.joint not in self.joint_names:
+            of_base = term.quantity in (*BASE_QUANTITIES, "command")
+            known = ("z",) if term.quantity == "height" else AXES if of_base else self.joint_names
+            if term.joint not in known:
                 raise ConfigurationError(
-                    f"observation term {term} names joint {term.joint!r}; known: {self.joint_names}"
+                    f"observation term {term} names {'axis' if of_base else 'joint'} {term.joint!r}; "
+                    f"known: {known}"
                 )
             lowest = 1 if term.quantity == "action" else 0
             if term.delay < lowest:
                 raise ConfigurationError(f"observation term {term}: delay must be at least {lowest}")
+
+    @property
+    def observes_base(self) -> bool:
+        """Whether the observation needs the state of a floating base."""
+        return any(term.quantity in BASE_QUANTITIES for term in self.observation)
 
     @property
     def history(self) -> int:
@@ -166,6 +184,9 @@ class ObservationBuilder:
     Args:
         spec: The policy's spec.
         batch_shape: () on the robot, (B,) in training.
+
+    Attributes:
+        command: The wanted velocity of the base: x, y [m/s] and yaw rate [rad/s], (..., 3); zero at first.
     """
 
     def __init__(self, spec: PolicySpec, batch_shape: tuple[int, ...] = ()) -> None:
@@ -178,6 +199,8 @@ class ObservationBuilder:
         self._position = np.zeros((depth, *batch_shape, J))
         self._velocity = np.zeros((depth, *batch_shape, J))
         self._action = np.zeros((depth + 1, *batch_shape, A))
+        self._base = np.zeros((depth, *batch_shape, 4 * len(AXES) + 1))
+        self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
         self._fresh = np.ones(batch_shape, dtype=bool)
 
     @property
@@ -197,11 +220,30 @@ class ObservationBuilder:
         self._action[1] = action
 
     def build(self, position: FloatArray, velocity: FloatArray) -> Observation:
-        """Return the observation, (..., O), from joint positions and velocities, (..., J) each."""
+        """Return the observation, (..., O).
+
+        Args:
+            position: Joint positions, (..., J); with a floating base, which then comes first, (..., 6 + J):
+                position in the world and rotation vector (:mod:`deal_hw.sim.chart`, around the identity).
+            velocity: Their velocities: linear in the world, angular in the base's frame, joints.
+
+        Raises:
+            ConfigurationError: The policy observes the base, and it is not given.
+        """
+        J = len(self._default)
         self._position = np.roll(self._position, 1, axis=0)
         self._velocity = np.roll(self._velocity, 1, axis=0)
-        self._position[0] = position - self._default
-        self._velocity[0] = velocity
+        self._position[0] = position[..., -J:] - self._default
+        self._velocity[0] = velocity[..., -J:]
+        if self.spec.observes_base:
+            if position.shape[-1] != BASE_SIZE + J:
+                raise ConfigurationError(
+                    f"the policy for {self.spec.robot!r} observes the base: it needs {BASE_SIZE} + {J} "
+                    f"coordinates, got {position.shape[-1]}; this robot's states carry no base"
+                )
+            self._base = np.roll(self._base, 1, axis=0)
+            self._base[0] = base_features(position[..., :BASE_SIZE], velocity[..., :BASE_SIZE])
+            self._base = np.where(self._fresh[..., None], self._base[:1], self._base)
         # The past of a fresh member is its present: there is no other state to fill it with.
         fresh = self._fresh[..., None]
         self._position = np.where(fresh, self._position[:1], self._position)
@@ -213,6 +255,12 @@ class ObservationBuilder:
     def _term(self, term: ObservationTerm) -> FloatArray:
         if term.quantity == "action":
             return np.asarray(term.scale * self._action[term.delay][..., self._actuator[term.joint]])
+        if term.quantity == "command":
+            return np.asarray(term.scale * self.command[..., AXES.index(term.joint)])
+        if term.quantity in BASE_QUANTITIES:
+            first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
+            offset = 0 if term.quantity == "height" else AXES.index(term.joint)
+            return np.asarray(term.scale * self._base[term.delay][..., first + offset])
         source = self._velocity if term.quantity == "velocity" else self._position
         value = source[term.delay][..., self._joint[term.joint]]
         if term.quantity == "sin_position":
@@ -220,3 +268,33 @@ class ObservationBuilder:
         elif term.quantity == "cos_position":
             value = np.cos(value)
         return np.asarray(term.scale * value)
+
+
+def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return vectors of the world, (..., 3), in the frame of a base at rotation vectors, (..., 3).
+
+    Rodrigues' formula for the inverse rotation.
+    """
+    angle = np.linalg.norm(rotation_vector, axis=-1, keepdims=True)
+    axis = rotation_vector / np.where(angle > 0, angle, 1.0)
+    along = np.sum(axis * vector, axis=-1, keepdims=True)
+    turned = np.cos(angle) * vector - np.sin(angle) * np.cross(axis, vector)
+    return np.asarray(turned + (1.0 - np.cos(angle)) * along * axis)
+
+
+def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Return what is observed of a base, (..., 13), in the order of :data:`BASE_QUANTITIES`.
+
+    Args:
+        position: Position in the world and rotation vector, (..., 6).
+        velocity: Linear in the world, angular in the base's frame, (..., 6).
+    """
+    turn = position[..., 3:]
+    down, ahead = (np.broadcast_to(v, turn.shape) for v in (np.array([0.0, 0, -1]), np.array([1.0, 0, 0])))
+    return np.concatenate(
+        [
+            in_base_frame(turn, down), in_base_frame(turn, ahead), velocity[..., 3:],
+            in_base_frame(turn, velocity[..., :3]), position[..., 2:3],
+        ],
+        axis=-1,
+    )  # fmt: skip

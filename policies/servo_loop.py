@@ -18,6 +18,9 @@ from deal_hw.types import FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
 
+SLEWLESS = 1e9
+"""Largest change a step of a set-point without a speed limit: finite, as 0 x infinity is no number."""
+
 EXACT_SENSOR = SensorModel(noise=(), resolution=(), velocity_window_s=0.0)
 """Reports the true state."""
 
@@ -64,8 +67,9 @@ class ServoLoop:
         threads: Threads of the physics; None for all CPUs.
 
     Attributes:
-        reported_position: What the host is told, (N, J).
-        reported_velocity: (N, J).
+        reported_position: What the host is told, (N, C): the joints, after a floating base where there is
+            one. The sensor model is the joints'; the base is reported as it is.
+        reported_velocity: (N, C).
     """
 
     def __init__(
@@ -86,23 +90,25 @@ class ServoLoop:
         self._theta = np.repeat(space.nominal[None], count, axis=0)
         self._sensor = description.sensor if sensor is None else sensor
         self._window = _window_periods(self._sensor, description)
-        J, A = len(description.joint_names), len(description.actuated)
+        C, A = self.batch.position.shape[1], len(description.actuated)
+        self._home = self.batch.position[0].copy()
+        self._home[self.batch.robot.joints] = description.default_position
         depth = int(np.ceil(longest_latency_s * description.device_rate_hz / self.steps)) + 2
         self._targets = np.zeros((depth, count, A))
         self._latency = np.zeros(count, dtype=np.int64)
         self._setpoint = np.zeros((count, A))
-        self._reports = np.zeros((self._window + 1, count, J))
-        self.reported_position = np.zeros((count, J))
-        self.reported_velocity = np.zeros((count, J))
+        self._reports = np.zeros((self._window + 1, count, C))
+        self.reported_position = np.zeros((count, C))
+        self.reported_velocity = np.zeros((count, C))
 
     @property
     def position(self) -> FloatArray:
-        """True joint positions, (N, J)."""
+        """True positions, (N, C)."""
         return self.batch.position
 
     @property
     def velocity(self) -> FloatArray:
-        """True joint velocities, (N, J)."""
+        """True velocities, (N, C)."""
         return self.batch.velocity
 
     def restart(
@@ -113,16 +119,18 @@ class ServoLoop:
         position: FloatArray,
         velocity: FloatArray,
         rng: np.random.Generator,
+        setpoint: FloatArray | None = None,
     ) -> None:
-        """Start M of the members anew: armed, set-point and targets at their own position.
+        """Start M of the members anew: armed, set-point and targets at their own position; motors at zero.
 
         Args:
             where: The M members, a mask (N,).
             theta: Their parameters, (M, K).
             latency_s: Their total latencies, (M,) [s]; rounded to device periods.
-            position: Their joint positions, (M, J).
-            velocity: Their joint velocities, (M, J).
+            position: Their positions, (M, C).
+            velocity: Their velocities, (M, C).
             rng: For the noise of the first report.
+            setpoint: Set-point and targets to start with, (M, A), where they are not the position.
 
         Raises:
             ConfigurationError: A latency is negative or longer than the loop was made for.
@@ -139,7 +147,11 @@ class ServoLoop:
         self.batch.set_parameters(self._theta, members)
         self.batch.set_state(position, velocity, members)
         self._latency[members] = ticks
-        start = position[:, list(self.description.actuated_index)]
+        start = setpoint
+        if start is None:
+            start = position[:, self.batch.robot.joints][:, list(self.description.actuated_index)]
+            if self.description.actuation == "motor":
+                start = np.zeros_like(start)
         self._setpoint[members] = start
         self._targets[:, members] = start
         period_s = 1.0 / self.description.control_rate_hz
@@ -153,7 +165,7 @@ class ServoLoop:
         """Send targets and advance by one control period.
 
         Args:
-            target: Position targets, (N, A) [m or rad].
+            target: Position targets [m or rad] or motor commands, (N, A).
             rng: For the noise.
 
         Returns:
@@ -168,6 +180,7 @@ class ServoLoop:
             * np.array(self.description.speed_limit)
             * self._step_s
         )
+        rate = np.minimum(rate, SLEWLESS)
         setpoints = delayed_setpoints(
             self._setpoint, self._targets[periods + 1, members], self._targets[periods, members], switch,
             rate, self.steps,
@@ -176,7 +189,7 @@ class ServoLoop:
         position, velocity = (values[:, -1] for values in self.batch.advance(setpoints))
         diverged: BoolArray = ~np.isfinite(np.concatenate([position, velocity], axis=1)).all(axis=1)
         if diverged.any():
-            position = np.where(diverged[:, None], self.description.default_position, position)
+            position = np.where(diverged[:, None], self._home, position)
             velocity = np.where(diverged[:, None], 0.0, velocity)
         self._reports = np.roll(self._reports, 1, axis=0)
         self._reports[0] = self._report(position, rng)
@@ -193,10 +206,13 @@ class ServoLoop:
     def _report(self, position: FloatArray, rng: np.random.Generator) -> FloatArray:
         if not self._sensor.noise:
             return position
-        noisy = position + rng.standard_normal(position.shape) * self._sensor.noise
+        joints = position[:, self.batch.robot.joints]
+        noisy = joints + rng.standard_normal(joints.shape) * self._sensor.noise
         resolution = np.array(self._sensor.resolution)
         step = np.where(resolution > 0, resolution, 1.0)
-        return np.where(resolution > 0, np.rint(noisy / step) * step, noisy)
+        noisy = np.where(resolution > 0, np.rint(noisy / step) * step, noisy)
+        base = position[:, : self.batch.robot.joints.start]
+        return np.concatenate([base, noisy], axis=1)
 
 
 def _window_periods(sensor: SensorModel, description: RobotDescription) -> int:

@@ -19,7 +19,7 @@ from deal_hw.types import FloatArray
 
 
 class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
-    """N robots that follow a policy's position targets; a task says how they start and what is rewarded.
+    """N robots that follow a policy's commands; a task says how they start and what is rewarded.
 
     Members that end are started anew in the same step (Gymnasium's SAME_STEP): what they saw last is in
     ``info["final_obs"]``. Observations come from the class that the robot uses, so the two cannot drift
@@ -73,10 +73,24 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self._elapsed = np.zeros(count, dtype=np.int64)
         self._scale = np.array(layout.action_scale)
         self._default = np.array(layout.default_position)[list(description.actuated_index)]
+        if description.actuation == "motor":
+            # An action is an effort itself: a motor has no pose that it is relative to.
+            self._default = np.zeros_like(self._default)
 
     @abc.abstractmethod
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
-        """Draw joint positions and velocities at the start of M episodes, (M, J) each."""
+        """Draw positions and velocities at the start of M episodes, (M, C) each."""
+
+    def start_setpoint(self) -> FloatArray | None:
+        """Return the set-point and targets episodes start with, (A,); None: each member's position."""
+        return None
+
+    def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:  # noqa: B027
+        """Draw what else a task draws for the members, (N,), that start anew; nothing by default."""
+
+    def limited(self, action: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the actions, (N, A), that are really taken after those before; all by default."""
+        return action
 
     @abc.abstractmethod
     def reward(
@@ -85,8 +99,8 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         """Return the reward of one tick, (N,), from the true state after it.
 
         Args:
-            position: (N, J).
-            velocity: (N, J).
+            position: (N, C).
+            velocity: (N, C).
             action: The action of this tick, (N, A).
             before: The action of the tick before, (N, A); zero at the start.
         """
@@ -114,6 +128,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
             (N, O) with the last observations of the members in ``_final_obs`` (N,).
         """
         action = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+        action = self.limited(action, self._last_action)
         self._builder.record_action(action)
         diverged = self.loop.step(self._default + self._scale * action, self.np_random)
         position, velocity = self.loop.position, self.loop.velocity
@@ -137,8 +152,11 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         latency = self.distribution.sample_latency(rng, count) + rng.uniform(*self.host_delay_s, count)
         theta = self.distribution.sample(rng, count)
         position, velocity = self.start_state(rng, count)
-        self.loop.restart(where, theta, latency, position, velocity, rng)
+        start = self.start_setpoint()
+        setpoint = None if start is None else np.repeat(start[None], count, axis=0)
+        self.loop.restart(where, theta, latency, position, velocity, rng, setpoint)
         self._builder.reset(where)
+        self.begin_episodes(where, rng)
         self._elapsed[where] = 0
         self._last_action[where] = 0.0
 

@@ -288,7 +288,7 @@ def _box(points: FloatArray, value: FloatArray, model: Any, side: float | None) 
     scale = model.covar_module.lengthscale.detach().numpy().reshape(C)
     half = 0.5 * side * scale / np.exp(np.mean(np.log(scale)))
     best = points[np.argmax(value)]
-    return np.clip(np.stack([best - half, best + half]), 0.0, 1.0)
+    return np.asarray(np.clip(np.stack([best - half, best + half]), 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -393,12 +393,12 @@ def _botorch() -> _Botorch:
             # Its parts use parts of torch that are on their way out.
             warnings.simplefilter("ignore")
             import torch
-            from botorch.acquisition import qLogExpectedImprovement
+            from botorch.acquisition.logei import qLogExpectedImprovement
             from botorch.exceptions.errors import ModelFittingError
             from botorch.fit import fit_gpytorch_mll
             from botorch.models import SingleTaskGP
-            from botorch.optim import optimize_acqf
-            from botorch.sampling import SobolQMCNormalSampler
+            from botorch.optim.optimize import optimize_acqf
+            from botorch.sampling.normal import SobolQMCNormalSampler
             from gpytorch.mlls import ExactMarginalLogLikelihood
             from linear_operator.utils.errors import NanError, NotPSDError
     except ImportError as err:  # pragma: no cover - the extra is installed where the tests run

@@ -184,10 +184,12 @@ class _Passes(Stepper):
         self._covariance = filter_.covariance[n:, n:]
         usable = np.array(misfits)[np.isfinite(misfits)]
         self._misfit = float(usable.mean()) if len(usable) else math.inf
+        members = self._members(self._value[None])
         self._run.note(
             f"innovations {self._misfit:.3g} times their variance, {self._lost} steps lost",
-            self._members(self._value[None]).theta,
+            members.theta,
             {"misfit": self._misfit, "lost": float(self._lost)},
+            members.latency_s,
         )
 
     def _filter(self) -> ExtendedKalman:

@@ -183,14 +183,14 @@ class _MultiStart(Stepper):
         self._stage, self._iteration, self._restarts = -1, 0, 0
         self._innovations = Innovations(run.problem, self._ticks[0], follow=False)
         C = len(run.problem.space) + 1
-        self._pool, self._scores = np.empty((0, C)), np.empty(0)
-        self._values, self._cost = np.empty((0, C)), np.empty(0)
+        # The best draws so far with their scores, later the starts with their costs.
+        self._values, self._cost, self._drawn = np.empty((0, C)), np.empty(0), 0
         self._best: tuple[float, FloatArray] = (math.inf, self._centre())
         self._explained = False
 
     def _centre(self) -> FloatArray:
         middle = self._coordinates.members(np.full((1, self._coordinates.count), 0.5))
-        return self._value_of(middle)[0]
+        return np.asarray(self._value_of(middle)[0], dtype=np.float64)
 
     def _value_of(self, members: Members) -> FloatArray:
         value = np.column_stack([self._problem.space.to_scale(members.theta), members.latency_s])
@@ -221,21 +221,22 @@ class _MultiStart(Stepper):
         # One metric for all draws, that of the range's centre, and absolute values: most draws are so far
         # off that squares would rank them by their one worst window.
         score = np.mean(np.abs(self._innovations.residual(values, self._centre())), axis=1)
-        self._pool = np.concatenate([self._pool, values])
-        self._scores = np.concatenate([self._scores, np.where(np.isfinite(score), score, np.inf)])
-        best = float(self._scores.min())
+        pool = np.concatenate([self._values, values])
+        scores = np.concatenate([self._cost, np.where(np.isfinite(score), score, np.inf)])
+        order = np.argsort(scores, kind="stable")[: settings.starts]
+        self._values, self._cost = pool[order], scores[order]
+        self._drawn += len(values)
+        best = float(self._cost[0])
         self._run.note(
-            f"{len(self._pool)} draws: best {best:.3g}",
+            f"{self._drawn} draws: best {best:.3g}",
             members.theta,
             {"stage": -1.0, "chi2": best**2, "starts": 0.0},
+            members.latency_s,
         )
-        share = max(budget.generations // DRAW_SHARE, 1)
-        wanted = min(settings.draws, share * budget.population)
         if self._best[0] == math.inf:
-            self._best = (math.inf, self._pool[int(np.argmin(self._scores))])
-        if len(self._pool) >= wanted:
-            order = np.argsort(self._scores, kind="stable")[: settings.starts]
-            self._values = self._pool[order]
+            self._best = (math.inf, self._values[0].copy())
+        share = max(budget.generations // DRAW_SHARE, 1)
+        if self._drawn >= min(settings.draws, share * budget.population):
             self._begin_stage(0)
 
     def _begin_stage(self, stage: int) -> None:
@@ -275,11 +276,12 @@ class _MultiStart(Stepper):
         return self._problem.fixed_latency_s is not None
 
     def _note(self, count: int) -> None:
-        chi2 = self._cost / count
+        chi2, members = self._cost / count, self._innovations.members(self._values)
         self._run.note(
             f"windows of {self._ticks[self._stage]} ticks: chi2 {chi2[0]:.3g}, worst start {chi2[-1]:.3g}",
-            self._innovations.members(self._values).theta,
+            members.theta,
             {"stage": float(self._stage), "chi2": float(chi2[0]), "starts": float(len(chi2))},
+            members.latency_s,
         )
 
     def _maybe_next(self, best_rests: bool, all_rest: bool, count: int) -> None:
@@ -302,7 +304,7 @@ class _MultiStart(Stepper):
             self._explained = True
         else:
             self._restarts += 1
-            self._pool, self._scores = self._pool[:0], self._scores[:0]
+            self._values, self._cost, self._drawn = self._values[:0], self._cost[:0], 0
             self._stage = -1
             self._innovations = Innovations(self._problem, self._ticks[0], follow=False)
 
@@ -347,14 +349,13 @@ class _MultiStart(Stepper):
         )
 
     def save(self) -> dict[str, Any]:
-        """Return the draws, the starts and where each stage stands."""
+        """Return the starts and where the run stands."""
         return {
             "stage": self._stage,
             "iteration": self._iteration,
             "restarts": self._restarts,
             "explained": self._explained,
-            "pool": self._pool,
-            "scores": self._scores,
+            "drawn": self._drawn,
             "values": self._values,
             "cost": self._cost,
             "best": [self._best[0], self._best[1]],
@@ -367,6 +368,6 @@ class _MultiStart(Stepper):
         self._stage, self._iteration = state["stage"], state["iteration"]
         self._innovations.offsets = state["offsets"]
         self._restarts, self._explained = state["restarts"], state["explained"]
-        self._pool, self._scores = state["pool"], state["scores"]
+        self._drawn = state["drawn"]
         self._values, self._cost = state["values"], state["cost"]
         self._best = (state["best"][0], state["best"][1])

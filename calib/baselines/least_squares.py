@@ -176,7 +176,7 @@ def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: F
     """
     variance = float(residual @ residual) / max(len(residual) - len(space), 1)
     information = jacobian.T @ jacobian / max(variance, np.finfo(float).tiny)
-    return np.asarray(np.linalg.inv(information + np.diag(12.0 / space.width**2)))
+    return np.asarray(np.linalg.inv(information + np.diag(12.0 / space.width**2)), dtype=np.float64)
 
 
 def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float) -> Found:
@@ -185,7 +185,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float
     step = PARAMETER_STEP * np.eye(len(space))
 
     def residual(value: FloatArray) -> FloatArray:
-        return error.residual(value[None])[0]
+        return np.asarray(error.residual(value[None])[0], dtype=np.float64)
 
     def jacobian(value: FloatArray) -> FloatArray:
         r = error.residual(np.concatenate([value[None], value + step]))
@@ -204,7 +204,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float
     theta = np.clip(space.from_scale(solution.x), space.low, space.high)
     return Found(
         theta=theta,
-        covariance=textbook_covariance(space, solution.jac, solution.fun),
+        covariance=textbook_covariance(space, np.asarray(solution.jac), solution.fun),
         latency_s=latency_s,
         iterations=int(solution.nfev),
         message=str(solution.message),
@@ -256,4 +256,5 @@ class OneStep:
             ahead = np.concatenate([predicted.position[:, :, -1], predicted.velocity[:, :, -1]], axis=-1)
             difference = (ahead - recorded[1])[..., self._counts] / self._scale
             parts.append(difference.reshape(len(values), -1))
-        return np.nan_to_num(np.concatenate(parts, axis=1), nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)
+        whole = np.concatenate(parts, axis=1)
+        return np.asarray(np.nan_to_num(whole, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED))

@@ -236,8 +236,20 @@ def trace(rows: Sequence[Mapping[str, float]]) -> Markup | None:
         return svg(figure, f"search trace: {', '.join(series)}")
 
 
-def population(space: ParameterSpace, members: FloatArray, estimate: FloatArray) -> Markup:
-    """Draw the last population inside the search range, one line a parameter, with the final estimate."""
+def population(
+    space: ParameterSpace,
+    members: FloatArray,
+    estimate: FloatArray,
+    told: np.ndarray[Any, np.dtype[np.bool_]],
+) -> Markup:
+    """Draw the last population inside the search range, one line a parameter, with the final estimate.
+
+    Args:
+        space: The parameters.
+        members: Physical values, (N, K).
+        estimate: Physical values, (K,).
+        told: Which estimates to draw, (K,).
+    """
     K = len(space)
     unit = np.clip(space.normalize(members), 0.0, 1.0)
     longest = 0.075 * max(len(name) for name in space.names) + 0.2
@@ -251,7 +263,7 @@ def population(space: ParameterSpace, members: FloatArray, estimate: FloatArray)
             axis.plot(
                 unit[:, k], np.full(len(unit), k), "|", color=CALIBRATED, markersize=9, markeredgewidth=0.8
             )
-        axis.plot(space.normalize(estimate), np.arange(K), "D", color=INK, markersize=3.5)
+        axis.plot(space.normalize(estimate)[told], np.flatnonzero(told), "D", color=INK, markersize=3.5)
         axis.set_yticks(np.arange(K), space.names)
         axis.set_ylim(K - 0.5, -0.5)
         axis.set_xlim(-0.02, 1.02)

@@ -27,7 +27,7 @@ _VARIABLES = {
     PAPER: "paper",
 }  # fmt: skip
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "deal-hw",
     "font.family": "sans-serif",

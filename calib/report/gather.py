@@ -95,7 +95,7 @@ def _overlays(
                 heldout=heldout,
                 names=problem.channel_names,
                 units=_units(problem),
-                time_s=episode.sample * episode.step_s,
+                time_s=np.asarray(episode.sample * episode.step_s, dtype=np.float64),
                 real=real,
                 nominal=both[0],
                 calibrated=both[1],
@@ -123,7 +123,7 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
     for data in windows:
         whitened = _whitened(problem, centre, data)
         episode = problem.episodes[data.episode]
-        time = (episode.sample * episode.step_s)[data.windows.samples()]
+        time = np.asarray(episode.sample[data.windows.samples()] * episode.step_s, dtype=np.float64)
         found.append(
             Residuals(title=titles[data.episode], names=problem.channel_names, time_s=time, whitened=whitened)
         )

@@ -41,6 +41,7 @@ class Row:
     range_high: float
     log: bool
     verdict: str
+    told: bool
     at_bound: str
     bar_left: float
     bar_width: float
@@ -101,7 +102,7 @@ def render(inputs: ReportInputs) -> str:
         trace=charts.trace(result.trace),
         population=None
         if result.population is None
-        else charts.population(result.space, result.population, result.estimate),
+        else charts.population(result.space, result.population, result.estimate, told(result)),
         facts=[(key, _plain(value)) for key, value in provenance.items() if key not in _HIDDEN],
         versions=_mapping(provenance.get("versions")),
         settings=[
@@ -154,6 +155,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
                 range_high=p.high,
                 log=p.scale == "log",
                 verdict=result.verdicts[k] if result.verdicts else "",
+                told=bool(told(result)[k]),
                 at_bound=bound,
                 bar_left=float(at[0][k]),
                 bar_width=max(float(at[1][k] - at[0][k]), 0.4),
@@ -163,6 +165,12 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             )
         )
     return rows
+
+
+def told(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return which parameters have a value, (K,): what the data cannot tell gets none on the page."""
+    K = len(result.space)
+    return np.array([v != "not identifiable" for v in result.verdicts] or [True] * K, dtype=bool)
 
 
 def short(value: float) -> str:

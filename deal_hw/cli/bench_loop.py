@@ -8,123 +8,67 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.cli.calibrate import calibrate_episodes
-from deal_hw.cli.run_plan import Profile, RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import PolicyBehaviour
-from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.profiles import profile as find_profile
+from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import Truth
-from deal_hw.errors import DealHwError
-from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
-from deal_hw.sim.episode import Episode, align, fill_gaps
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.types import FloatArray
 
-DEMONSTRATION_S = 4.0
 TASK_EPISODES = 5
 SEARCHES = ("deal", "weki", "deal-paper", "deal-paper-flat", "centre")
 """Run without the polish, beside the default with everything."""
 
 
-@dataclass(frozen=True, slots=True)
-class Demonstration:
-    """What a seed's robot gave, and what only the bench knows.
-
-    Attributes:
-        truth: The hidden truth.
-        space: What is searched.
-        robot: The nominal model.
-        theta: True values of the free parameters, (K,).
-        fit: The demonstration.
-        heldout: Another motion family.
-        fit_truth: Noise-free positions and velocities at the demonstration's samples.
-        heldout_truth: Noise-free positions at the held-out samples.
-    """
-
-    truth: Truth
-    space: ParameterSpace
-    robot: RobotModel
-    theta: FloatArray
-    fit: Episode
-    heldout: Episode
-    fit_truth: tuple[FloatArray, FloatArray]
-    heldout_truth: FloatArray
-
-
-def demonstrate(profile: str, seed: int, xi: float) -> Demonstration:
+def demonstrate(profile: str, seed: int, xi: float) -> Case:
     """Draw a truth and record one ``rich`` demonstration and one ``chirp`` from its robot."""
-    truth = draw_truth(profile, seed, xi=xi)
-    space = k9_space().with_ratio(xi)
-    virtual = VirtualCartpole(truth)
-    recordings = []
-    policy = str(shipped_policy("cartpole") or "")
-    kinds: tuple[Profile, ...] = ("rich", "chirp")
-    for kind in kinds:
-        plan = RunPlan(robot="cartpole", profile=kind, seconds=DEMONSTRATION_S, seed=seed, policy=policy)
-        recordings.append(virtual.run(make_behaviour(plan, DESCRIPTION), DEMONSTRATION_S))
-    fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
-    return Demonstration(
-        truth=truth,
-        space=space,
-        robot=load_model(DESCRIPTION),
-        theta=np.array([truth.parameters[name] for name in space.names]),
-        fit=fit,
-        heldout=heldout,
-        fit_truth=recordings[0].true_states(fit),
-        heldout_truth=recordings[1].true_states(heldout)[0],
-    )
+    return make_case("cartpole", profile, seed, xi)
 
 
 def calibration_row(
-    demonstration: Demonstration, method: str, budget: Budget, threads: int | None
+    case: Case, method: str, budget: Budget, threads: int | None
 ) -> tuple[dict[str, Any], CalibrationResult]:
     """Calibrate with one method and score it.
 
     Returns:
         The row's part that concerns calibration, and the result.
     """
-    from deal_hw.calib.metrics import error_percent, fisher_std, interval_score, log_error_x100
-    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.metrics import error_percent, log_error_x100
     from deal_hw.calib.validate import heldout_nrmse
 
-    d = demonstration
+    d = case
     result = calibrate_episodes(
-        d.robot, d.space, [d.fit], [], method=method, budget=budget, rng=np.random.default_rng(d.truth.seed),
+        d.robot, d.space, [d.fit], [], method=method, budget=budget, rng=np.random.default_rng(d.seed),
         threads=threads,
     )  # fmt: skip
-    problem = Problem(d.robot, d.space, [d.fit], threads=threads)
-    sensor = find_profile(d.truth.profile).sensor
-    bound = fisher_std(
-        problem, d.theta, d.truth.latency_s, [d.fit_truth],
-        np.maximum(sensor.position_std, problem.noise_std[problem.channels] * 1e-2), length=160,
-    )  # fmt: skip
-    score = interval_score(d.space, result.interval, d.theta, bound)
+    coverage, width = _intervals(d, result, threads)
     errors = heldout_nrmse(
         d.robot, d.space, [d.heldout],
         {"nominal": (d.space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)},
-        truth=[d.heldout_truth], threads=threads,
+        truth=[d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]],
+        threads=threads,
     )  # fmt: skip
     row = {
         "error_percent": error_percent(result.estimate, d.theta),
         "log_error_x100": log_error_x100(result.estimate, d.theta),
         "null_error_percent": error_percent(d.space.center, d.theta),
         "null_log_error_x100": log_error_x100(d.space.center, d.theta),
-        "coverage90": score.coverage90,
-        "width90": score.width90,
+        "coverage90": coverage,
+        "width90": width,
         "heldout_nrmse_nominal": errors["nominal"],
         "heldout_nrmse_calibrated": errors["calibrated"],
         "heldout_nrmse_null": errors["null"],
-        "latency_true": d.truth.latency_s,
+        "latency_true": d.latency_s,
         "latency_found": result.latency_s,
         "steps": result.steps,
         "seconds": result.seconds,
@@ -140,9 +84,26 @@ def calibration_row(
             }
             for k, p in enumerate(d.space)
         },
-        "refused_truths": d.truth.refused,
+        "refused_truths": d.refused,
     }
     return row, result
+
+
+def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tuple[float, float | None]:
+    """Return coverage90 and width90; without noise there is no bound to compare a width with."""
+    from deal_hw.calib.metrics import fisher_std, interval_score
+    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.refine import samples_in
+
+    if case.channel_std is None:
+        inside = (result.interval[:, 0] <= case.theta) & (case.theta <= result.interval[:, 1])
+        return float(np.mean(inside)), None
+    problem = Problem(case.robot, case.space, [case.fit], threads=threads)
+    std = np.maximum(case.channel_std, problem.noise_std[problem.channels] * 1e-2)
+    length = samples_in(problem, 0.8)
+    bound = fisher_std(problem, case.theta, case.latency_s, [case.fit_truth], std, length)
+    score = interval_score(case.space, result.interval, case.theta, bound)
+    return score.coverage90, score.width90
 
 
 def task_score(truth: Truth, policy: Policy, episodes: int = TASK_EPISODES) -> tuple[float, float]:
@@ -163,11 +124,11 @@ def task_score(truth: Truth, policy: Policy, episodes: int = TASK_EPISODES) -> t
     return float(np.mean(angles)), float(np.mean(speeds))
 
 
-def transfer_row(demonstration: Demonstration, result: CalibrationResult, folder: Path) -> dict[str, Any]:
+def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[str, Any]:
     """Train under the calibrated distribution and under the truth, deploy both and the shipped UDR policy.
 
     Args:
-        demonstration: The robot.
+        case: The robot.
         result: Its calibration.
         folder: Where the policies are kept.
 
@@ -177,20 +138,22 @@ def transfer_row(demonstration: Demonstration, result: CalibrationResult, folder
     from deal_hw.cli.train import train_policy
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 
-    d = demonstration
+    d, truth = case, case.truth
+    if truth is None:
+        raise ConfigurationError(f"{case.task} has no emulator to deploy on; only the cart-pole has")
     row: dict[str, Any] = {}
     shipped = shipped_policy("cartpole")
     if shipped is None:
         raise DealHwError("no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it")
-    row["angle_error_udr"], row["cart_speed_udr"] = task_score(d.truth, OnnxPolicy(shipped))
-    oracle = ParameterDistribution.point(d.space, d.theta, d.truth.latency_s)
+    row["angle_error_udr"], row["cart_speed_udr"] = task_score(truth, OnnxPolicy(shipped))
+    oracle = ParameterDistribution.point(d.space, d.theta, d.latency_s)
     for name, distribution in (("retrained", result.distribution()), ("oracle", oracle)):
         start = time.perf_counter()
-        file = folder / f"{d.truth.profile}_{d.truth.seed}_{name}.onnx"
-        train_policy("cartpole", distribution, file, seed=d.truth.seed)
+        file = folder / f"{d.profile}_{d.seed}_{name}.onnx"
+        train_policy("cartpole", distribution, file, seed=d.seed)
         if name == "retrained":
             row["seconds_train"] = time.perf_counter() - start
-        row[f"angle_error_{name}"], row[f"cart_speed_{name}"] = task_score(d.truth, OnnxPolicy(file))
+        row[f"angle_error_{name}"], row[f"cart_speed_{name}"] = task_score(truth, OnnxPolicy(file))
     return row
 
 

@@ -100,7 +100,8 @@ def _finite(trajectory: Trajectory) -> Verdict:
         for channel in ("position", "velocity", "effort")
         for index, joint in enumerate(trajectory.joint_names)
     }
-    if np.isnan(trajectory.effort).all():  # Nobody measured it; an import has such recordings.
+    # The file of an import may have no effort at all.
+    if "import" in trajectory.metadata and np.isnan(trajectory.effort).all():
         bad = {name: count for name, count in bad.items() if not name.startswith("effort")}
     found = [f"{name}: {count}" for name, count in bad.items() if count]
     if not found:

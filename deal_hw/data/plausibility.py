@@ -8,7 +8,6 @@ order or with another sign, a target that is a copy of the measurement, and the 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -232,10 +231,10 @@ def _longest_still(table: Table, joint: int) -> float:
     changes = np.flatnonzero(np.diff(table.position[:, joint]) != 0) + 1
     edges = np.concatenate(([0], changes, [table.time_s.size - 1]))
     longest = 0.0
-    for begin, end in itertools.pairwise(edges):
-        span_s = table.time_s[end] - table.time_s[begin]
-        if span_s > max(longest, FROZEN_S) and np.ptp(target[begin : end + 1]) > 5 * moved:
-            longest = float(span_s)
+    spans_s = np.diff(table.time_s[edges])
+    for at in np.flatnonzero(spans_s > FROZEN_S):
+        if spans_s[at] > longest and np.ptp(target[edges[at] : edges[at + 1] + 1]) > 5 * moved:
+            longest = float(spans_s[at])
     return longest
 
 

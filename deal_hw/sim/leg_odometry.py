@@ -16,7 +16,7 @@ from deal_hw.types import FloatArray
 STANCE_M = 0.008
 """Feet within this height of the lowest one count as standing [m]."""
 
-VELOCITY_STD = 0.03
+VELOCITY_STD = 0.04
 """Standard deviation of a base velocity from the legs [m/s]: joint noise, soft contacts, a little slip."""
 
 HEIGHT_STD = 0.004

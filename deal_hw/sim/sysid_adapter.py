@@ -14,6 +14,7 @@ rests at zero, so it is normalised over the whole recording.
 from __future__ import annotations
 
 import copy
+import importlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -83,7 +84,8 @@ def require_sysid() -> Any:
         MissingExtraError: What it needs is not installed.
     """
     try:
-        from mujoco import sysid
+        # By name, or type checkers take the typed subpackage for the whole of mujoco.
+        sysid = importlib.import_module("mujoco.sysid")
     except ImportError as err:
         raise MissingExtraError("mujoco[sysid]", "bench") from err
     # Without its dependencies the package imports, but is empty.

@@ -143,7 +143,8 @@ class PopulationView:
             low, width = float(real.min()), max(float(np.ptp(real)), 1e-9)
             text = f"{joint}: {low:.3g} to {low + width:.3g}, {t.max():.1f} s"
             self._stream.log(
-                f"/motion/{joint}", rr.Points2D([[0.0, LANE_STEP * j - 0.1]], labels=[text], radii=0.0)
+                f"/motion/{joint}",
+                rr.Points2D([[LANE_WIDTH / 2, LANE_STEP * j - 0.2]], labels=[text], radii=0.0),
             )
             for name, values, color in (("real", real, palette.REAL), (MEAN, mean, palette.CALIBRATED)):
                 # A picture's y axis points down. A prediction that ran away ends at its lane's border.

@@ -15,7 +15,8 @@ from deal_hw.calib.pipeline import PolishedMethod
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.weki import Weki
 from deal_hw.calibration import Budget
-from deal_hw.cli.bench_loop import Demonstration, demonstrate
+from deal_hw.cli.bench_loop import demonstrate
+from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.errors import UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite

@@ -15,7 +15,8 @@ from deal_hw.calib.refine import polish
 from deal_hw.calib.residuals import Shooting
 from deal_hw.calib.validate import heldout_nrmse
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
-from deal_hw.cli.bench_loop import Demonstration, demonstrate
+from deal_hw.cli.bench_loop import demonstrate
+from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace

@@ -17,7 +17,8 @@ from deal_hw.calib.rollouts import (
     rollout_population,
     transitions,
 )
-from deal_hw.cli.bench_loop import Demonstration, demonstrate
+from deal_hw.cli.bench_loop import demonstrate
+from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 

@@ -39,7 +39,8 @@ MODEL = """
         <joint name="knee" axis="1 0 0" range="-2 2" limited="true"/>
         <geom size="0.1"/>
         <body pos="0 0 1"><joint name="hip" axis="0 1 0"/><geom size="0.1"/></body>
-        <body pos="0 0 2"><joint name="foot" type="slide" range="-3 3" limited="true"/><geom size="0.1"/></body>
+        <body pos="0 0 2"><joint name="foot" type="slide" range="-3 3" limited="true"/><geom
+        size="0.1"/></body>
       </body>
     </body>
   </worldbody>

@@ -190,7 +190,7 @@ def test_two_recordings_share_one_grid(make_table: MakeTable) -> None:
 def test_any_clock_gives_consistent_trajectories(
     rate_hz: float, jitter: float, lost: set[int], seed: int
 ) -> None:
-    """Whatever the stamps: uniform indices, ages that fit the commands, nothing beyond the recording's ends."""
+    """Whatever the stamps: uniform indices, ages that fit the commands, nothing beyond the ends."""
     rng = np.random.default_rng(seed)
     time_s = np.cumsum((1 + jitter * rng.uniform(-1, 1, 400)) / rate_hz)
     keep = np.array([i not in lost for i in range(400)])

@@ -119,7 +119,7 @@ def test_csv_round_trip(
 
 
 def test_npz_arrays(tmp_path: Path) -> None:
-    """Arrays of all joints are guessed, by label where the file names its joints, else by the model's order."""
+    """Arrays are guessed by label where the file names its joints, else by the model's order."""
     q = np.arange(12.0).reshape(4, 3)
     arrays: dict[str, Any] = {"time": np.arange(4) * 5e6, "dof_pos": q, "des_dof_pos": q + 100}
     np.savez(tmp_path / "a.npz", joint_names=np.array(["hip", "knee", "foot"]), **arrays)
@@ -256,25 +256,35 @@ def test_log_of_two_rates_in_one_file(tmp_path: Path) -> None:
     assert (table.source["rows_without_position"], table.source["rows_without_target"]) == (1, 2)
 
 
+NO_SCALE = {"name": "a", "normalised": {"from": [0, 0], "to": [0, 1]}}
+NO_PAIR = {"name": "a", "normalised": {"from": [0]}}
+NO_ORDER = {"column": "q", "order": "yxzw"}
+HOURS = {"column": "t", "unit": "h"}
+
+
 @pytest.mark.parametrize(
     ("values", "error", "words"),
     [
         ([], ConfigurationError, "not a mapping"),
         ({"joints": ["a"]}, ConfigurationError, "'time' is missing"),
         ({"time": "t", "joints": ["a"], "colour": 1}, UnknownNameError, "'colour'"),
-        ({"time": {"column": "t", "unit": "h"}, "joints": ["a"]}, UnknownNameError, "'h'; known: s, ms, us, ns"),
+        ({"time": HOURS, "joints": ["a"]}, UnknownNameError, "'h'; known: s, ms, us, ns"),
         ({"time": "t", "joints": []}, ConfigurationError, "at least one"),
         ({"time": "t", "joints": ["a", "a"]}, ConfigurationError, "each joint once"),
         ({"time": "t", "joints": [{"column": "a"}]}, ConfigurationError, "has no name"),
         ({"time": "t", "joints": [{"name": "a", "sign": 2}]}, ConfigurationError, "sign is 1 or -1"),
         ({"time": "t", "joints": [{"name": "a", "sign": "x"}]}, ConfigurationError, "not a number"),
         ({"time": "t", "joints": [{"name": "a", "unit": "turns"}]}, UnknownNameError, "'turns'"),
-        ({"time": "t", "joints": [{"name": "a", "normalised": {"from": [0, 0], "to": [0, 1]}}]}, ConfigurationError, "no scale"),
-        ({"time": "t", "joints": [{"name": "a", "normalised": {"from": [0]}}]}, ConfigurationError, "two numbers"),
-        ({"time": "t", "joints": ["a"], "gyro": {"columns": ["x", "y"]}}, ConfigurationError, "name 3 columns"),
-        ({"time": "t", "joints": ["a"], "orientation": {"column": "q", "order": "yxzw"}}, UnknownNameError, "wxyz"),
+        ({"time": "t", "joints": [NO_SCALE]}, ConfigurationError, "no scale"),
+        ({"time": "t", "joints": [NO_PAIR]}, ConfigurationError, "two numbers"),
+        (
+            {"time": "t", "joints": ["a"], "gyro": {"columns": ["x"] * 2}},
+            ConfigurationError,
+            "name 3 columns",
+        ),
+        ({"time": "t", "joints": ["a"], "orientation": NO_ORDER}, UnknownNameError, "wxyz"),
     ],
-)  # fmt: skip
+)
 def test_column_map_that_makes_no_sense(values: Any, error: type[Exception], words: str) -> None:
     """Each says what was given and what is allowed."""
     with pytest.raises(error, match=words):

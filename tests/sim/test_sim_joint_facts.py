@@ -20,7 +20,7 @@ def test_joints_of_the_cartpole() -> None:
 
 
 def test_degrees_free_joints_and_limits(tmp_path: Path) -> None:
-    """Ranges come in rad whatever the file's unit; free joints are left out; a joint without a range is free."""
+    """Ranges come in rad whatever the file's unit; free joints stay out; no range is a free joint."""
     path = tmp_path / "a.xml"
     path.write_text(
         """<mujoco><worldbody><body><freejoint name="base"/><geom size="1"/>

@@ -1,0 +1,266 @@
+"""Trials: what a robot with given parameters would do under a behaviour, run through the safety filter.
+
+The same closed loop as on the robot, at the control rate: state, behaviour, safety filter, set-point
+generator, latency, engine. Several members with their own parameters run side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.safety_filter import SafetyFilter, is_finite
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.episode import Episode
+from deal_hw.sim.model import RobotModel
+from deal_hw.types import FloatArray, JointCommand, RobotState, Status
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """D members that every candidate is tried on.
+
+    Attributes:
+        theta: Physical parameters, (D, K).
+        latency_s: Total latencies, (D,) [s].
+        position: Joint positions at the start, (D, J); they start at rest.
+    """
+
+    theta: FloatArray
+    latency_s: FloatArray
+    position: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def part(self, rows: Sequence[int]) -> Scenario:
+        """Return some of the members."""
+        index = list(rows)
+        return Scenario(self.theta[index], self.latency_s[index], self.position[index])
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What one member did.
+
+    Attributes:
+        episode: Its recording without noise.
+        tripped: Why the safety module would have ended the run; "" where it would not.
+        clipped: Commands that the safety filter changed.
+    """
+
+    episode: Episode
+    tripped: str
+    clipped: int
+
+
+class TrialRunner:
+    """Runs behaviours on the members of a scenario; keeps the simulator from one candidate to the next.
+
+    Args:
+        robot: The nominal model, with a fixed base.
+        space: The parameters.
+        scenario: The members.
+        seconds: Length of a run [s].
+        threads: Simulation threads; None for all CPUs.
+
+    Raises:
+        ConfigurationError: The robot's base floats, or its rates do not divide.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        space: ParameterSpace,
+        scenario: Scenario,
+        seconds: float,
+        threads: int | None = None,
+    ) -> None:
+        description = robot.description
+        if robot.base is not None:
+            raise ConfigurationError(
+                f"robot {description.name!r} has a floating base; excitations are designed for robots on a "
+                "stand (such as go2_suspended), where falling over is no matter"
+            )
+        self._robot, self._scenario = robot, scenario
+        self._device_s = 1.0 / description.device_rate_hz
+        self._repeat = max(round(self._device_s / robot.step_s), 1)
+        self._period = description.steps_per_control
+        self._stride = round(description.device_rate_hz / description.state_rate_hz)
+        if self._period % self._stride:
+            raise ConfigurationError(
+                f"{description.name}: states every {self._stride} device periods do not divide control periods "
+                f"of {self._period}"
+            )
+        self._ticks = math.ceil(seconds * description.control_rate_hz - 1e-9)
+        self._batch = ServoBatch(robot, space, len(scenario), threads)
+
+    def run(self, behaviours: Sequence[Behaviour]) -> list[Trial]:
+        """Run one behaviour a member, reset first; all ask for the same gains and limits at a time.
+
+        Raises:
+            ConfigurationError: They ask for different ones.
+        """
+        description, scenario = self._robot.description, self._scenario
+        for behaviour in behaviours:
+            behaviour.reset()
+        self._batch.set_parameters(scenario.theta)
+        self._batch.set_state(scenario.position, np.zeros_like(scenario.position))
+        loop = _Loop(description, scenario.position)
+        positions, velocities = [self._batch.position[:, None]], [self._batch.velocity[:, None]]
+        path = _Path(self._batch, scenario, self._ticks * self._period, self._device_s)
+        for tick in range(self._ticks):
+            sent = loop.command(behaviours, positions[-1][:, -1], velocities[-1][:, -1], tick)
+            self._batch.set_sent(sent[0].stiffness, sent[0].damping, sent[0].effort_limit)
+            control = path.extend(np.stack([c.position_target for c in sent]), sent[0].speed_limit, self._period)
+            x, v = self._batch.advance(
+                np.repeat(control, self._repeat, axis=1), self._stride * self._repeat
+            )
+            positions.append(x)
+            velocities.append(v)
+            loop.watch(x, v)
+        x, v = np.concatenate(positions, axis=1), np.concatenate(velocities, axis=1)
+        return [self._trial(loop, n, x[n], v[n]) for n in range(len(scenario))]
+
+    def _trial(self, loop: _Loop, n: int, x: FloatArray, v: FloatArray) -> Trial:
+        def each(name: str) -> FloatArray:
+            return np.repeat([getattr(sent[n], name) for sent in loop.sent], self._period, axis=0)
+
+        start = x[0][list(self._robot.description.actuated_index)]
+        episode = Episode(
+            step_s=self._device_s,
+            sample=np.arange(len(x)) * self._stride,
+            position=x,
+            velocity=v,
+            target=each("position_target"),
+            stiffness=each("stiffness"),
+            damping=each("damping"),
+            effort_limit=each("effort_limit"),
+            speed_limit=each("speed_limit"),
+            usable=np.ones(len(x), dtype=bool),
+            start_setpoint=start,
+        )
+        return Trial(episode, loop.tripped[n], loop.clipped[n])
+
+
+class _Path:
+    """The set-points of all members so far: slewed at their own speed limits, then late by their latency."""
+
+    def __init__(self, batch: ServoBatch, scenario: Scenario, steps: int, step_s: float) -> None:
+        description = batch.robot.description
+        self._motor = description.actuation == "motor"
+        self._step_s = step_s
+        self._factor = batch.servo_factor("servo_speed_limit")
+        start = scenario.position[:, list(description.actuated_index)]
+        self._now = np.zeros_like(start) if self._motor else start.copy()
+        late = scenario.latency_s / step_s
+        self._whole = np.floor(late).astype(int)
+        self._part = (late - self._whole)[:, None, None]
+        self._margin = int(self._whole.max()) + 1
+        self._done = self._margin
+        self._path = np.repeat(self._now[:, None], self._margin + steps, axis=1)
+
+    def extend(self, target: FloatArray, speed_limit: FloatArray, steps: int) -> FloatArray:
+        """Return the late set-points of the next steps, (N, steps, A), for targets (N, A)."""
+        ahead = np.repeat(target[:, None], steps, axis=1)
+        if not self._motor:
+            gap = (target - self._now)[:, None]
+            rate = (self._factor * speed_limit)[:, None] * self._step_s
+            reach = rate * np.arange(1, steps + 1)[:, None]
+            ahead = self._now[:, None] + np.clip(gap, -reach, reach)
+        self._path[:, self._done : self._done + steps] = ahead
+        self._now = ahead[:, -1]
+        index = self._done + np.arange(steps) - self._whole[:, None]
+        self._done += steps
+        late = np.take_along_axis(self._path, index[..., None], axis=1)
+        later = np.take_along_axis(self._path, index[..., None] - 1, axis=1)
+        return np.asarray((1 - self._part) * late + self._part * later)
+
+
+class _Loop:
+    """Behaviours behind the safety filter, and what the safety module would have said."""
+
+    def __init__(self, description: RobotDescription, position: FloatArray) -> None:
+        self._description = description
+        self._index = list(description.actuated_index)
+        self._filters = [SafetyFilter(description) for _ in position]
+        self._start = position[:, self._index]
+        self._previous = self._start.copy()
+        self.tripped = [""] * len(position)
+        self.clipped = [0] * len(position)
+        self.sent: list[list[JointCommand]] = []
+
+    def command(
+        self, behaviours: Sequence[Behaviour], position: FloatArray, velocity: FloatArray, tick: int
+    ) -> list[JointCommand]:
+        """Return what is sent to each member."""
+        time_s = tick / self._description.control_rate_hz
+        sent = []
+        for n, behaviour in enumerate(behaviours):
+            if self.tripped[n]:
+                # What a robot would do after a trip is of no interest: its trial is not used.
+                sent.append(self.sent[-1][n])
+                continue
+            wanted = behaviour.command(_state(position[n], velocity[n], tick), time_s)
+            sent.append(self._filtered(n, wanted, position[n][self._index], time_s))
+        if any(not _same_limits(sent[0], other) for n, other in enumerate(sent) if not self.tripped[n]):
+            raise ConfigurationError("behaviours that run side by side must send the same gains and limits")
+        self.sent.append(sent)
+        return sent
+
+    def _filtered(self, n: int, wanted: JointCommand, measured: FloatArray, time_s: float) -> JointCommand:
+        if not is_finite_target(wanted):
+            self.tripped[n] = "the behaviour asked for a command that is not finite"
+            return dataclasses.replace(wanted, position_target=self._previous[n])
+        share = 1.0
+        if self._description.limits.ease_in_s > 0:
+            share = min(time_s / self._description.limits.ease_in_s, 1.0)
+        eased = self._start[n] + share * (wanted.position_target - self._start[n])
+        command, clipped = self._filters[n].clip(
+            dataclasses.replace(wanted, position_target=eased), self._previous[n], measured
+        )
+        self.clipped[n] += bool(clipped)
+        self._previous[n] = command.position_target
+        return command
+
+    def watch(self, position: FloatArray, velocity: FloatArray) -> None:
+        """Note which members left the limits that trip, (N, H, J) each."""
+        limits, names = self._description.limits, self._description.joint_names
+        low, high = np.array(limits.trip_position).T
+        fast = np.array(limits.trip_velocity)
+        for n in range(len(position)):
+            if self.tripped[n]:
+                continue
+            if not np.isfinite(position[n]).all():
+                self.tripped[n] = "the simulation diverged"
+                continue
+            out = np.any((position[n] < low) | (position[n] > high), axis=0)
+            over = np.any(np.abs(velocity[n]) > fast, axis=0)
+            if out.any():
+                self.tripped[n] = f"{names[int(np.argmax(out))]} left its range"
+            elif over.any():
+                self.tripped[n] = f"{names[int(np.argmax(over))]} moved too fast"
+
+
+def is_finite_target(command: JointCommand) -> bool:
+    """Return whether a command is finite, but for a speed limit of infinity: there is no set-point generator."""
+    return is_finite(dataclasses.replace(command, speed_limit=np.zeros_like(command.speed_limit)))
+
+
+def _same_limits(a: JointCommand, b: JointCommand) -> bool:
+    return all(
+        np.array_equal(getattr(a, name), getattr(b, name))
+        for name in ("stiffness", "damping", "effort_limit", "speed_limit")
+    )
+
+
+def _state(position: FloatArray, velocity: FloatArray, tick: int) -> RobotState:
+    return RobotState(position, velocity, np.zeros_like(position), 0, 0, tick, -1, -1, Status.ARMED)

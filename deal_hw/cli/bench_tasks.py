@@ -1,0 +1,214 @@
+"""The benches' robots: for each task, profile and seed a hidden truth, its recordings, and what really was.
+
+The cart-pole is the emulated one, over its bytes in virtual time; ant and Go2 are simulated targets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from deal_hw.cli.run_plan import Profile, RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
+from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.profiles import profile as find_profile
+from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode import Episode, align, fill_gaps
+from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.target import Behaviour, Sensing, TargetRecording, record_target
+from deal_hw.types import FloatArray
+
+DEMONSTRATION_S = 4.0
+TRUTH_PART = (0.1, 0.9)
+"""Truths are drawn from this part of the range."""
+
+LATENCY_S = (0.006, 0.024)
+"""Range of a target's hidden latency in profile ``sensor`` [s]."""
+
+MOST_REDRAWS = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """What a seed's robot gave, and what only the bench knows.
+
+    Attributes:
+        task: Name of the task.
+        profile: Name of the profile.
+        seed: Decides everything.
+        robot: The nominal model.
+        space: What is searched.
+        theta: True values of the free parameters, (K,).
+        latency_s: True total latency [s].
+        fit: The demonstration.
+        heldout: Another motion family.
+        fit_truth: Noise-free positions and velocities at the demonstration's samples, (T, C) each.
+        heldout_truth: Noise-free positions at the held-out samples, (T, C).
+        channel_std: True standard deviation of the measured channels, (M,); None where nothing is noisy.
+        refused: Truths that were drawn and could not demonstrate.
+        truth: The emulated robot's truth, where there is an emulator.
+    """
+
+    task: str
+    profile: str
+    seed: int
+    robot: RobotModel
+    space: ParameterSpace
+    theta: FloatArray
+    latency_s: float
+    fit: Episode
+    heldout: Episode
+    fit_truth: tuple[FloatArray, FloatArray]
+    heldout_truth: FloatArray
+    channel_std: FloatArray | None
+    refused: int
+    truth: Truth | None = None
+
+
+def make_case(task: str, profile: str, seed: int, xi: float, space: str = "") -> Case:
+    """Draw a truth and record a demonstration and a held-out motion.
+
+    Args:
+        task: A name in `TASKS`.
+        profile: "ideal", "sensor" or, for the cart-pole, "realistic".
+        seed: Decides everything.
+        xi: Ratio of the search range.
+        space: Name of the parameter set; the task's default.
+
+    Raises:
+        ConfigurationError: There is no such profile or parameter set for this task.
+        CalibrationError: No drawn truth could demonstrate.
+    """
+    return TASKS[task](profile, seed, xi, space)
+
+
+def _cartpole(profile: str, seed: int, xi: float, space_name: str) -> Case:
+    truth = draw_truth(profile, seed, xi=xi)
+    space = _space(SPACES, space_name).with_ratio(xi)
+    virtual = VirtualCartpole(truth)
+    recordings = []
+    policy = str(shipped_policy("cartpole") or "")
+    kinds: tuple[Profile, ...] = ("rich", "chirp")
+    for kind in kinds:
+        plan = RunPlan(robot="cartpole", profile=kind, seconds=DEMONSTRATION_S, seed=seed, policy=policy)
+        recordings.append(virtual.run(make_behaviour(plan, DESCRIPTION), DEMONSTRATION_S))
+    fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
+    # The truth is of K9; what else may be searched has its nominal value.
+    values = space.known | {p.name: p.nominal for p in space} | truth.parameters
+    return Case(
+        task="cartpole", profile=profile, seed=seed, robot=load_model(DESCRIPTION), space=space,
+        theta=np.array([values[name] for name in space.names]), latency_s=truth.latency_s, fit=fit,
+        heldout=heldout, fit_truth=recordings[0].true_states(fit),
+        heldout_truth=recordings[1].true_states(heldout)[0],
+        channel_std=find_profile(profile).sensor.position_std, refused=truth.refused, truth=truth,
+    )  # fmt: skip
+
+
+def _ant(profile: str, seed: int, xi: float, space_name: str) -> Case:
+    from deal_hw.drivers.ant import description as ant
+    from deal_hw.drivers.ant.motions import flail
+
+    if profile != "ideal":
+        raise ConfigurationError(f"the ant has no sensors, so no profile {profile!r}; use ideal")
+    robot = load_model(ant.DESCRIPTION)
+
+    def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
+        return flail(rng), flail(rng, (1.5, 4.0))
+
+    return _target("ant", robot, _space(ant.SPACES, space_name), profile, seed, xi, motions, None)
+
+
+def _go2(profile: str, seed: int, xi: float, space_name: str) -> Case:
+    from deal_hw.drivers.go2 import description as go2
+    from deal_hw.drivers.go2.motions import FEET, sway
+
+    if profile == "realistic":
+        raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
+    robot = load_model(go2.DESCRIPTION)
+    sensing = Sensing(
+        joint_std=go2.DESCRIPTION.sensor.noise, joint_resolution=go2.DESCRIPTION.sensor.resolution,
+        orientation_std=go2.ORIENTATION_NOISE_RAD, gyro_std=go2.GYRO_NOISE_RAD_S, feet=FEET,
+    )  # fmt: skip
+
+    def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
+        return sway(robot, rng, DEMONSTRATION_S), sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
+
+    space = _space(go2.SPACES, space_name)
+    return _target("go2", robot, space, profile, seed, xi, motions, None if profile == "ideal" else sensing)
+
+
+def _target(
+    task: str,
+    robot: RobotModel,
+    space: ParameterSpace,
+    profile: str,
+    seed: int,
+    xi: float,
+    motions: Callable[[np.random.Generator], tuple[Behaviour, Behaviour]],
+    sensing: Sensing | None,
+) -> Case:
+    space = space.with_ratio(xi)
+    rng = np.random.default_rng([seed, sum(task.encode())])
+    low, high = (round(t / robot.step_s) for t in LATENCY_S)
+    for refused in range(MOST_REDRAWS):  # noqa: B007
+        theta = space.unnormalize(rng.uniform(*TRUTH_PART, len(space)))
+        latency_s = 0.0 if sensing is None else int(rng.integers(low, high + 1)) * robot.step_s
+        try:
+            fit, heldout = (
+                record_target(
+                    robot, space, theta, motion, seconds=DEMONSTRATION_S, latency_s=latency_s,
+                    sensing=sensing, rng=rng,
+                )
+                for motion in motions(rng)
+            )  # fmt: skip
+        except CalibrationError:
+            continue
+        if all(_stands(task, r) for r in (fit, heldout)):
+            break
+    else:
+        raise CalibrationError(f"{task}, seed {seed}: none of {MOST_REDRAWS} truths could demonstrate")
+    std = None if sensing is None else _channel_std(robot, sensing)
+    return Case(
+        task=task, profile=profile, seed=seed, robot=robot, space=space, theta=theta, latency_s=latency_s,
+        fit=fit.episode, heldout=heldout.episode, fit_truth=(fit.position, fit.velocity),
+        heldout_truth=heldout.position, channel_std=std, refused=refused,
+    )  # fmt: skip
+
+
+LOWEST_M = {"ant": 0.0, "go2": 0.12}
+"""A base below this has fallen [m]: a demonstration of a robot that lies on its trunk says little."""
+
+
+def _stands(task: str, recording: TargetRecording) -> bool:
+    return bool(np.all(recording.position[:, 2] > LOWEST_M[task]))
+
+
+def _channel_std(robot: RobotModel, sensing: Sensing) -> FloatArray:
+    joints = np.array(sensing.joint_std)
+    if sensing.joint_resolution:
+        joints = np.sqrt(joints**2 + np.square(sensing.joint_resolution) / 12)
+    # Channels in order: rotation, joints, angular velocity.
+    return np.concatenate([np.full(3, sensing.orientation_std), joints, np.full(3, sensing.gyro_std)])
+
+
+def _space(table: Mapping[str, Callable[[], ParameterSpace]], name: str) -> ParameterSpace:
+    if name and name not in table:
+        raise ConfigurationError(f"there is no parameter set {name!r}; known: {', '.join(table)}")
+    return table[name or next(iter(table))]()
+
+
+def centred(space: ParameterSpace) -> ParameterSpace:
+    """Return the space as the paper searches it: linear ranges [theta / xi, xi theta]."""
+    return ParameterSpace(replace(p, scale="linear") for p in space.parameters)
+
+
+TASKS: Mapping[str, Callable[[str, int, float, str], Case]] = {
+    "cartpole": _cartpole,
+    "ant": _ant,
+    "go2": _go2,
+}

@@ -1,0 +1,92 @@
+"""How large an excitation may be: what a description says of ranges, steps, speeds and efforts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray
+
+MARGIN = 0.9
+"""Share of a limit that is used: what is added on top (noise, the blend from balancing) needs room, too."""
+
+
+def centre(description: RobotDescription) -> FloatArray:
+    """Return what signals are offsets from, (A,): the default pose; for motors no effort."""
+    if description.actuation == "motor":
+        return np.zeros(len(description.actuated))
+    return np.array(description.default_position)[list(description.actuated_index)]
+
+
+def room(description: RobotDescription) -> FloatArray:
+    """Return the largest offset of each actuated joint to either side of the centre, (A,); 0 where none.
+
+    Raises:
+        ConfigurationError: No joint has any.
+    """
+    low, high = np.array(description.limits.target).T
+    around = centre(description)
+    found = np.maximum(np.minimum(around - low, high - around), 0.0)
+    # While a joint does not follow at all, the set-point may be off by the offset.
+    found = MARGIN * np.minimum(found, np.array(description.limits.target_distance))
+    if not np.any(found > 0):
+        raise ConfigurationError(
+            f"no joint of {description.name!r} has room around its centre {around.tolist()} within the "
+            f"target limits {list(description.limits.target)}"
+        )
+    return np.asarray(found)
+
+
+def predicted_effort(description: RobotDescription, offsets: FloatArray) -> FloatArray:
+    """Return the P-D effort of servos that follow a signal, before any limit, (T, A).
+
+    All that a description tells of a servo's motion is its gains: kd v = kp (target - x), a first-order lag
+    with the corner kp / kd. It leaves inertia, friction and load out, so it is a lower estimate for heavy
+    joints; the device's own effort limit is what holds.
+
+    Args:
+        description: The robot.
+        offsets: The signal at each control period, (T, A).
+    """
+    kp, kd = np.array(description.stiffness), np.array(description.damping)
+    rate = np.where(kd > 0, kp / np.where(kd > 0, kd, 1.0), 0.0)
+    follow = -np.expm1(-rate / description.control_rate_hz)
+    position = np.zeros(offsets.shape[1])
+    out = np.empty_like(offsets)
+    for t, target in enumerate(offsets):
+        out[t] = kp * (target - position)
+        position = position + follow * (target - position)
+    return out
+
+
+def fit_to_limits(description: RobotDescription, offsets: FloatArray, *, smooth: bool) -> FloatArray:
+    """Return the factor, at most 1, by which each joint's signal must be scaled to keep the limits, (A,).
+
+    Target range, change of the target from one command to the next, half the speed that trips, and for smooth
+    signals the predicted effort. Steps ask for more effort than there is on purpose: that is how they show
+    the limit.
+
+    Args:
+        description: The robot.
+        offsets: The signal at each control period, (T, A).
+        smooth: Whether effort and speed count.
+    """
+    limits = description.limits
+    step = np.max(np.abs(np.diff(offsets, axis=0, prepend=0.0)), axis=0)
+    pairs = [
+        (np.max(np.abs(offsets), axis=0), room(description)),
+        (step, MARGIN * np.array(limits.target_step)),
+    ]
+    if smooth and description.actuation == "position":
+        trip = np.array(limits.trip_velocity)[list(description.actuated_index)]
+        pairs.append((step * description.control_rate_hz, 0.5 * trip))
+        effort = np.max(np.abs(predicted_effort(description, offsets)), axis=0)
+        pairs.append((effort, np.array(limits.effort)))
+    scale = np.ones(offsets.shape[1])
+    for found, most in pairs:
+        over = (found > most) & np.isfinite(most)
+        scale = np.where(over, np.minimum(scale, most / np.where(over, found, math.inf)), scale)
+    return np.asarray(scale)

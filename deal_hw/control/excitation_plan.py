@@ -1,0 +1,338 @@
+"""A planned excitation: what to play on a robot for calibration, as a small JSON file, and its behaviour.
+
+What is optimal is computed before the run, elsewhere; the control process only reads the table and plays it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from deal_hw.control.behaviours import Behaviour, position_command
+from deal_hw.control.excitation import Segment
+from deal_hw.control.excitation_limits import centre, fit_to_limits, room
+from deal_hw.control.waveforms import (
+    Arrangement,
+    Law,
+    Sweep,
+    Wave,
+    ease,
+    multisine,
+    random_steps,
+    wave_from_json,
+    wave_to_json,
+)
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.types import FloatArray, JointCommand, RobotState
+
+FORMAT = "deal_hw.excitation/1"
+Family = Literal["multisine", "chirp", "steps"]
+FAMILIES = get_args(Family)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExcitationDesign:
+    """What a plan is made from: few numbers, which an optimiser varies."""
+
+    family: Family = "multisine"
+    """multisine: sum of sines with a low peak; chirp: a sweep; steps: random set-points."""
+    seconds: float = 4.0
+    """Length of the run [s]."""
+    amplitude: float = 1.0
+    """Share of the largest amplitude that the limits allow, up to 1."""
+    low_hz: float = 0.3
+    """Least frequency of multisine and chirp."""
+    high_hz: float = 5.0
+    """Greatest frequency of multisine and chirp."""
+    tilt: float = 0.5
+    """How amplitudes of a multisine fall with frequency: 0 flat, 1 equal speeds."""
+    law: Law = "linear"
+    """How a chirp's frequency grows."""
+    arrangement: Arrangement = "one-by-one"
+    """How a chirp treats several joints."""
+    hold_s: tuple[float, float] = (0.1, 0.3)
+    """Shortest and longest hold of a step [s]."""
+    balance_s: float = 0.0
+    """Time spent balancing with a policy first [s]; 0 for robots that stand by themselves."""
+    ease_s: float = 0.2
+    """Time over which a signal swells from the first set-point, and fades at the end [s]; steps have none."""
+    split: float = 0.5
+    """Fraction of the run from which on the second factors hold."""
+    effort: tuple[float, float] = (1.0, 1.0)
+    """Factor on the effort limit that is sent, before and after the split."""
+    speed: tuple[float, float] = (1.0, 1.0)
+    """Factor on the speed limit that is sent, before and after the split."""
+    seed: int = 0
+    """Fixes what is random in the signal."""
+
+    def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            raise UnknownNameError("excitation", self.family, FAMILIES)
+        if not (0 < self.amplitude <= 1 and 0 <= self.balance_s < self.seconds and 0 < self.split <= 1):
+            raise ConfigurationError(
+                f"not a usable excitation: amplitude {self.amplitude:g} (a share of what the limits allow, "
+                f"in (0, 1]), balance_s {self.balance_s:g} of {self.seconds:g} s, split {self.split:g} in (0, 1]"
+            )
+
+    def segments(self) -> tuple[Segment, ...]:
+        """Return the parts of the run in which other limits are sent; none where all factors are 1."""
+        bounds = [(0.0, self.split), (self.split, 1.0)] if self.split < 1 else [(0.0, 1.0)]
+        parts = [
+            Segment(start=low, stop=high, effort_limit=effort, speed_limit=speed)
+            for (low, high), effort, speed in zip(bounds, self.effort, self.speed, strict=False)
+        ]
+        return tuple(p for p in parts if p.effort_limit != 1.0 or p.speed_limit != 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExcitationPlan:
+    """What is played.
+
+    Attributes:
+        robot: Name of the robot.
+        digest: Digest of the description that it was made for.
+        seconds: Length of the run [s].
+        balance_s: Time spent balancing with a policy first [s].
+        ease_s: Time of swelling and fading [s].
+        wave: Offsets from the robot's centre, from the end of balancing on.
+        segments: Parts of the run in which other gains and limits are sent.
+        words: One line that says what it is.
+        predicted: Predicted standard deviation of each parameter in its own scale, where it was computed.
+    """
+
+    robot: str
+    digest: str
+    seconds: float
+    balance_s: float
+    ease_s: float
+    wave: Wave
+    segments: tuple[Segment, ...] = ()
+    words: str = ""
+    predicted: Mapping[str, float] = field(default_factory=dict)
+
+    def check_fits(self, description: RobotDescription) -> None:
+        """Check that the plan was made for this robot.
+
+        Raises:
+            ConfigurationError: It was not.
+        """
+        if self.robot != description.name or self.digest != description.digest():
+            raise ConfigurationError(
+                f"the excitation was made for robot {self.robot!r} (description {self.digest}), this is "
+                f"{description.name!r} ({description.digest()}); make another with `deal-hw excite`"
+            )
+
+    def offsets(self, time_s: FloatArray) -> FloatArray:
+        """Return the eased signal at times of the run, (T,) -> (T, A); 0 while balancing."""
+        local = time_s - self.balance_s
+        window = ease(local, self.seconds - self.balance_s, self.ease_s)
+        return np.asarray(self.wave.at(local) * window[:, None])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "format": FORMAT,
+            "robot": self.robot,
+            "digest": self.digest,
+            "seconds": self.seconds,
+            "balance_s": self.balance_s,
+            "ease_s": self.ease_s,
+            "wave": wave_to_json(self.wave),
+            "segments": [dataclasses.asdict(part) for part in self.segments],
+            "words": self.words,
+            "predicted": dict(self.predicted),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> ExcitationPlan:
+        """Return the plan that :meth:`to_json` wrote.
+
+        Raises:
+            ConfigurationError: The values are not those of a plan.
+        """
+        if values.get("format") != FORMAT:
+            raise ConfigurationError(f"not an excitation: format is {values.get('format')!r}, not {FORMAT!r}")
+        try:
+            return cls(
+                robot=str(values["robot"]),
+                digest=str(values["digest"]),
+                seconds=float(values["seconds"]),
+                balance_s=float(values["balance_s"]),
+                ease_s=float(values["ease_s"]),
+                wave=wave_from_json(values["wave"]),
+                segments=tuple(Segment(**part) for part in values["segments"]),
+                words=str(values["words"]),
+                predicted={str(k): float(v) for k, v in values["predicted"].items()},
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as err:
+            if isinstance(err, ConfigurationError):
+                raise
+            raise ConfigurationError(f"not an excitation: {type(err).__name__} {err}") from err
+
+    def write(self, path: Path) -> None:
+        """Write the plan as JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(self.to_json(), indent=1) + "\n", encoding="utf-8")
+
+
+def read_plan(path: Path) -> ExcitationPlan:
+    """Return the plan of a file.
+
+    Raises:
+        ConfigurationError: It cannot be read, or holds no plan.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as err:
+        raise ConfigurationError(
+            f"--excite {path}: {err}; give one of {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` "
+            "wrote"
+        ) from err
+    if not isinstance(values, dict):
+        raise ConfigurationError(f"--excite {path}: not an excitation, but a JSON {type(values).__name__}")
+    return ExcitationPlan.from_json(values)
+
+
+def make_plan(description: RobotDescription, design: ExcitationDesign) -> ExcitationPlan:
+    """Return the plan of a design, as large as the design asks and the safety limits allow.
+
+    Raises:
+        ConfigurationError: No joint has room to move, or a factor exceeds what may be sent.
+    """
+    _check_factors(description, design)
+    rng = np.random.default_rng(design.seed)
+    length = design.seconds - design.balance_s
+    most = room(description)
+    wave: Wave
+    ease_s = min(design.ease_s, 0.25 * length)
+    if design.family == "steps":
+        wave, ease_s = random_steps(most, length, design.hold_s, rng), 0.0
+    elif design.family == "chirp":
+        wave = Sweep(
+            amplitude=tuple(map(float, most)), duration_s=length, low_hz=design.low_hz,
+            high_hz=design.high_hz, law=design.law, arrangement=design.arrangement,
+        )  # fmt: skip
+    else:
+        wave = multisine(most, design.low_hz, design.high_hz, 1.0 / length, tilt=design.tilt, rng=rng)
+    plan = ExcitationPlan(
+        robot=description.name, digest=description.digest(), seconds=design.seconds,
+        balance_s=design.balance_s, ease_s=ease_s, wave=wave, segments=design.segments(), words=words(design),
+    )  # fmt: skip
+    times = design.balance_s + np.arange(0.0, length, 1.0 / description.control_rate_hz)
+    scale = fit_to_limits(description, plan.offsets(times), smooth=design.family != "steps")
+    return dataclasses.replace(plan, wave=wave.scaled(scale * design.amplitude))
+
+
+def _check_factors(description: RobotDescription, design: ExcitationDesign) -> None:
+    limits = description.limits
+    for what, factors, default, most in (
+        ("effort", design.effort, description.effort_limit, limits.effort),
+        ("speed", design.speed, description.speed_limit, limits.speed),
+    ):
+        for factor in factors:
+            # The description's own defaults are not this plan's choice.
+            if factor != 1.0 and not 0 < factor <= largest_factor(default, most):
+                greatest = largest_factor(default, most)
+                raise ConfigurationError(
+                    f"{what} factor {factor:g} on robot {description.name!r}: above 0 and up to "
+                    f"{greatest:.3g} is allowed, or the safety filter would clip it"
+                )
+
+
+def largest_factor(default: Sequence[float], most: Sequence[float]) -> float:
+    """Return the largest factor, at least 1, on defaults, (A,), that stays within limits, (A,)."""
+    ratios = [m / d for d, m in zip(default, most, strict=True) if d > 0 and math.isfinite(d)]
+    return max(min(ratios, default=1.0), 1.0)
+
+
+def words(design: ExcitationDesign) -> str:
+    """Return a design in words, as advice and file carry it."""
+    band = f"{design.low_hz:.2g} to {design.high_hz:.2g} Hz"
+    what = {
+        "multisine": f"a multisine of {band}",
+        "chirp": f"a {design.law} chirp of {band}",
+        "steps": f"random set-points held {design.hold_s[0]:.2g} to {design.hold_s[1]:.2g} s",
+    }[design.family]
+    parts = [f"{design.seconds:g} s of {what} at {design.amplitude:.0%} of the largest amplitude"]
+    if design.balance_s:
+        parts.append(f"{design.balance_s:.2g} s of balancing first")
+    for part in design.segments():
+        sent = [
+            f"{factor:.2g} times the {name} limit"
+            for name, factor in (("effort", part.effort_limit), ("speed", part.speed_limit))
+            if factor != 1.0
+        ]
+        parts.append(f"{' and '.join(sent)} from {part.start:.0%} to {part.stop:.0%} of the run")
+    return ", ".join(parts)
+
+
+class ExcitationBehaviour:
+    """Balances where the plan says so, then plays its signal around the robot's centre.
+
+    The signal swells from the last set-point of the balancing, so the first sample is continuous.
+
+    Args:
+        plan: What to play.
+        description: The robot.
+        balance: What balances at first; needed where the plan balances.
+
+    Raises:
+        ConfigurationError: The plan is another robot's, or nothing balances.
+    """
+
+    def __init__(
+        self, plan: ExcitationPlan, description: RobotDescription, balance: Behaviour | None = None
+    ) -> None:
+        plan.check_fits(description)
+        if plan.balance_s > 0 and balance is None:
+            raise ConfigurationError(
+                f"the excitation balances for {plan.balance_s:g} s first, but there is no policy"
+            )
+        self._plan, self._description = plan, description
+        self._balance = balance if plan.balance_s > 0 else None
+        self._centre = centre(description)
+        self.action: FloatArray | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Start anew with the same signal."""
+        self._last = self._centre
+        self.action = None
+        if self._balance is not None:
+            self._balance.reset()
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        """Return the balancing command or the signal's set-point, with the limits of the segment."""
+        # Half a millisecond of slack: times are multiples of the control period, not exact in binary.
+        if self._balance is not None and time_s + 5e-4 < self._plan.balance_s:
+            wanted = self._balance.command(state, time_s)
+            self.action, self._last = self._balance.action, wanted.position_target
+            return self._scaled(wanted.position_target, time_s)
+        self.action = None
+        offset = self._plan.offsets(np.array([max(time_s, self._plan.balance_s)]))[0]
+        return self._scaled(self._centre + offset + self._left(time_s) * (self._last - self._centre), time_s)
+
+    def _left(self, time_s: float) -> float:
+        """Return how much of the balancing's last set-point is left at a time."""
+        if self._plan.ease_s <= 0:
+            return 0.0
+        since = max(time_s - self._plan.balance_s, 0.0)
+        return 1.0 - float(ease(np.array([since]), float("inf"), self._plan.ease_s)[0])
+
+    def _scaled(self, target: FloatArray, time_s: float) -> JointCommand:
+        fraction = time_s / self._plan.seconds
+        for part in self._plan.segments:
+            if part.start <= fraction < part.stop:
+                return position_command(
+                    self._description, target, stiffness=part.stiffness, damping=part.damping,
+                    effort_limit=part.effort_limit, speed_limit=part.speed_limit,
+                )  # fmt: skip
+        return position_command(self._description, target)

@@ -1,0 +1,50 @@
+"""Motions that excite a standing Go2 without moving its feet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from deal_hw.drivers.go2.description import DESCRIPTION
+from deal_hw.sim.kinematics import standing_targets
+from deal_hw.sim.model import RobotModel
+from deal_hw.types import FloatArray
+
+FEET = tuple(f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR"))
+
+SHIFT_M = (0.04, 0.04, 0.03)
+TURN_RAD = (0.12, 0.10, 0.15)
+"""Largest shift and turn of the body: forward, left, up; roll, pitch, yaw."""
+
+BAND_HZ = (0.4, 3.0)
+EASE_S = 0.5
+_TONES = 3
+
+
+def sway(
+    robot: RobotModel, rng: np.random.Generator, seconds: float, band_hz: tuple[float, float] = BAND_HZ
+) -> Callable[[FloatArray, FloatArray, float], FloatArray]:
+    """Return a behaviour that sways the body in all six directions over standing feet.
+
+    Args:
+        robot: The Go2's model.
+        rng: Draws frequencies and phases.
+        seconds: Length [s].
+        band_hz: Lowest and highest frequency [Hz].
+    """
+    rate = DESCRIPTION.control_rate_hz
+    time = np.arange(round(seconds * rate) + 2) / rate
+    low, high = band_hz
+    frequency = np.exp(rng.uniform(np.log(low), np.log(high), (6, _TONES)))
+    phase = rng.uniform(0.0, 2 * np.pi, (6, _TONES))
+    waves = np.sin(2 * np.pi * frequency * time[:, None, None] + phase).mean(axis=2)
+    # From rest: a step of the targets would throw the robot before anything is known of it.
+    moved = np.minimum(time / EASE_S, 1.0)[:, None] * waves * (*SHIFT_M, *TURN_RAD)
+    pose = np.array(DESCRIPTION.default_position)
+    targets = standing_targets(robot, FEET, moved[:, :3], moved[:, 3:], pose)
+
+    def behaviour(position: FloatArray, velocity: FloatArray, at_s: float) -> FloatArray:
+        return np.asarray(targets[min(round(at_s * rate), len(targets) - 1)])
+
+    return behaviour

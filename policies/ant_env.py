@@ -1,0 +1,119 @@
+"""The running task of the ant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.locomotion import (
+    GRAVITY,
+    HEIGHT,
+    LocomotionEnv,
+    base,
+    joint_terms,
+    locomotion_spec,
+    vector_terms,
+)
+from deal_hw.policies.servo_loop import BoolArray
+from deal_hw.policy import ObservationTerm, PolicySpec
+from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunTask:
+    """Settings of the task; the defaults are what the shipped policy was trained with.
+
+    Attributes:
+        ticks: Control periods in an episode.
+        forward_weight: Reward of speed along the world's x axis [s/m].
+        healthy_reward: Reward of a tick in which the ant is healthy.
+        control_weight: Cost of the sum of squared actions.
+        top_height_m: A higher torso ends the episode, as in gymnasium.
+        start_noise_rad: Largest deviation of joints at the start.
+    """
+
+    ticks: int = 250
+    forward_weight: float = 1.0
+    healthy_reward: float = 1.0
+    control_weight: float = 0.1
+    top_height_m: float = 1.0
+    start_noise_rad: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.ticks < 1:
+            raise ConfigurationError(f"ticks must be at least 1, got {self.ticks}")
+        if not self.top_height_m > 0:
+            raise ConfigurationError(f"top_height_m must be positive, got {self.top_height_m!r}")
+
+
+def run_spec(
+    description: RobotDescription,
+    trained_under: str = "",
+    training: Mapping[str, Any] | None = None,
+) -> PolicySpec:
+    """Return the layout of observation and action: the full state but the place, and the last action.
+
+    Directions are in the torso's frame, unlike gymnasium's quaternion, of which q and -q are one orientation.
+    """
+    terms = [ObservationTerm("height", "z", 2.0), *vector_terms("gravity", 1.0)]
+    terms += [*vector_terms("heading", 1.0), *vector_terms("linear_velocity", 0.5)]
+    terms += [*vector_terms("angular_velocity", 0.2), *joint_terms(description, 0.1)]
+    scale = (1.0,) * len(description.actuated)
+    return locomotion_spec(description, terms, scale, trained_under, training)
+
+
+class AntEnv(LocomotionEnv):
+    """Run along the world's x axis.
+
+    The reward of a tick, from the true state after it, is gymnasium's Ant (version 4)::
+
+        forward_weight vx + healthy_reward - control_weight |a|²
+
+    and 0 in the tick in which the ant stops being healthy, which ends the episode. Two things differ. An ant
+    here is healthy while its torso is not upside down and not above ``top_height_m``; gymnasium also asks for
+    a height of 0.2 m at least, below which the soft floors of this distribution let a resting ant sink. And
+    the control weight is smaller than gymnasium's 0.5: the gear is 15 instead of 150.
+
+    Args:
+        description: The robot.
+        distribution: What each member's parameters and latency are drawn from.
+        count: Members N.
+        task: The settings.
+        threads: Threads of the physics; None for all CPUs.
+    """
+
+    failure_reward = 0.0
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        distribution: ParameterDistribution,
+        count: int,
+        *,
+        task: RunTask | None = None,
+        threads: int | None = 1,
+    ) -> None:
+        self.task = task or RunTask()
+        super().__init__(
+            description, distribution, run_spec(description, distribution.digest()), count,
+            ticks=self.task.ticks, start_noise=self.task.start_noise_rad, threads=threads,
+        )  # fmt: skip
+
+    def reward(
+        self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
+    ) -> FloatArray:
+        """Return the reward of one tick; the class says how it is made."""
+        task = self.task
+        forward = task.forward_weight * velocity[:, 0]
+        return np.asarray(forward + task.healthy_reward - task.control_weight * np.square(action).sum(axis=1))
+
+    def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
+        """Return who lies on the back or flew off."""
+        seen = base(position, velocity)
+        return np.asarray((seen[:, GRAVITY][:, 2] > 0.0) | (seen[:, HEIGHT] > self.task.top_height_m))

@@ -1,0 +1,141 @@
+"""pi_0 in the loop of a target or of a population: policies as plain functions of the state.
+
+Needs numpy only. The callables fit :data:`deal_hw.sim.target.Behaviour` and the calibrator's population
+policies without knowing either: states are those of :class:`deal_hw.sim.batch.ServoBatch`, joints after a
+floating base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import InitVar, dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import UnknownNameError
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
+from deal_hw.types import FloatArray
+
+ASSETS: Final = Path(__file__).parent / "assets"
+SHIPPED: Final = ("ant", "cartpole", "go2")
+"""Robots whose demonstration policy is shipped."""
+
+
+class BatchPolicy(Protocol):
+    """A policy that acts for many members at once."""
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy observes and what its action means."""
+        ...
+
+    def act_batch(self, observations: Observation) -> FloatArray:
+        """Return the actions, (B, A), for observations, (B, O)."""
+        ...
+
+
+def shipped_policy(robot: str) -> OnnxPolicy:
+    """Return the demonstration policy of a robot, trained under uniform domain randomisation.
+
+    Raises:
+        UnknownNameError: None is shipped; the message lists those that are.
+    """
+    if robot not in SHIPPED:
+        raise UnknownNameError("robot with a demonstration policy", robot, SHIPPED)
+    return OnnxPolicy(ASSETS / f"{robot}_udr.onnx")
+
+
+def limited_action(
+    description: RobotDescription, scale: FloatArray, action: FloatArray, before: FloatArray
+) -> FloatArray:
+    """Return actions, (..., A), in [-1, 1] that move the target no faster than the safety limits allow.
+
+    Limited in the action and not after it, so that the policy, which observes its last action, knows what was
+    sent.
+    """
+    step = np.array(description.limits.target_step) / scale
+    return np.clip(np.clip(action, -1.0, 1.0), before - step, before + step)
+
+
+@dataclass(eq=False)
+class PopulationDemonstration:
+    """A policy that drives N robots in closed loop, each from its own state.
+
+    The fields identify it in checkpoints; what it remembers of a rollout is forgotten at tick 0.
+
+    Attributes:
+        policy: The policy.
+        description: The robot.
+        wanted: Wanted velocity of the base: x, y [m/s] and yaw rate [rad/s]; for policies that observe it.
+        spec_digest: Digest of the policy's spec, training record included.
+
+    Raises:
+        PolicyMismatchError: The policy was made for another robot.
+    """
+
+    policy: InitVar[BatchPolicy]
+    description: InitVar[RobotDescription]
+    wanted: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    spec_digest: str = ""
+
+    def __post_init__(self, policy: BatchPolicy, description: RobotDescription) -> None:
+        spec = policy.spec
+        spec.check_fits(description)
+        self.spec_digest = spec.digest()
+        self._policy, self._description = policy, description
+        self._scale = np.array(spec.action_scale)
+        self._offset = np.zeros(len(spec.actuated))
+        if description.actuation == "position":
+            self._offset = np.array(spec.default_position)[list(description.actuated_index)]
+        self._begin(1)
+
+    def _begin(self, count: int) -> None:
+        self._builder = ObservationBuilder(self._policy.spec, (count,))
+        self._builder.command = np.repeat(np.array(self.wanted)[None], count, axis=0)
+        self._action = np.zeros((count, len(self._scale)))
+
+    def __call__(self, position: FloatArray, velocity: FloatArray, tick: int) -> FloatArray:
+        """Return the commands of a control period, (N, A), from states, (N, C) each; tick 0 begins anew.
+
+        Members whose state is not finite (diverged ones) are sent their rest command.
+        """
+        if tick == 0 or len(position) != len(self._action):
+            self._begin(len(position))
+        finite = np.isfinite(position).all(axis=1) & np.isfinite(velocity).all(axis=1)
+        known = np.nan_to_num(position), np.nan_to_num(velocity)
+        observation = self._builder.build(*known)
+        wanted = np.where(finite[:, None], self._policy.act_batch(observation), 0.0)
+        self._action = limited_action(self._description, self._scale, wanted, self._action)
+        self._builder.record_action(self._action)
+        return np.asarray(self._offset + self._scale * self._action)
+
+
+class Demonstration:
+    """The same for one robot, as a target's behaviour: position (C,), velocity (C,), time [s] -> (A,).
+
+    Args:
+        policy: The policy.
+        description: The robot.
+        wanted: See :class:`PopulationDemonstration`.
+
+    Raises:
+        PolicyMismatchError: The policy was made for another robot.
+    """
+
+    def __init__(
+        self,
+        policy: BatchPolicy,
+        description: RobotDescription,
+        wanted: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self._population = PopulationDemonstration(policy, description, wanted)
+        self._rate_hz = description.control_rate_hz
+
+    def __call__(self, position: FloatArray, velocity: FloatArray, time_s: float) -> FloatArray:
+        """Return the command of the next control period; time 0 begins anew."""
+        tick = round(time_s * self._rate_hz)
+        command: FloatArray = self._population(position[None], velocity[None], tick)[0]
+        return command

@@ -1,0 +1,182 @@
+"""What the tasks of robots with a floating base share: starts, termination by tilt, specs, judgement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.demonstration import BatchPolicy, limited_action
+from deal_hw.policies.servo_loop import BoolArray
+from deal_hw.policies.vector_env import ServoVectorEnv
+from deal_hw.policy import AXES, ObservationTerm, PolicySpec, Quantity, base_features
+from deal_hw.sim.batch import ServoBatch
+from deal_hw.types import FloatArray
+
+POOL = 64
+"""Settled robots that episodes start from."""
+SETTLE_S = 1.0
+
+GRAVITY, HEADING, ANGULAR, LINEAR, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
+"""Columns of :func:`deal_hw.policy.base_features`."""
+
+
+class LocomotionEnv(ServoVectorEnv):
+    """Robots on a floor that start from rest in their default pose.
+
+    A start is drawn from a pool of robots of the same distribution that stood (or lay) for a second, as a
+    target does before it is recorded; those that ended while settling are left out.
+
+    Args:
+        description: The robot; its base floats.
+        distribution: What each member's parameters and latency are drawn from.
+        layout: What is observed and what an action means.
+        count: Members N.
+        ticks: Control periods in an episode.
+        start_noise: Largest deviation of a joint from its settled position [rad].
+        threads: Threads of the physics; None for all CPUs.
+
+    Raises:
+        ConfigurationError: The robot's base is fixed, or none of the settled robots may start.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        distribution: ParameterDistribution,
+        layout: PolicySpec,
+        count: int,
+        *,
+        ticks: int,
+        start_noise: float,
+        threads: int | None = 1,
+    ) -> None:
+        if description.floating_base is None:
+            raise ConfigurationError(
+                f"robot {description.name!r} has a fixed base; locomotion needs a free one"
+            )
+        super().__init__(
+            description, distribution, layout, count, ticks=ticks, host_delay_s=(0.0, 0.0), threads=threads
+        )
+        self._start_noise = start_noise
+        self._pool = self._settled(threads)
+
+    def start_setpoint(self) -> FloatArray:
+        """Return the command that holds the default pose; motors are off."""
+        return self._default
+
+    def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+        """Draw settled robots and move their joints a little; at rest."""
+        position = self._pool[rng.integers(len(self._pool), size=count)]
+        joints = self.loop.batch.robot.joints
+        position[:, joints] += rng.uniform(-1.0, 1.0, position[:, joints].shape) * self._start_noise
+        return position, np.zeros_like(position)
+
+    def limited(self, action: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the actions after the safety limit on the targets' steps."""
+        return limited_action(self.description, self._scale, action, before)
+
+    def _settled(self, threads: int | None) -> FloatArray:
+        # Fixed draws: the pool is part of the task and does not depend on the seed of a reset.
+        space, robot = self.distribution.space, self.loop.batch.robot
+        batch = ServoBatch(robot, space, POOL, threads)
+        batch.set_parameters(self.distribution.sample(np.random.default_rng(0), POOL))
+        start = batch.position
+        start[:, robot.joints] = self.description.default_position
+        batch.set_state(start, np.zeros_like(start))
+        steps = round(SETTLE_S / robot.step_s)
+        moved = batch.advance(np.broadcast_to(self._default, (POOL, steps, len(self._default))))
+        position, velocity = moved[0][:, 0], moved[1][:, 0]
+        fit = np.isfinite(position).all(axis=1)
+        fit[fit] = ~self.ended(position[fit], velocity[fit])
+        if not fit.any():
+            raise ConfigurationError(
+                f"none of {POOL} robots {self.description.name!r} can hold the default pose under the "
+                "distribution; narrow it or correct the default pose"
+            )
+        return np.asarray(position[fit])
+
+
+def base(position: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Return what there is to know of the bases of states, (N, C) each: (N, 13)."""
+    return base_features(position[:, :6], velocity[:, :6])
+
+
+def vector_terms(quantity: Quantity, scale: float) -> list[ObservationTerm]:
+    """Return the terms of a quantity's three axes."""
+    return [ObservationTerm(quantity, axis, scale) for axis in AXES]
+
+
+def joint_terms(description: RobotDescription, velocity_scale: float) -> list[ObservationTerm]:
+    """Return the terms of joint positions, joint velocities and the last action."""
+    terms = [ObservationTerm("position", name, 1.0) for name in description.joint_names]
+    terms += [ObservationTerm("velocity", name, velocity_scale) for name in description.joint_names]
+    return terms + [ObservationTerm("action", name, 1.0, 1) for name in description.actuated]
+
+
+def locomotion_spec(
+    description: RobotDescription,
+    terms: Sequence[ObservationTerm],
+    action_scale: Sequence[float],
+    trained_under: str,
+    training: Mapping[str, Any] | None,
+) -> PolicySpec:
+    """Return a spec with the description's gains and limits, the latter within what may be sent."""
+    limits = description.limits
+    return PolicySpec(
+        robot=description.name,
+        joint_names=description.joint_names,
+        actuated=description.actuated,
+        observation=tuple(terms),
+        action_scale=tuple(action_scale),
+        default_position=description.default_position,
+        stiffness=description.stiffness,
+        damping=description.damping,
+        effort_limit=tuple(map(min, description.effort_limit, limits.effort)),
+        speed_limit=description.speed_limit,
+        control_rate_hz=description.control_rate_hz,
+        trained_under=trained_under,
+        training=dict(training or {}),
+    )
+
+
+def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
+    """Return what a policy does in one episode of each member of an environment.
+
+    Args:
+        policy: The policy.
+        env: The environment; each member is another draw of its distribution.
+        seed: Decides the draws.
+
+    Returns:
+        Plain JSON values: returns (undiscounted), the share that fell, the share of the time they were up,
+        and the mean forward speed of those that did not fall [m/s].
+    """
+    observation, _ = env.reset(seed=seed)
+    count = env.num_envs
+    going, total, lasted, way = np.ones(count, dtype=bool), np.zeros(count), np.zeros(count), np.zeros(count)
+    fell: BoolArray = np.zeros(count, dtype=bool)
+    for _ in range(env.ticks):
+        speed = base(env.loop.position, env.loop.velocity)[:, LINEAR][:, 0]
+        observation, reward, terminated, truncated, _ = env.step(policy.act_batch(observation))
+        total += np.where(going, reward, 0.0)
+        way += np.where(going, speed, 0.0)
+        lasted += going
+        fell |= going & terminated
+        going &= ~(terminated | truncated)
+    up = ~fell
+    return {
+        "robots": count,
+        "seed": seed,
+        "episode_s": env.ticks / env.description.control_rate_hz,
+        "return_mean": float(total.mean()),
+        "return_std": float(total.std()),
+        "return_quartiles": [float(x) for x in np.quantile(total, (0.25, 0.5, 0.75))],
+        "fall_rate": float(fell.mean()),
+        "time_up": float((lasted / env.ticks).mean()),
+        "forward_speed_m_s": float((way[up] / lasted[up]).mean()) if up.any() else None,
+    }

@@ -1,0 +1,167 @@
+"""`ekf`: the filter against exact answers, and the contract."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman, only
+from deal_hw.calib.checkpoint import Checkpoint
+from deal_hw.calib.problem import Problem
+from deal_hw.calibration import Budget
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode import Episode, align
+from deal_hw.sim.model import load_model
+from deal_hw.testing.method_suite import MethodCase, MethodSuite
+from deal_hw.testing.simulated_episode import simulated_episode
+from deal_hw.types import FloatArray
+
+TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
+"""Factors of the nominal values."""
+
+
+@functools.cache
+def recorded() -> tuple[ParameterSpace, FloatArray, Episode]:
+    """Return a space with two free parameters, their true values, and 1.2 s of a noise-free recording."""
+    space = k9_space().with_ratio(5.0).with_free(TRUTH)
+    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
+    return space, theta, align(simulated_episode(DESCRIPTION, space, theta, seconds=1.2), DESCRIPTION)
+
+
+def problem(fixed_latency_s: float | None = 0.0) -> Problem:
+    """Return the problem of finding them."""
+    space, _, episode = recorded()
+    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s)
+
+
+class TestEkf(MethodSuite):
+    """`ekf` on a clean recording: within 5 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return MethodCase(
+            method=Ekf(),
+            make_problem=problem,
+            truth=recorded()[1],
+            budget=Budget(generations=8),
+            short_budget=Budget(generations=2),
+            tolerance=0.05,
+            open_store=Checkpoint,
+        )
+
+
+def slope_filter(noise: FloatArray | None = None) -> ExtendedKalman:
+    """Return a filter of x that grows by an unknown a at each step: mean (0, 0.5), variances (1, 4)."""
+    return ExtendedKalman(
+        np.array([0.0, 0.5]),
+        np.diag([1.0, 4.0]),
+        moving=1,
+        step=np.array([1e-3, 1e-3]),
+        noise=np.zeros(2) if noise is None else noise,
+    )
+
+
+def advance(kalman: ExtendedKalman, measured: float, std: float) -> float:
+    """Take one step of x' = x + a, y = x'."""
+    points = kalman.ask()
+    moved = points[:, :1] + points[:, 1:]
+    return kalman.tell(moved, moved, np.array([measured]), np.array([std]))
+
+
+def test_filter_takes_the_step_computed_by_hand() -> None:
+    """One linear step.
+
+    F = [[1, 1], [0, 1]], so P- = [[5, 4], [4, 4]] around (0.5, 0.5). A measurement of 2 +- 1 has the innovation
+    1.5 with S = 5 + 1 = 6 and the gain (5, 4) / 6: mean (0.5 + 1.25, 0.5 + 1), P = P- - (5, 4)'(5, 4) / 6.
+    """
+    kalman = slope_filter()
+    assert advance(kalman, 2.0, 1.0) == pytest.approx(1.5**2 / 6)
+    np.testing.assert_allclose(kalman.mean, [1.75, 1.5], rtol=1e-9)
+    np.testing.assert_allclose(kalman.covariance, [[5 / 6, 2 / 3], [2 / 3, 4 / 3]], rtol=1e-8)
+
+
+def test_filter_without_a_measurement_only_predicts() -> None:
+    """An infinite standard deviation says that nothing was reported."""
+    kalman = slope_filter()
+    assert math.isnan(advance(kalman, 123.0, math.inf))
+    np.testing.assert_allclose(kalman.mean, [0.5, 0.5])
+    np.testing.assert_allclose(kalman.covariance, [[5.0, 4.0], [4.0, 4.0]], rtol=1e-8)
+
+
+def test_noise_enters_before_the_step() -> None:
+    """Variances (1, 0) added to x first: P- = F [[2, 0], [0, 4]] F' = [[6, 4], [4, 4]]."""
+    kalman = slope_filter(np.array([1.0, 0.0]))
+    advance(kalman, 0.0, math.inf)
+    np.testing.assert_allclose(kalman.covariance, [[6.0, 4.0], [4.0, 4.0]], rtol=1e-8)
+
+
+def test_filter_equals_the_regression_on_a_linear_model() -> None:
+    """Twenty steps of x + a t give the mean and covariance of weighted least squares with the prior."""
+    rng = np.random.default_rng(3)
+    times = np.arange(1.0, 21.0)
+    measured = 0.2 + 0.7 * times + 0.5 * rng.standard_normal(20)
+    kalman = slope_filter()
+    for y in measured:
+        advance(kalman, float(y), 0.5)
+    design = np.column_stack([np.ones(20), times])
+    information = design.T @ design / 0.25 + np.diag([1.0, 0.25])
+    mean = np.linalg.solve(information, design.T @ measured / 0.25 + np.array([0.0, 0.5 * 0.25]))
+    # The filter's x is the one after twenty steps.
+    to_last = np.array([[1.0, 20.0], [0.0, 1.0]])
+    np.testing.assert_allclose(kalman.mean, to_last @ mean, rtol=1e-6)
+    np.testing.assert_allclose(kalman.covariance, to_last @ np.linalg.inv(information) @ to_last.T, rtol=1e-5)
+
+
+def test_restart_keeps_the_parameters_and_forgets_the_rest() -> None:
+    """After a gap the state is that of the recording, and no correlation with it is left."""
+    kalman = slope_filter()
+    advance(kalman, 2.0, 1.0)
+    kalman.restart(np.array([7.0]), np.array([0.1]))
+    np.testing.assert_allclose(kalman.mean, [7.0, 1.5], rtol=1e-9)
+    np.testing.assert_allclose(kalman.covariance, np.diag([0.01, 4 / 3]), rtol=1e-8)
+
+
+def test_latency_is_one_more_state() -> None:
+    """A latency of zero is found from the middle of its range, within 1 ms, and is stated with an interval."""
+    result = Ekf().run(problem(None), Budget(), np.random.default_rng(0))
+    assert result.latency_s < 1e-3
+    assert 0.0 <= result.latency_interval_s[0] <= result.latency_s <= result.latency_interval_s[1]
+    assert np.mean(np.abs(np.log(result.estimate / recorded()[1]))) < 0.05
+
+
+def test_a_diverged_filter_says_so() -> None:
+    """One pass from far off leaves innovations that its covariance does not explain."""
+    settings = EkfSettings(passes=1, first_noise_factor=1.0)
+    result = Ekf(settings).run(problem(), Budget(), np.random.default_rng(0))
+    assert result.chi2 > 3.0
+    assert "diverged" in result.alarms[0]
+
+
+def test_passes_start_with_the_prior_that_a_parameter_has() -> None:
+    """Zero drift and a sharp prior at the wrong value: the filter hardly moves from it."""
+    space, _, episode = recorded()
+    sharp = ParameterSpace(
+        dataclasses.replace(p, prior_mean=p.nominal, prior_std=1e-6) if not p.known else p
+        for p in space.parameters
+    )
+    made = Problem(load_model(DESCRIPTION), sharp, [episode], threads=1, fixed_latency_s=0.0)
+    settings = EkfSettings(passes=1, parameter_drift=0.0, first_noise_factor=1e6)
+    result = Ekf(settings).run(made, Budget(), np.random.default_rng(0))
+    np.testing.assert_allclose(result.estimate, sharp.nominal, rtol=1e-3)
+
+
+def test_one_window_of_several_is_that_window() -> None:
+    """Arrays keep their shape but for the count."""
+    data = problem().windows(3)[0]
+    one = only(data, 4)
+    assert len(one.windows) == 1
+    assert one.windows.start[0] == data.windows.start[4]
+    np.testing.assert_array_equal(one.measured[0], data.measured[4])
+    np.testing.assert_array_equal(one.prior_std[0], data.prior_std[4])

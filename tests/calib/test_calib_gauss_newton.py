@@ -1,0 +1,118 @@
+"""`gauss-newton`: the contract, noise and latency, restarts, and intervals that are those of the data."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings, Innovations, costs
+from deal_hw.calib.checkpoint import Checkpoint
+from deal_hw.calib.problem import Problem
+from deal_hw.calibration import Budget, Progress
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode import Episode, align
+from deal_hw.sim.model import load_model
+from deal_hw.testing.method_suite import MethodCase, MethodSuite
+from deal_hw.testing.simulated_episode import simulated_episode
+from deal_hw.types import FloatArray
+
+TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
+"""Factors of the nominal values."""
+
+LATENCY_TICKS = 7
+SMALL = GaussNewtonSettings(draws=40, starts=4, survivors=2)
+
+
+@functools.cache
+def recorded(sensor: bool) -> tuple[ParameterSpace, FloatArray, Episode]:
+    """Return a space with two free parameters, their true values, and a recording."""
+    space = k9_space().with_ratio(5.0).with_free(TRUTH)
+    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
+    seconds, ticks = (3.0, LATENCY_TICKS) if sensor else (1.2, 0)
+    trajectory = simulated_episode(
+        DESCRIPTION, space, theta, seconds=seconds, latency_ticks=ticks, sensor=sensor
+    )
+    return space, theta, align(trajectory, DESCRIPTION)
+
+
+def problem(sensor: bool = False) -> Problem:
+    """Return the problem of finding them; the latency is given unless there is noise."""
+    space, _, episode = recorded(sensor)
+    robot = load_model(DESCRIPTION)
+    return Problem(robot, space, [episode], threads=1, fixed_latency_s=None if sensor else 0.0)
+
+
+class TestGaussNewton(MethodSuite):
+    """`gauss-newton`: within 0.1 %."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return MethodCase(
+            method=GaussNewton(SMALL),
+            make_problem=problem,
+            truth=recorded(False)[1],
+            budget=Budget(population=20, generations=20),
+            short_budget=Budget(population=10, generations=4),
+            tolerance=1e-3,
+            open_store=Checkpoint,
+        )
+
+
+def test_finds_parameters_and_latency_under_noise() -> None:
+    """Two parameters within 5 %, the latency within 1 ms, all inside the stated intervals; the residual is noise."""
+    made = problem(sensor=True)
+    result = GaussNewton(SMALL).run(made, Budget(population=20, generations=30), np.random.default_rng(0))
+    theta = recorded(True)[1]
+    assert np.all(np.abs(np.log(result.estimate / theta)) < 0.05)
+    assert abs(result.latency_s - LATENCY_TICKS / DESCRIPTION.device_rate_hz) < 1e-3
+    assert np.all((result.interval[:, 0] < theta) & (theta < result.interval[:, 1]))
+    assert result.chi2 < 1.5
+    assert result.provenance["restarts"] == 0
+    assert result.verdicts == ("identifiable", "identifiable")
+
+
+def test_draws_again_while_the_residual_is_unexplained() -> None:
+    """With a bar that nothing passes the budget is used up, the best multi-start is kept and the rest counted."""
+    settings = GaussNewtonSettings(draws=10, starts=2, stage_generations=2, restart_chi2=0.0)
+    stages: list[float] = []
+
+    def watch(progress: Progress) -> None:
+        stages.append(progress.values["stage"])
+
+    result = GaussNewton(settings).run(
+        problem(), Budget(population=10, generations=14), np.random.default_rng(1), watch
+    )
+    assert len(stages) == 14
+    assert result.provenance["restarts"] >= 2
+    assert stages[:5] == [-1.0, 0.0, 0.0, 1.0, 1.0]
+
+
+def test_derivatives_are_those_of_each_start() -> None:
+    """Gradient and Hessian of two starts in one batch are those of each alone, and the gradient is the slope."""
+    innovations = Innovations(problem(), 5, follow=False)
+    made = innovations.problem
+    base = np.append(made.space.to_scale(recorded(False)[1]), 0.0)
+    values = base + np.array([[0.3, -0.2, 0.0], [-0.1, 0.4, 0.0]])
+    both = innovations.linear(values, base)
+    for s in range(2):
+        alone = innovations.linear(values[s : s + 1], base)
+        np.testing.assert_allclose(both.gradient[s], alone.gradient[0], rtol=1e-9)
+        np.testing.assert_allclose(both.hessian[s], alone.hessian[0], rtol=1e-9)
+    step = np.array([1e-3, 0.0, 0.0])
+    ahead, behind = costs(innovations.residual(np.stack([values[0] + step, values[0] - step]), base))
+    assert both.gradient[0, 0] == pytest.approx((ahead - behind) / (4 * 1e-3), rel=0.02)
+    # The latency is given: nothing leads along it.
+    assert both.gradient[0, 2] == both.hessian[0, 2, 2] == 0.0
+    assert both.residual.shape[1] == sum(part.size for part in innovations.split(both.residual[0]))
+
+
+def test_diverged_residuals_cost_infinitely_much() -> None:
+    """A member that has blown up is never the better one."""
+    np.testing.assert_array_equal(
+        costs(np.array([[1.0, 2.0], [np.nan, 0.0], [np.inf, 0.0]])), [5.0, np.inf, np.inf]
+    )
