@@ -37,7 +37,7 @@ class SearchSettings:
 
     candidates: int = 40
     """Random designs."""
-    screening: int = 2
+    screening: int = 3
     """Members that random designs are tried on."""
     finalists: int = 4
     """Designs that are tried on all members."""
@@ -122,7 +122,9 @@ def search_excitation(
             notify(count.tried, total, f"{design.family}: {found.tripped or f'{found.gain:.1f} nats'}")
         return found
 
-    drawn = [_draw(description, experiment.seconds, balance is not None, rng) for _ in range(wanted.candidates)]
+    drawn = [
+        _draw(description, experiment.seconds, balance is not None, rng) for _ in range(wanted.candidates)
+    ]
     screened = [(score(predict(d, wanted.screening), wanted), i) for i, d in enumerate(drawn)]
     ranked = [i for s, i in sorted(screened, reverse=True) if np.isfinite(s)][: wanted.finalists]
     finals = [(predict(drawn[i]), drawn[i]) for i in ranked]
@@ -130,8 +132,8 @@ def search_excitation(
     if not finals:
         reasons = ", ".join(f"{n} x {why}" for why, n in count.tripped.items())
         raise CalibrationError(
-            f"none of {count.tried} excitations keeps {description.name!r} inside its limits ({reasons}); draw "
-            "from narrower ranges (--xi, --calibration), or try more (--candidates)"
+            f"none of {count.tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
+            "draw from narrower ranges (--xi, --calibration), or try more (--candidates)"
         )
     best, design = max(finals, key=lambda pair: score(pair[0], wanted))
     trace = [score(best, wanted)]
@@ -215,7 +217,7 @@ def _moved(
     other = _draw(description, design.seconds, balances, rng)
     band = {"high_hz": high, "low_hz": float(np.clip(design.low_hz * factor, 0.1, 0.8 * design.high_hz))}
     own: dict[str, list[dict[str, object]]] = {
-        "steps": [{"hold_s": (design.hold_s[0] * factor, design.hold_s[1] * factor)}, {"hold_s": other.hold_s}],
+        "steps": [{"hold_s": tuple(s * factor for s in design.hold_s)}, {"hold_s": other.hold_s}],
         "chirp": [{"high_hz": high}, {"low_hz": band["low_hz"]}, {"law": other.law}],
         "multisine": [{"high_hz": high}, {"low_hz": band["low_hz"]}, {"tilt": other.tilt}],
     }

@@ -23,7 +23,7 @@ ADVANCE_S = 0.008
 
 def is_noisy(problem: Problem) -> bool:
     """Return whether what was measured carries sensor noise."""
-    return bool(np.any(problem.noise_std[problem.channels] >= NOISE_FREE_STD))
+    return not problem.exact and bool(np.any(problem.noise_std[problem.channels] >= NOISE_FREE_STD))
 
 
 def samples_per_tick(problem: Problem) -> int:

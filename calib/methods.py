@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from typing import cast
 
@@ -61,5 +62,10 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
     if not polish or name in NULL_METHODS:
         return search
     from deal_hw.calib.pipeline import PolishedMethod
+    from deal_hw.calib.weki import Weki
 
+    if isinstance(search, Weki):
+        search = dataclasses.replace(
+            search, settings=dataclasses.replace(search.settings, before_polish=True)
+        )
     return PolishedMethod(search, name)

@@ -138,8 +138,8 @@ class Problem:
         if self.known_std is not None:
             if self.known_std.shape != (2 * self.coordinates,):
                 raise ConfigurationError(
-                    f"known_std has shape {self.known_std.shape}, expected ({2 * self.coordinates},): positions, "
-                    "then velocities"
+                    f"known_std has shape {self.known_std.shape}, expected ({2 * self.coordinates},): "
+                    "positions, then velocities"
                 )
             return np.maximum(self.known_std, floor)
         if self.exact:
@@ -159,9 +159,8 @@ class Problem:
         # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.
         timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
         columns = self.channels[timed]
-        moved = noise_model(
-            [e.position[:, columns] for e in self.episodes], [s.velocity[:, columns] for s in self.starts], floor
-        )
+        positions = [e.position[:, columns] for e in self.episodes]
+        moved = noise_model(positions, [s.velocity[:, columns] for s in self.starts], floor)
         std = self.noise_std[self.channels]
         std[timed] = moved.position_std
         return NoiseModel(std, moved.timing_std_s)
@@ -308,5 +307,5 @@ class Problem:
         C, channels = x.shape[-1], self.channels
         if np.array_equal(channels, np.arange(C)):
             return Prediction(x, x, v)
-        observed = np.concatenate([x[..., channels[channels < C]], v[..., channels[channels >= C] - C]], axis=-1)
-        return Prediction(observed, x, v)
+        positions, velocities = x[..., channels[channels < C]], v[..., channels[channels >= C] - C]
+        return Prediction(np.concatenate([positions, velocities], axis=-1), x, v)

@@ -23,6 +23,13 @@ STEP_LIMIT = 0.7
 """Largest step of a parameter in its own scale (about a factor two)."""
 
 LATENCY_STEP_LIMIT_S = 0.005
+EXPLAINED = 1.25
+"""A residual below this is not worth another basin."""
+
+SHAKES = (0.5, 0.25, 0.12)
+"""Spreads of the start states that are drawn where the solver got stuck, in standard deviations."""
+
+SHAKE_COUNT = 60
 DAMPINGS = 10.0 ** np.arange(-5.0, 4.0)
 CONVERGED = 1e-4
 
@@ -64,6 +71,7 @@ def polish(
     fixed_latency: bool = False,
     notify: Callable[[int, float], None] | None = None,
     states: States | None = None,
+    shake: bool = True,
 ) -> Polished:
     """Polish parameters from a start.
 
@@ -76,6 +84,7 @@ def polish(
         fixed_latency: Keep the latency.
         notify: Called with iterations done and chi2.
         states: Where the first stage's windows start; the smoothed states by default.
+        shake: Search other start states where contacts leave the solver stuck.
 
     Raises:
         InsufficientDataError: Not even the shortest window fits.
@@ -83,6 +92,8 @@ def polish(
     space = problem.space
     theta = np.clip(theta, space.low, space.high)
     result: Polished | None = None
+    # Fixed: a polish is part of the data's analysis, not of the search's luck.
+    rng = np.random.default_rng(0)
     done = 0
     for seconds in stages_s:
         try:
@@ -92,9 +103,10 @@ def polish(
                 raise
             break
         start = shooting.start(theta, latency_s, states)
-        point, normal, used = _solve(shooting, start, iterations, fixed_latency)
-        done += used
         free = len(space) + (0 if fixed_latency else 1)
+        spreads = SHAKES if shake else ()
+        point, normal, used = _solve_shaken(shooting, start, iterations, fixed_latency, free, rng, spreads)
+        done += used
         chi2 = normal.cost / max(normal.count - free, 1)
         if result is not None and chi2 > WORSE * max(result.chi2, 1.0):
             break
@@ -108,11 +120,50 @@ def polish(
     return result
 
 
+def polish_windows(
+    shooting: Shooting, point: Point, iterations: int = 6, fixed_latency: bool = False
+) -> Polished:
+    """Polish from a point in the windows it is of, such as a part of all windows or weighed ones.
+
+    Args:
+        shooting: The windows.
+        point: Where to start.
+        iterations: Most iterations.
+        fixed_latency: Keep the latency.
+    """
+    point, normal, used = _solve(shooting, point, iterations, fixed_latency)
+    free = len(shooting.problem.space) + (0 if fixed_latency else 1)
+    chi2 = normal.cost / max(normal.count - free, 1)
+    return Polished(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
+
+
 def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
     """Return the least and greatest parameters in their own scale, the latency [s] last, (K + 1,) each."""
     space = problem.space
     low, high = problem.latency_range_s
     return np.append(space.to_scale(space.low), low), np.append(space.to_scale(space.high), high)
+
+
+def _solve_shaken(
+    shooting: Shooting,
+    point: Point,
+    iterations: int,
+    fixed_latency: bool,
+    free: int,
+    rng: np.random.Generator,
+    spreads: Sequence[float],
+) -> tuple[Point, Normal, int]:
+    """Solve; while the residual is unexplained, search other start states and solve again."""
+    point, normal, used = _solve(shooting, point, iterations, fixed_latency)
+    if shooting.problem.robot.base is None or shooting.problem.exact:
+        return point, normal, used
+    for spread in spreads:
+        if normal.cost / max(normal.count - free, 1) < EXPLAINED:
+            break
+        point = shooting.shaken(point, spread, SHAKE_COUNT, rng)
+        point, normal, more = _solve(shooting, point, iterations, fixed_latency)
+        used += more
+    return point, normal, used
 
 
 def _solve(

@@ -16,6 +16,13 @@ from deal_hw.calib.problem import Prediction, Problem, WindowData
 from deal_hw.types import FloatArray
 
 PARAMETER_STEP = 1e-4
+CONTACT_STEP = 2e-2
+"""Parameter step where feet touch the floor: sticking and slipping kink predictions on every scale, and a
+secant says more of them than a derivative."""
+
+CONTACT_STATE_STEP = 0.5
+"""Step of start states there, in standard deviations of the smoothed ones."""
+
 LATENCY_STEP_S = 2e-4
 POSITION_STEP = 1e-6
 VELOCITY_STEP = 1e-4
@@ -40,6 +47,23 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
+class WindowRows:
+    """Linearised residuals of one episode's windows; the last S rows are what is known of the start states.
+
+    Attributes:
+        episode: Index of the episode.
+        residual: Whitened residuals, (W, R) with R = H M + S.
+        parameter: Their derivatives by parameters and latency, (W, R, K + 1).
+        start: By the start states, (W, R, S).
+    """
+
+    episode: int
+    residual: FloatArray
+    parameter: FloatArray
+    start: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Normal:
     """Normal equations at a point, start states eliminated.
 
@@ -50,6 +74,8 @@ class Normal:
         gradient: (K + 1,).
         back: Per episode what turns a parameter step into start-state steps: (W, 2C, K + 1) and (W, 2C).
         residual: Whitened residuals per episode, (W, H, M).
+        prior: Information that the parameters' priors gave to the hessian, (K + 1,).
+        rows: Linearised residuals per episode, where they were asked for.
     """
 
     cost: float
@@ -58,6 +84,8 @@ class Normal:
     gradient: FloatArray
     back: tuple[tuple[FloatArray, FloatArray], ...]
     residual: tuple[FloatArray, ...]
+    prior: FloatArray
+    rows: tuple[WindowRows, ...] = ()
 
 
 class Shooting:
@@ -67,15 +95,26 @@ class Shooting:
         problem: The problem.
         length: Samples a window predicts.
         offset: First sample that may start a window.
+        data: The windows, where they are not all that the recordings hold.
     """
 
-    def __init__(self, problem: Problem, length: int, offset: int = 0) -> None:
+    def __init__(
+        self, problem: Problem, length: int, offset: int = 0, data: Sequence[WindowData] | None = None
+    ) -> None:
         self.problem = problem
-        self.data: Sequence[WindowData] = problem.windows(length, offset=offset)
+        self.data: Sequence[WindowData] = problem.windows(length, offset=offset) if data is None else data
         self.length = length
+        mean, std = problem.space.prior
+        # The latency has no prior.
+        self._prior_mean = np.append(problem.space.to_scale(mean), 0.0)
+        self._prior_information = np.append(1 / std**2, 0.0)
         C = problem.coordinates
         self._start_information = [1 / d.prior_std**2 for d in self.data]
+        self._parameter_step = PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
+        if problem.robot.base is not None and not problem.exact:
+            self._parameter_step = CONTACT_STEP
+            self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
 
     def start(self, theta: FloatArray, latency_s: float, states: States | None = None) -> Point:
         """Return the point at parameters (K,) and latency.
@@ -105,7 +144,8 @@ class Shooting:
         found = [(x.copy(), v.copy()) for x, v in self.smoothed()]
         for e, data in enumerate(self.data):
             x, v = found[data.episode]
-            predicted = self._predict(point.value[None], data, point.position[e][None], point.velocity[e][None])
+            start_x, start_v = point.position[e][None], point.velocity[e][None]
+            predicted = self._predict(point.value[None], data, start_x, start_v)
             x[data.windows.start], v[data.windows.start] = point.position[e], point.velocity[e]
             # The last sample of a window is the start of the next, where it has a state of its own.
             inner = data.windows.samples()[:, :-1]
@@ -116,25 +156,33 @@ class Shooting:
         """Return the physical parameters at a point, (K,)."""
         return self.problem.space.from_scale(point.value[:-1])
 
-    def normal(self, point: Point) -> Normal:
-        """Return the normal equations at a point, derivatives by forward differences in one batch."""
+    def normal(self, point: Point, keep: bool = False) -> Normal:
+        """Return the normal equations at a point, derivatives by forward differences in one batch.
+
+        Args:
+            point: Where.
+            keep: Hand back the linearised residuals, too; they take much memory.
+        """
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.problem.exact else C
         members = 1 + K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
-        values[1 : K + 1, :K] += PARAMETER_STEP * np.eye(K)
+        values[1 : K + 1, :K] += self._parameter_step * np.eye(K)
         values[K + 1, K] += LATENCY_STEP_S
-        steps = np.concatenate([np.full(K, PARAMETER_STEP), [LATENCY_STEP_S], self._state_step])[: members - 1]
-        hessian, gradient = np.zeros((K + 1, K + 1)), np.zeros(K + 1)
-        cost, count = 0.0, 0
+        steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
+        steps = steps[: members - 1]
+        expected = point.value - self._prior_mean
+        hessian, gradient = np.diag(self._prior_information), self._prior_information * expected
+        cost, count = float(np.sum(self._prior_information * expected**2)), 0
+        rows: list[WindowRows] = []
         back: list[tuple[FloatArray, FloatArray]] = []
         residuals: list[FloatArray] = []
         for e, data in enumerate(self.data):
             x = np.repeat(point.position[e][None], members, axis=0)
             v = np.repeat(point.velocity[e][None], members, axis=0)
             for c in range(moved):
-                x[K + 2 + c, :, c] += POSITION_STEP
-                v[K + 2 + C + c, :, c] += VELOCITY_STEP
+                x[K + 2 + c, :, c] += self._state_step[c]
+                v[K + 2 + C + c, :, c] += self._state_step[C + c]
             predicted = self._predict(values, data, x, v).observed
             r = (predicted[0] - data.measured) / data.std
             jac = np.moveaxis((predicted[1:] - predicted[:1]) / data.std, 0, -1) / steps
@@ -148,9 +196,13 @@ class Shooting:
             count += r_flat.size
             if self.problem.exact:
                 back.append((np.zeros((W, 2 * C, K + 1)), np.zeros((W, 2 * C))))
+                if keep:
+                    rows.append(WindowRows(data.episode, r_flat, jp, js))
                 continue
             start = np.concatenate([point.position[e], point.velocity[e]], axis=1) - data.prior_mean
             information = self._start_information[e]
+            if keep:
+                rows.append(_rows(data.episode, r_flat, jp, js, np.sqrt(information), start))
             mss = np.einsum("wri,wrj->wij", js, js) + information[:, :, None] * np.eye(2 * C)
             gs = np.einsum("wri,wr->wi", js, r_flat) + information * start
             msp = np.einsum("wri,wrj->wij", js, jp)
@@ -160,7 +212,16 @@ class Shooting:
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
             count += W * int(data.prior_counts.sum()) - W * 2 * C
-        return Normal(cost, count, hessian, gradient, tuple(back), tuple(residuals))
+        return Normal(
+            cost,
+            count,
+            hessian,
+            gradient,
+            tuple(back),
+            tuple(residuals),
+            self._prior_information,
+            tuple(rows),
+        )
 
     def moved(self, point: Point, normal: Normal, step: FloatArray) -> Point:
         """Return the point after a parameter step, (K + 1,), start states following it to first order."""
@@ -172,21 +233,74 @@ class Shooting:
             velocity.append(point.velocity[e] + state[:, C:])
         return Point(point.value + step, tuple(position), tuple(velocity))
 
+    @property
+    def state_std(self) -> FloatArray:
+        """Standard deviation of smoothed start states over all episodes, (2 C,)."""
+        starts = [self.problem.starts[d.episode] for d in self.data]
+        each = [np.concatenate([s.position_std, s.velocity_std]) for s in starts]
+        return np.asarray(np.max(each, axis=0))
+
     def costs(self, points: Sequence[Point]) -> FloatArray:
         """Return the cost at each of several points, in one batch; infinite where a member diverged."""
-        total = np.zeros(len(points))
         values = np.stack([p.value for p in points])
-        for e, data in enumerate(self.data):
+        total = (values - self._prior_mean) ** 2 @ self._prior_information
+        for e in range(len(self.data)):
             x = np.stack([p.position[e] for p in points])
             v = np.stack([p.velocity[e] for p in points])
-            predicted = self._predict(values, data, x, v).observed
-            r = (predicted - data.measured) / data.std
-            total += np.sum(r**2, axis=(1, 2, 3))
-            if not self.problem.exact:
-                start = np.concatenate([x, v], axis=2) - data.prior_mean
-                total += np.sum(self._start_information[e] * start**2, axis=(1, 2))
-        return np.where(np.isfinite(total), total, np.inf)
+            total += self._window_costs(e, values, x, v).sum(axis=1)
+        return total
+
+    def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""
+        data = self.data[e]
+        predicted = self._predict(values, data, x, v).observed
+        cost = np.sum(((predicted - data.measured) / data.std) ** 2, axis=(2, 3))
+        if not self.problem.exact:
+            start = np.concatenate([x, v], axis=2) - data.prior_mean
+            cost = cost + np.sum(self._start_information[e] * start**2, axis=2)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def shaken(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
+        """Return the point with, window by window, the best of several drawn start states.
+
+        Given the parameters the windows do not depend on each other, so one batch searches them all at once.
+        It frees windows whose feet stick where they should slip, which no derivative tells.
+
+        Args:
+            point: Where the solver stands.
+            spread: How far start states are drawn, in standard deviations of the smoothed ones.
+            count: Draws; half of them around the smoothed states instead of the point's.
+            rng: Draws them.
+        """
+        C = self.problem.coordinates
+        std = spread * self.state_std
+        values = np.repeat(point.value[None], count, axis=0)
+        position, velocity = [], []
+        for e, data in enumerate(self.data):
+            W = len(data.windows)
+            draw = std * rng.standard_normal((count, W, 2 * C))
+            draw[0] = 0.0
+            x, v = point.position[e] + draw[..., :C], point.velocity[e] + draw[..., C:]
+            x[1::2] = data.start_position + draw[1::2, :, :C]
+            v[1::2] = data.start_velocity + draw[1::2, :, C:]
+            best = np.argmin(self._window_costs(e, values, x, v), axis=0)
+            position.append(x[best, np.arange(W)])
+            velocity.append(v[best, np.arange(W)])
+        return Point(point.value, tuple(position), tuple(velocity))
 
     def _predict(self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray) -> Prediction:
         theta = self.problem.space.from_scale(values[:, :-1])
         return self.problem.predict(theta, np.maximum(values[:, -1], 0.0), data, x, v)
+
+
+def _rows(
+    episode: int, residual: FloatArray, jp: FloatArray, js: FloatArray, root: FloatArray, start: FloatArray
+) -> WindowRows:
+    """Append to each window the rows of what is known of its start state."""
+    W, _, S = js.shape
+    return WindowRows(
+        episode,
+        np.concatenate([residual, root * start], axis=1),
+        np.concatenate([jp, np.zeros((W, S, jp.shape[2]))], axis=1),
+        np.concatenate([js, root[:, :, None] * np.eye(S)], axis=1),
+    )

@@ -97,14 +97,18 @@ class TrialRunner:
         self._stride = round(description.device_rate_hz / description.state_rate_hz)
         if self._period % self._stride:
             raise ConfigurationError(
-                f"{description.name}: states every {self._stride} device periods do not divide control periods "
-                f"of {self._period}"
+                f"{description.name}: states every {self._stride} device periods do not divide control "
+                f"periods of {self._period}"
             )
         self._ticks = math.ceil(seconds * description.control_rate_hz - 1e-9)
         self._batch = ServoBatch(robot, space, len(scenario), threads)
 
-    def run(self, behaviours: Sequence[Behaviour]) -> list[Trial]:
+    def run(self, behaviours: Sequence[Behaviour], until_trip: bool = False) -> list[Trial]:
         """Run one behaviour a member, reset first; all ask for the same gains and limits at a time.
+
+        Args:
+            behaviours: One a member.
+            until_trip: End all trials as soon as one trips.
 
         Raises:
             ConfigurationError: They ask for different ones.
@@ -119,14 +123,15 @@ class TrialRunner:
         path = _Path(self._batch, scenario, self._ticks * self._period, self._device_s)
         for tick in range(self._ticks):
             sent = loop.command(behaviours, positions[-1][:, -1], velocities[-1][:, -1], tick)
-            self._batch.set_sent(sent[0].stiffness, sent[0].damping, sent[0].effort_limit)
-            control = path.extend(np.stack([c.position_target for c in sent]), sent[0].speed_limit, self._period)
-            x, v = self._batch.advance(
-                np.repeat(control, self._repeat, axis=1), self._stride * self._repeat
-            )
+            lead = sent[next((n for n, why in enumerate(loop.tripped) if not why), 0)]
+            self._batch.set_sent(lead.stiffness, lead.damping, lead.effort_limit)
+            control = path.extend(np.stack([c.position_target for c in sent]), lead.speed_limit, self._period)
+            x, v = self._batch.advance(np.repeat(control, self._repeat, axis=1), self._stride * self._repeat)
             positions.append(x)
             velocities.append(v)
             loop.watch(x, v)
+            if until_trip and any(loop.tripped):
+                break
         x, v = np.concatenate(positions, axis=1), np.concatenate(velocities, axis=1)
         return [self._trial(loop, n, x[n], v[n]) for n in range(len(scenario))]
 
@@ -211,7 +216,8 @@ class _Loop:
                 continue
             wanted = behaviour.command(_state(position[n], velocity[n], tick), time_s)
             sent.append(self._filtered(n, wanted, position[n][self._index], time_s))
-        if any(not _same_limits(sent[0], other) for n, other in enumerate(sent) if not self.tripped[n]):
+        running = [command for command, why in zip(sent, self.tripped, strict=True) if not why]
+        if any(not _same_limits(running[0], other) for other in running):
             raise ConfigurationError("behaviours that run side by side must send the same gains and limits")
         self.sent.append(sent)
         return sent
@@ -251,7 +257,7 @@ class _Loop:
 
 
 def is_finite_target(command: JointCommand) -> bool:
-    """Return whether a command is finite, but for a speed limit of infinity: there is no set-point generator."""
+    """Return whether a command is finite; its speed limit need not be, without a set-point generator."""
     return is_finite(dataclasses.replace(command, speed_limit=np.zeros_like(command.speed_limit)))
 
 

@@ -33,7 +33,8 @@ def heldout_nrmse(
         space: The parameters.
         episodes: Held-out recordings.
         candidates: Name to physical parameters, (K,), and latency [s].
-        truth: Noise-free positions at the episodes' samples, (T, n) each in the order of the measured coordinates, where there are any; else the
+        truth: Noise-free positions at the episodes' samples, (T, n) each in
+            the order of the measured coordinates, where there are any; else the
             reported ones.
         window_s: Prediction restarts from the smoothed reported state this often [s].
         threads: Simulation threads.

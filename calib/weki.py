@@ -32,6 +32,10 @@ class WekiSettings:
         widen: Least spread of a coordinate at the start of each further stage, in logits.
         restart_chi2: A residual above this is not explained: the search starts again from the whole range.
         stage_generations: Most generations of one stage.
+        before_polish: Whether a polish follows. On robots with a free base, and where states are exact, the
+            short windows of the first stage then are enough: the polish starts from there, and long windows
+            of contacts say little to a population.
+        least_spread: Spread in logits at which that stage ends on exact states.
     """
 
     noisy_ticks: tuple[int, ...] = (5, 20, 20)
@@ -40,6 +44,8 @@ class WekiSettings:
     widen: float = 0.5
     restart_chi2: float = 3.0
     stage_generations: int = 20
+    before_polish: bool = False
+    least_spread: float = 2e-3
 
 
 @dataclass(frozen=True)
@@ -64,7 +70,13 @@ class _Weki(KalmanStepper):
     def __init__(self, run: Run, rng: np.random.Generator, settings: WekiSettings) -> None:
         super().__init__(run, rng, settings.step_clip)
         self._settings = settings
-        self._lengths = settings.noisy_ticks if is_noisy(run.problem) else settings.clean_ticks
+        problem = run.problem
+        noisy = is_noisy(problem) and not problem.exact
+        self._lengths = settings.noisy_ticks if noisy else settings.clean_ticks
+        self._brief = settings.before_polish and (problem.robot.base is not None or problem.exact)
+        if self._brief:
+            self._lengths = self._lengths[:1]
+        self._near = False
         self._restarts = 0
         self._best: tuple[float, FloatArray] | None = None
         self._over = run.budget.generations <= 0
@@ -83,6 +95,7 @@ class _Weki(KalmanStepper):
         problem = self.run.problem
         step = self.kalman.tell(whitened_residual(problem, members, centre, self._windows, self._offsets))
         self._generation += 1
+        self._near = self._brief and problem.exact and step.spread < self._settings.least_spread
         ticks = self._lengths[self._stage]
         self.run.note(
             f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
@@ -106,7 +119,7 @@ class _Weki(KalmanStepper):
         """See :meth:`Stepper.result`."""
         chi2, z = self._best or (float("nan"), self.kalman.ask())
         alarms = []
-        if not chi2 <= self._settings.restart_chi2:
+        if not chi2 <= self._settings.restart_chi2 and not self._brief:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
                 f"{len(self.run.trace)} generations; "
@@ -147,6 +160,7 @@ class _Weki(KalmanStepper):
     def _stage_over(self) -> bool:
         return (
             self.kalman.finished
+            or self._near
             or self._generation >= self._settings.stage_generations
             or len(self.run.trace) >= self.run.budget.generations
         )
@@ -166,7 +180,8 @@ class _Weki(KalmanStepper):
         chi2 = explained(self.run.problem, self.population(z)[1], self._lengths[-1])
         if self._best is None or chi2 < self._best[0]:
             self._best = (chi2, z)
-        if chi2 <= self._settings.restart_chi2 or len(self.run.trace) >= self.run.budget.generations:
+        spent = len(self.run.trace) >= self.run.budget.generations
+        if self._brief or spent or chi2 <= self._settings.restart_chi2:
             self._over = True
             return
         self._restarts += 1

@@ -37,7 +37,7 @@ class BatchPolicy(Protocol):
         ...
 
 
-def shipped_policy(robot: str) -> OnnxPolicy:
+def demonstration_policy(robot: str) -> OnnxPolicy:
     """Return the demonstration policy of a robot, trained under uniform domain randomisation.
 
     Raises:
@@ -104,10 +104,10 @@ class PopulationDemonstration:
         """
         if tick == 0 or len(position) != len(self._action):
             self._begin(len(position))
-        finite = np.isfinite(position).all(axis=1) & np.isfinite(velocity).all(axis=1)
+        finite = np.isfinite(np.concatenate([position, velocity], axis=1)).all(axis=1, keepdims=True)
         known = np.nan_to_num(position), np.nan_to_num(velocity)
         observation = self._builder.build(*known)
-        wanted = np.where(finite[:, None], self._policy.act_batch(observation), 0.0)
+        wanted = np.where(finite, self._policy.act_batch(observation), 0.0)
         self._action = limited_action(self._description, self._scale, wanted, self._action)
         self._builder.record_action(self._action)
         return np.asarray(self._offset + self._scale * self._action)

@@ -7,15 +7,15 @@ are the reported states, because on a robot there are no others.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.parameters import ParameterSpace
 from deal_hw.policies.cartpole_env import CART, POLE
+from deal_hw.policies.demonstration import BatchPolicy
 from deal_hw.policies.servo_loop import ServoLoop
-from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
+from deal_hw.policy import ObservationBuilder
 from deal_hw.types import FloatArray
 
 TASK_SECONDS = 10.0
@@ -24,19 +24,6 @@ FALLEN_RAD = 0.5
 
 
 _SLACK_S = 0.1
-
-
-class BatchPolicy(Protocol):
-    """A policy that acts for many members at once."""
-
-    @property
-    def spec(self) -> PolicySpec:
-        """What the policy observes and what its action means."""
-        ...
-
-    def act_batch(self, observations: Observation) -> FloatArray:
-        """Return the actions, (B, A), for observations, (B, O)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -91,7 +91,7 @@ class LocomotionEnv(ServoVectorEnv):
         steps = round(SETTLE_S / robot.step_s)
         moved = batch.advance(np.broadcast_to(self._default, (POOL, steps, len(self._default))))
         position, velocity = moved[0][:, 0], moved[1][:, 0]
-        fit = np.isfinite(position).all(axis=1)
+        fit: BoolArray = np.asarray(np.isfinite(position).all(axis=1))
         fit[fit] = ~self.ended(position[fit], velocity[fit])
         if not fit.any():
             raise ConfigurationError(

@@ -85,7 +85,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         """Return the set-point and targets episodes start with, (A,); None: each member's position."""
         return None
 
-    def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:  # noqa: B027
+    def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
         """Draw what else a task draws for the members, (N,), that start anew; nothing by default."""
 
     def limited(self, action: FloatArray, before: FloatArray) -> FloatArray:

@@ -41,12 +41,12 @@ JUDGE_SEED = 1_000_003
 """Training seeds the environment from 0 ... 2^31 by a generator; held out means drawn by another one."""
 
 COMMON = SacConfig(
-    hidden=(128, 128), gradient_steps=16, batch=256, learning_rate=1e-3, final_learning_rate=3e-4,
-    gamma=0.98, tau=0.01, entropy=0.1, warmup=5_000, buffer=500_000, averaged=0.05,
+    hidden=(128, 128), gradient_steps=8, batch=256, learning_rate=1e-3, final_learning_rate=3e-4,
+    gamma=0.98, tau=0.02, entropy=0.1, warmup=5_000, buffer=500_000, averaged=0.05,
 )  # fmt: skip
 CONFIGS = {
-    "ant": dataclasses.replace(COMMON, steps=300_000, target_entropy=-8.0),
-    "go2": dataclasses.replace(COMMON, steps=300_000, target_entropy=-12.0),
+    "ant": dataclasses.replace(COMMON, steps=240_000, target_entropy=-8.0),
+    "go2": dataclasses.replace(COMMON, steps=240_000, target_entropy=-12.0),
 }
 
 
@@ -72,7 +72,7 @@ def train(robot: str, path: Path, *, seed: int, steps: int | None, members: int,
         "spec_digest": policy.spec.digest(),
         "seconds": time.monotonic() - started,
         "cpu_seconds": time.process_time() - cpu,
-        "machine": f"{platform.machine()}, one thread, {platform.system()}, Python {platform.python_version()}",
+        "machine": f"one thread of {platform.machine()}, shared, Python {platform.python_version()}",
     }
     exported = export_network(policy.network, policy.spec, path)
     held_out = make(description, distribution, judged)

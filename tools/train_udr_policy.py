@@ -23,7 +23,8 @@ import numpy as np
 from deal_hw.cli.train import train_policy, udr_distribution
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.policies.evaluate import BatchPolicy, evaluate_batch
+from deal_hw.policies.demonstration import BatchPolicy
+from deal_hw.policies.evaluate import evaluate_batch
 
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
 ROBOTS = 30

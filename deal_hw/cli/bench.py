@@ -7,10 +7,10 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import tyro
 
@@ -25,8 +25,16 @@ FORMAT = "deal_hw.bench/1"
 class Bench:
     """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
 
-    bench: tyro.conf.Positional[Literal["loop"]]
-    """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows."""
+    bench: tyro.conf.Positional[Literal["loop", "honest", "mismatch", "paper"]]
+    """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
+    honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
+    simulator here does. paper: DEAL's protocol, whose target is the centre of the range."""
+
+    task: str = "cartpole"
+    """Tasks, comma separated: cartpole, ant, go2 (loop: the cart-pole only)."""
+
+    space: str = ""
+    """Parameter set of the task; its default where nothing is named."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "sensor"
     """Profile of the emulated robots."""
@@ -37,14 +45,23 @@ class Bench:
     methods: str = ""
     """Methods, comma separated; by default the default with training, and each search without polish."""
 
-    xi: float = 5.0
-    """Ratio of the search range."""
+    xi: str = "5"
+    """Ratios of the search range, comma separated (loop: one)."""
+
+    polish_all: bool = False
+    """Polish every method; by default only `default` is."""
+
+    population: int = 100
+    """Members of a search."""
+
+    generations: int = 50
+    """Most generations of a search."""
 
     train: bool = True
     """Train and deploy policies with the default method."""
 
-    out: Path = Path("loop.json")
-    """File of the rows; the CSV and the figure lie beside it."""
+    out: Path | None = None
+    """File of the rows, by default BENCH.json; the CSV and the figure lie beside it."""
 
     threads: int | None = None
     """Simulation threads; by default all CPUs."""
@@ -73,47 +90,102 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
+def parse_ratios(text: str) -> tuple[float, ...]:
+    """Return the ratios of a text such as ``"3,5,10"``.
+
+    Raises:
+        ConfigurationError: It is not such a text.
+    """
+    try:
+        ratios = tuple(float(part) for part in text.split(","))
+    except ValueError as err:
+        raise ConfigurationError(f"--xi {text!r}: give numbers above 1, such as 5 or 3,5,10,20") from err
+    if not all(xi > 1 for xi in ratios):
+        raise ConfigurationError(f"--xi {text!r}: a ratio must be above 1")
+    return ratios
+
+
 def bench(config: Bench) -> int:
     """Run the cells that are not done yet, writing the files after each; return 1 if any cell failed."""
+    out = config.out or Path(f"{config.bench}.json")
+    rows = _load(out)
+    names, runs = _loop_runs(config, out) if config.bench == "loop" else _calibration_runs(config)
+    done = {tuple(r.get(name, "") for name in names) for r in rows if not r["error"]}
+    for number, (key, run) in enumerate(runs):
+        if key in done:
+            continue
+        row = run()
+        rows = [r for r in rows if tuple(r.get(name, "") for name in names) != key] + [row]
+        save(out, rows)
+        if not config.quiet:
+            print(f"{number + 1}/{len(runs)} {_line(row)}", flush=True)
+    if not config.quiet:
+        print_summary(rows)
+        print(f"written: {out}, {out.with_suffix('.csv')}, {out.with_suffix('.png')}")
+    return 1 if any(row["error"] for row in rows) else 0
+
+
+Runs = list[tuple[tuple[Any, ...], Callable[[], dict[str, Any]]]]
+"""Cells by their key, each with what runs it."""
+
+
+def _methods(config: Bench, default: Sequence[str]) -> tuple[str, ...]:
+    return tuple(m.strip() for m in config.methods.split(",") if m.strip()) or tuple(default)
+
+
+def _loop_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
     try:
         from deal_hw.calib.methods import check_method
         from deal_hw.cli.bench_loop import SEARCHES, loop_cells, loop_row
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "bench") from err
 
-    methods = tuple(m.strip() for m in config.methods.split(",") if m.strip()) or ("default", *SEARCHES)
+    methods = _methods(config, ("default", *SEARCHES))
     for method in methods:
         check_method(method)
-    rows = _load(config.out)
-    policies = config.out.parent / f"{config.out.stem}_policies"
-    cells = loop_cells(methods, parse_seeds(config.seeds))
-    done = {(r["profile"], r["seed"], r["method"], r["xi"]) for r in rows if not r["error"]}
-    for number, (seed, method) in enumerate(cells):
-        if (config.profile, seed, method, config.xi) in done:
-            continue
-        policies.mkdir(parents=True, exist_ok=True)
-        row = loop_row(
-            config.profile,
-            seed,
-            method,
-            config.xi,
-            train=config.train,
-            folder=policies,
-            threads=config.threads,
+    (xi,) = parse_ratios(config.xi)[:1]
+    policies = out.parent / f"{out.stem}_policies"
+    policies.mkdir(parents=True, exist_ok=True)
+
+    def make(seed: int, method: str) -> Callable[[], dict[str, Any]]:
+        return lambda: loop_row(
+            config.profile, seed, method, xi, train=config.train, folder=policies, threads=config.threads
         )
-        key = ("profile", "seed", "method", "xi")
-        rows = [r for r in rows if any(r[k] != row[k] for k in key)] + [row]
-        save(config.out, rows)
-        if not config.quiet:
-            print(f"{number + 1}/{len(cells)} {_line(row)}", flush=True)
-    if not config.quiet:
-        print_summary(rows)
-        print(f"written: {config.out}, {config.out.with_suffix('.csv')}, {config.out.with_suffix('.png')}")
-    return 1 if any(row["error"] for row in rows) else 0
+
+    cells = loop_cells(methods, parse_seeds(config.seeds))
+    return ("profile", "seed", "method", "xi"), [
+        ((config.profile, seed, method, xi), make(seed, method)) for seed, method in cells
+    ]
+
+
+def _calibration_runs(config: Bench) -> tuple[tuple[str, ...], Runs]:
+    try:
+        from deal_hw.cli.bench_calibrate import KEY, Cell, Protocol, make_cells, run_cell
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "bench") from err
+
+    protocol = cast("Protocol", config.bench)
+    cells = make_cells(
+        protocol,
+        [task.strip() for task in config.task.split(",")],
+        "realistic" if protocol == "mismatch" else config.profile,
+        _methods(config, ("default",)),
+        parse_ratios(config.xi),
+        parse_seeds(config.seeds),
+        space=config.space,
+        polish_all=config.polish_all,
+    )
+
+    def make(cell: Cell) -> Callable[[], dict[str, Any]]:
+        return lambda: run_cell(
+            cell, population=config.population, generations=config.generations, threads=config.threads
+        )
+
+    return KEY, [(cell.key, make(cell)) for cell in cells]
 
 
 def _line(row: Mapping[str, Any]) -> str:
-    head = f"{row['profile']} seed {row['seed']} {row['method']}"
+    head = f"{' '.join(_group(row))} seed {row['seed']}"
     if row["error"]:
         return f"{head}: {row['error']}"
     text = f"{head}: error {row['error_percent']:.2f} %, log error x100 {row['log_error_x100']:.2f}"
@@ -173,7 +245,8 @@ def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     methods = list(dict.fromkeys(row["method"] for row in rows))
     for i, method in enumerate(methods):
-        values = [row["log_error_x100"] for row in rows if row["method"] == method]
+        # An exact result has no place on a log scale.
+        values = [max(row["log_error_x100"], 1e-3) for row in rows if row["method"] == method]
         left.plot([i] * len(values), values, "o", alpha=0.6, color=f"C{i}")
     left.set_xticks(range(len(methods)), methods, rotation=30, ha="right")
     left.set_yscale("log")
@@ -189,6 +262,12 @@ def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     figure.savefig(path, dpi=130)
 
 
+def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a line of the summary stands for."""
+    method = row["method"] + (" + polish" if row.get("polish") and row["method"] != "default" else "")
+    return row.get("task", "cartpole"), row["profile"], f"{row['xi']:g}", method
+
+
 def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
     """Print median and worst by profile and method."""
     import numpy as np
@@ -198,12 +277,12 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
     good = [row for row in rows if not row["error"]]
     table = Table(title="median over seeds (worst)")
     for name in (
-        "profile", "method", "seeds", "error %", "log error x100", "coverage90", "width90",
+        "task", "profile", "xi", "method", "seeds", "error %", "log error x100", "coverage90", "width90",
         "held-out / nominal", "latency error ms", "flagged", "seconds",
     ):  # fmt: skip
-        table.add_column(name, justify="left" if name in ("profile", "method") else "right")
-    for profile, method in dict.fromkeys((row["profile"], row["method"]) for row in good):
-        part = [row for row in good if (row["profile"], row["method"]) == (profile, method)]
+        table.add_column(name, justify="left" if name in ("task", "profile", "method") else "right")
+    for group in dict.fromkeys(_group(row) for row in good):
+        part = [row for row in good if _group(row) == group]
 
         def values(name: str, rows: Sequence[Mapping[str, Any]] = part) -> Any:
             return np.array([row[name] for row in rows], dtype=float)
@@ -211,8 +290,7 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
         ratio = values("heldout_nrmse_calibrated") / values("heldout_nrmse_nominal")
         late = 1e3 * np.abs(values("latency_found") - values("latency_true"))
         table.add_row(
-            profile,
-            method,
+            *group,
             str(len(part)),
             *(
                 f"{np.median(values(n)):.2f} ({values(n).max():.2f})"

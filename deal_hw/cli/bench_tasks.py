@@ -15,8 +15,8 @@ from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
-from deal_hw.drivers.cartpole.truth import Truth
-from deal_hw.errors import CalibrationError, ConfigurationError
+from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.episode import Episode, align, fill_gaps
 from deal_hw.sim.model import RobotModel, load_model
@@ -70,7 +70,27 @@ class Case:
     truth: Truth | None = None
 
 
-def make_case(task: str, profile: str, seed: int, xi: float, space: str = "") -> Case:
+@dataclass(frozen=True, slots=True)
+class _Ask:
+    profile: str
+    seed: int
+    xi: float
+    space: str
+    centred: bool
+
+    def ranges(self, table: Mapping[str, Callable[[], ParameterSpace]]) -> ParameterSpace:
+        """Return the parameter set with its search ranges."""
+        if self.space and self.space not in table:
+            raise UnknownNameError("parameter set", self.space, table)
+        space = table[self.space or next(iter(table))]().with_ratio(self.xi)
+        if not self.centred:
+            return space
+        return ParameterSpace(replace(p, scale="linear") for p in space.parameters)
+
+
+def make_case(
+    task: str, profile: str, seed: int, xi: float, space: str = "", *, centred: bool = False
+) -> Case:
     """Draw a truth and record a demonstration and a held-out motion.
 
     Args:
@@ -79,17 +99,19 @@ def make_case(task: str, profile: str, seed: int, xi: float, space: str = "") ->
         seed: Decides everything.
         xi: Ratio of the search range.
         space: Name of the parameter set; the task's default.
+        centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
         CalibrationError: No drawn truth could demonstrate.
     """
-    return TASKS[task](profile, seed, xi, space)
+    return TASKS[task](_Ask(profile, seed, xi, space, centred))
 
 
-def _cartpole(profile: str, seed: int, xi: float, space_name: str) -> Case:
-    truth = draw_truth(profile, seed, xi=xi)
-    space = _space(SPACES, space_name).with_ratio(xi)
+def _cartpole(ask: _Ask) -> Case:
+    seed, profile = ask.seed, ask.profile
+    truth = nominal_truth(profile, seed) if ask.centred else draw_truth(profile, seed, xi=ask.xi)
+    space = ask.ranges(SPACES)
     virtual = VirtualCartpole(truth)
     recordings = []
     policy = str(shipped_policy("cartpole") or "")
@@ -109,25 +131,25 @@ def _cartpole(profile: str, seed: int, xi: float, space_name: str) -> Case:
     )  # fmt: skip
 
 
-def _ant(profile: str, seed: int, xi: float, space_name: str) -> Case:
+def _ant(ask: _Ask) -> Case:
     from deal_hw.drivers.ant import description as ant
     from deal_hw.drivers.ant.motions import flail
 
-    if profile != "ideal":
-        raise ConfigurationError(f"the ant has no sensors, so no profile {profile!r}; use ideal")
+    if ask.profile != "ideal":
+        raise ConfigurationError(f"the ant has no sensors, so no profile {ask.profile!r}; use ideal")
     robot = load_model(ant.DESCRIPTION)
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
         return flail(rng), flail(rng, (1.5, 4.0))
 
-    return _target("ant", robot, _space(ant.SPACES, space_name), profile, seed, xi, motions, None)
+    return _target("ant", robot, ask.ranges(ant.SPACES), ask, motions, None)
 
 
-def _go2(profile: str, seed: int, xi: float, space_name: str) -> Case:
+def _go2(ask: _Ask) -> Case:
     from deal_hw.drivers.go2 import description as go2
     from deal_hw.drivers.go2.motions import FEET, sway
 
-    if profile == "realistic":
+    if ask.profile == "realistic":
         raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
     robot = load_model(go2.DESCRIPTION)
     sensing = Sensing(
@@ -138,25 +160,25 @@ def _go2(profile: str, seed: int, xi: float, space_name: str) -> Case:
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
         return sway(robot, rng, DEMONSTRATION_S), sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
 
-    space = _space(go2.SPACES, space_name)
-    return _target("go2", robot, space, profile, seed, xi, motions, None if profile == "ideal" else sensing)
+    space = ask.ranges(go2.SPACES)
+    return _target("go2", robot, space, ask, motions, None if ask.profile == "ideal" else sensing)
 
 
 def _target(
     task: str,
     robot: RobotModel,
     space: ParameterSpace,
-    profile: str,
-    seed: int,
-    xi: float,
+    ask: _Ask,
     motions: Callable[[np.random.Generator], tuple[Behaviour, Behaviour]],
     sensing: Sensing | None,
 ) -> Case:
-    space = space.with_ratio(xi)
+    seed = ask.seed
     rng = np.random.default_rng([seed, sum(task.encode())])
     low, high = (round(t / robot.step_s) for t in LATENCY_S)
     for refused in range(MOST_REDRAWS):  # noqa: B007
         theta = space.unnormalize(rng.uniform(*TRUTH_PART, len(space)))
+        if ask.centred:
+            theta = space.nominal
         latency_s = 0.0 if sensing is None else int(rng.integers(low, high + 1)) * robot.step_s
         try:
             fit, heldout = (
@@ -174,7 +196,7 @@ def _target(
         raise CalibrationError(f"{task}, seed {seed}: none of {MOST_REDRAWS} truths could demonstrate")
     std = None if sensing is None else _channel_std(robot, sensing)
     return Case(
-        task=task, profile=profile, seed=seed, robot=robot, space=space, theta=theta, latency_s=latency_s,
+        task=task, profile=ask.profile, seed=seed, robot=robot, space=space, theta=theta, latency_s=latency_s,
         fit=fit.episode, heldout=heldout.episode, fit_truth=(fit.position, fit.velocity),
         heldout_truth=heldout.position, channel_std=std, refused=refused,
     )  # fmt: skip
@@ -196,18 +218,7 @@ def _channel_std(robot: RobotModel, sensing: Sensing) -> FloatArray:
     return np.concatenate([np.full(3, sensing.orientation_std), joints, np.full(3, sensing.gyro_std)])
 
 
-def _space(table: Mapping[str, Callable[[], ParameterSpace]], name: str) -> ParameterSpace:
-    if name and name not in table:
-        raise ConfigurationError(f"there is no parameter set {name!r}; known: {', '.join(table)}")
-    return table[name or next(iter(table))]()
-
-
-def centred(space: ParameterSpace) -> ParameterSpace:
-    """Return the space as the paper searches it: linear ranges [theta / xi, xi theta]."""
-    return ParameterSpace(replace(p, scale="linear") for p in space.parameters)
-
-
-TASKS: Mapping[str, Callable[[str, int, float, str], Case]] = {
+TASKS: Mapping[str, Callable[[_Ask], Case]] = {
     "cartpole": _cartpole,
     "ant": _ant,
     "go2": _go2,

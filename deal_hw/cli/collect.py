@@ -11,6 +11,10 @@ import tyro
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
+from deal_hw.control.excitation_plan import FAMILIES, read_plan
+
+EXCITATION_FILE = "excitation.json"
+"""Where the excitation of `--excite optimal` is kept, in the run folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +39,10 @@ class Collect:
     profile: Literal["rich", "chirp", "balance", "hold"] = "rich"
     """rich: balance, then random set-points; chirp: a sine sweep (for held-out data); balance: the policy all
     the time; hold: the start pose."""
+
+    excite: str = ""
+    """Play this instead of a profile: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
+    file that `deal-hw excite` wrote, which says how long it is."""
 
     policy: Path | None = None
     """Policy that balances (.onnx); by default the one shipped for the robot."""
@@ -62,14 +70,16 @@ def collect(config: Collect) -> RunReport:
         DealHwError: What made it fail; the robot is passive and what was recorded is whole.
     """
     policy = config.policy or shipped_policy(config.robot)
+    excite, seconds = _excitation(config)
     plan = RunPlan(
         robot=config.robot,
         transport=config.transport,
-        profile=config.profile,
+        profile="excite" if excite else config.profile,
         policy=str(policy or ""),
-        seconds=config.seconds,
+        seconds=seconds,
         seed=config.seed,
         rich=config.rich,
+        excite=excite,
     )
     return run_episodes(
         plan,
@@ -79,3 +89,26 @@ def collect(config: Collect) -> RunReport:
         purpose="collect",
         quiet=config.quiet,
     )
+
+
+def _excitation(config: Collect) -> tuple[str, float]:
+    """Return what the control process is told to play, and for how long [s]; compute what is optimal."""
+    if not config.excite or config.excite in FAMILIES:
+        return config.excite, config.seconds
+    if config.excite != "optimal":
+        path = Path(config.excite)
+        return str(path), read_plan(path).seconds
+    # Only here: the rest of this verb runs on computers without the extras.
+    from deal_hw.cli.excite import Excite, excite
+
+    folder = dataset_folder(config.out, config.dataset)
+    if folder is None:
+        raise RuntimeError("unreachable: dataset_folder() raises where neither folder was given")
+    path = folder.parent / EXCITATION_FILE
+    report = excite(
+        Excite(
+            robot=config.robot, out=path, seconds=config.seconds, policy=config.policy, seed=config.seed,
+            quiet=config.quiet,
+        )
+    )  # fmt: skip
+    return str(path), report.plan.seconds

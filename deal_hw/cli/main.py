@@ -47,11 +47,13 @@ class Verb:
     extra: str = ""
 
 
-def _verb(name: str, *, help: str, example: str, extra: str = "", module: str = "") -> Verb:
+def _verb(
+    name: str, *, help: str, example: str, extra: str = "", module: str = "", function: str = ""
+) -> Verb:
     return Verb(
         module=f"deal_hw.cli.{module or name}",
         config=name.capitalize(),
-        function=name,
+        function=function or name,
         help=help,
         example=example,
         extra=extra,
@@ -67,9 +69,10 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
         ),
         "calibrate": _verb(
             "calibrate",
-            help="find the simulator parameters that explain a recording",
+            help="find the simulator parameters that explain recordings, of any robot (--model)",
             example="calibrate runs/first/dataset",
             extra="calib",
+            function="calibrate_or_write_parameters",
         ),
         "train": _verb(
             "train",
@@ -97,6 +100,12 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
     {
         "demo": _verb(
             "demo", help="do all five on an emulated cart-pole", example="demo --out runs/demo", extra="all"
+        ),
+        "excite": _verb(
+            "excite",
+            help="compute what to play on a robot so that a recording tells most",
+            example="excite cartpole --out runs/first/excitation.json",
+            extra="calib",
         ),
         "emulate": _verb(
             "emulate",

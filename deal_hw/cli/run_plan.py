@@ -13,10 +13,18 @@ from typing import Any, Literal, get_args
 
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig, Segment
+from deal_hw.control.excitation_plan import (
+    FAMILIES,
+    ExcitationBehaviour,
+    ExcitationDesign,
+    ExcitationPlan,
+    make_plan,
+    read_plan,
+)
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 
-Profile = Literal["rich", "chirp", "balance", "hold", "replay"]
+Profile = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
 """What a run does; `balance` runs the policy all the time."""
 
 
@@ -35,6 +43,7 @@ class RunPlan:
         dry_run: Whether to compute everything and send nothing.
         home: Whether to bring the robot to its start pose first.
         rich: Settings of the profile `rich`; its length is ``seconds``.
+        excite: What the profile `excite` plays: `chirp`, `multisine`, or a file of `deal-hw excite`.
         realtime: Whether to ask for SCHED_FIFO and locked memory.
     """
 
@@ -48,6 +57,7 @@ class RunPlan:
     dry_run: bool = False
     home: bool = True
     rich: RichConfig = field(default_factory=RichConfig)
+    excite: str = ""
     realtime: bool = True
 
     def __post_init__(self) -> None:
@@ -94,11 +104,42 @@ def make_behaviour(plan: RunPlan, description: RobotDescription) -> Behaviour:
         from deal_hw.data.reader import read_trajectory
 
         return ReplayBehaviour(read_trajectory(Path(plan.recording)), description)
+    if plan.profile == "excite":
+        excitation = find_excitation(plan, description)
+        balance = _policy(plan, description) if excitation.balance_s > 0 else None
+        return ExcitationBehaviour(excitation, description, balance)
     if plan.profile == "rich":
         config = dataclasses.replace(plan.rich, duration_s=plan.seconds)
         balance = _policy(plan, description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)
     return _policy(plan, description)
+
+
+def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:
+    """Return what the profile `excite` plays: the file's plan, or one made from name and seed.
+
+    A robot that cannot stand without a policy balances first, as in the profile `rich`.
+
+    Raises:
+        ConfigurationError: The file is no plan, is for another robot, or is not as long as the run.
+    """
+    if plan.excite in FAMILIES:
+        balance_s = min(plan.rich.balance_s, 0.5 * plan.seconds) if plan.policy else 0.0
+        design = ExcitationDesign(
+            family=plan.excite,  # type: ignore[arg-type]
+            seconds=plan.seconds,
+            balance_s=balance_s,
+            seed=plan.seed,
+        )
+        return make_plan(description, design)
+    found = read_plan(Path(plan.excite))
+    found.check_fits(description)
+    if abs(found.seconds - plan.seconds) > 1e-6:
+        raise ConfigurationError(
+            f"the excitation in {plan.excite} is {found.seconds:g} s long; --seconds {plan.seconds:g} must "
+            "agree"
+        )
+    return found
 
 
 def _policy(plan: RunPlan, description: RobotDescription) -> Behaviour:

@@ -210,6 +210,7 @@ class _Episode:
             "policy": plan.policy,
             "policy_digest": _digest(plan.policy),
             "recording": plan.recording,
+            "excite": plan.excite,
             "seed": plan.seed,
             "seconds": plan.seconds,
             "dry_run": plan.dry_run,

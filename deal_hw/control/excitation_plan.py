@@ -79,7 +79,8 @@ class ExcitationDesign:
         if not (0 < self.amplitude <= 1 and 0 <= self.balance_s < self.seconds and 0 < self.split <= 1):
             raise ConfigurationError(
                 f"not a usable excitation: amplitude {self.amplitude:g} (a share of what the limits allow, "
-                f"in (0, 1]), balance_s {self.balance_s:g} of {self.seconds:g} s, split {self.split:g} in (0, 1]"
+                f"in (0, 1]), balance_s {self.balance_s:g} of {self.seconds:g} s, "
+                f"split {self.split:g} in (0, 1]"
             )
 
     def segments(self) -> tuple[Segment, ...]:

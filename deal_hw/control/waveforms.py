@@ -179,9 +179,10 @@ def wave_from_json(values: Mapping[str, Any]) -> Wave:
     if name not in WAVES:
         raise UnknownNameError("wave", str(name), WAVES)
     try:
-        return WAVES[name](**{key: _tuples(value) for key, value in given.items()})
+        found: Wave = WAVES[name](**{key: _tuples(value) for key, value in given.items()})
     except TypeError as err:
         raise ConfigurationError(f"not the table of {name!r}: {err}") from err
+    return found
 
 
 def _tuples(value: Any) -> Any:

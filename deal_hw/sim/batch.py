@@ -84,7 +84,7 @@ class ServoBatch:
             values = columns.get(p.name, np.full(self.count, p.nominal))
             for name in p.elements:
                 if p.kind in SERVO_KINDS:
-                    self._acting[p.kind][:, description.actuated.index(name)] = values
+                    self._acting[p.kind][:, self.robot.actuator_names.index(name)] = values
                 elif p.kind == ENCODER_BIAS:
                     self._bias[:, description.joint_names.index(name)] = values
         self._biased = bool(np.any(self._bias))

@@ -11,10 +11,10 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.fields import ModelFields, element_id
+from deal_hw.sim.fields import ModelFields, element_id, element_names
 from deal_hw.sim.parameters import apply_parameters
+from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
-
 
 BASE_COORDINATES = ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz")
 """Position in the world [m]; rotation vector from the reference orientation, in the base's frame [rad]."""
@@ -29,7 +29,7 @@ class RobotModel:
         model: The nominal model; treat as read-only.
         qpos: Index into qpos of each joint, (J,).
         qvel: Index into qvel of each joint, (J,).
-        actuator: Index of each actuated joint's actuator, (A,).
+        actuator: Index of the actuator that drives each actuated joint, (A,).
         base: Where the floating base's entries begin in qpos and qvel; None for a fixed base.
     """
 
@@ -39,6 +39,12 @@ class RobotModel:
     qvel: tuple[int, ...]
     actuator: tuple[int, ...]
     base: tuple[int, int] | None = None
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        """Names of the actuators in the order of the actuated joints, (A,)."""
+        names = element_names(self.model, "actuator")
+        return tuple(names[i] for i in self.actuator)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -94,8 +100,31 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
         model=model,
         qpos=tuple(int(model.jnt_qposadr[j]) for j in joints),
         qvel=tuple(int(model.jnt_dofadr[j]) for j in joints),
-        actuator=tuple(element_id(model, "actuator", name) for name in description.actuated),
+        actuator=tuple(actuator_of(model, name) for name in description.actuated),
         base=base,
+    )
+
+
+def actuator_of(model: mujoco.MjModel, joint: str) -> int:
+    """Return the id of the actuator that drives a joint, whatever the actuator's own name.
+
+    Raises:
+        UnknownNameError: There is no such joint.
+        ConfigurationError: No actuator drives it, or several do.
+    """
+    index = element_id(model, "joint", joint)
+    found = [i for i in range(model.nu) if joint_of(model, i) == index]
+    if len(found) == 1:
+        return found[0]
+    names = element_names(model, "actuator")
+    if not found:
+        raise ConfigurationError(
+            f"no actuator of the model drives joint {joint!r}; actuators: {', '.join(names) or '(none)'}. "
+            f'Give it one in the MJCF, such as <position joint="{joint}" kp="..."/>'
+        )
+    raise ConfigurationError(
+        f"actuators {', '.join(names[i] or f'number {i}' for i in found)} all drive joint {joint!r}; "
+        "keep the one that takes the recorded commands"
     )
 
 

@@ -115,14 +115,14 @@ def test_replay_that_is_forgotten_is_not_saved(problem: Problem) -> None:
 
 @pytest.mark.parametrize("name", ["trajectory", "energy", "mmd"])
 def test_deal_paper_takes_another_fitness(problem: Problem, name: str) -> None:
-    """Algorithm 1 on another fitness: median error of three seeds within 0.25 where the centre has ln 2."""
+    """Algorithm 1 on another fitness: median error of three seeds within 0.15 where the centre has ln 2."""
     method = DealPaper(PaperSettings(fitness=name))
     errors = []
     for seed in range(3):
-        result = method.run(problem, Budget(population=40, generations=10), np.random.default_rng(seed))
+        result = method.run(problem, Budget(population=60, generations=15), np.random.default_rng(seed))
         assert result.provenance["settings"]["fitness"] == name
         errors.append(np.mean(np.abs(np.log(result.estimate / (2 * problem.space.nominal)))))
-    assert np.median(errors) < 0.25
+    assert np.median(errors) < 0.15
 
 
 def test_bad_names_and_settings_are_refused(problem: Problem) -> None:

@@ -87,7 +87,7 @@ def test_one_step_error_vanishes_at_the_truth_only() -> None:
 
 
 def test_textbook_covariance_of_a_line() -> None:
-    """Residuals (1, -1, 1, -1) of two parameters: s^2 = 4 / (4 - 2) = 2, J'J = 4 I, so 0.5 I but for the range."""
+    """Residuals (1, -1, 1, -1), two parameters: s^2 = 4 / (4 - 2) = 2, J'J = 4 I: 0.5 I but for the range."""
     space = recorded()[0]
     jacobian = np.array([[1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [1.0, -1.0]])
     covariance = textbook_covariance(space, jacobian, np.array([1.0, -1.0, 1.0, -1.0]))

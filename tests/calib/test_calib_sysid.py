@@ -71,10 +71,10 @@ class TestMujocoSysid(MethodSuite):
 
 @needs_sysid
 def test_latency_is_zero_unless_given() -> None:
-    """As its user it knows of none; told what was found by other means it finds the parameters, and says so."""
+    """Its user knows of none; told what was found by other means it finds the parameters, and says so."""
     theta, rng = recorded(8)[1], np.random.default_rng(0)
-    ignorant = MujocoSysid().run(problem(8, None), Budget(), rng)
-    told = MujocoSysid(SysidSettings(latency_s=8e-3)).run(problem(8, None), Budget(), rng)
+    ignorant = MujocoSysid().run(problem(8, None), Budget(generations=12), rng)
+    told = MujocoSysid(SysidSettings(latency_s=8e-3)).run(problem(8, None), Budget(generations=12), rng)
     assert ignorant.latency_s == 0.0
     assert "0 ms of latency (none" in ignorant.provenance["interval"]
     assert told.latency_s == 8e-3
@@ -115,13 +115,13 @@ def test_what_it_cannot_express_is_refused() -> None:
     """The error names the parameter and the kinds that are possible."""
     space, _, episode = recorded()
     bias = Parameter(
-        name="pole.bias", kind="encoder_bias", elements=("pole",), unit="rad", nominal=0.0, low=-0.1, high=0.1,
-        scale="linear",
+        name="pole.bias", kind="encoder_bias", elements=("pole",), unit="rad", nominal=0.0,
+        low=-0.1, high=0.1, scale="linear",
     )  # fmt: skip
     wider = ParameterSpace([*space.parameters, bias])
     made = Problem(load_model(DESCRIPTION), wider, [episode], threads=1, fixed_latency_s=0.0)
     with pytest.raises(
-        ConfigurationError, match=r"no counterpart for pole\.bias \(encoder_bias\); it takes body_mass"
+        ConfigurationError, match=r"no counterpart for pole\.bias \(encoder_bias\); it takes .*body_mass"
     ):
         MujocoSysid().run(made, Budget(), np.random.default_rng(0))
 

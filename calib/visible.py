@@ -1,0 +1,107 @@
+"""Which parameters a recording can see at all: looked up before any long work, by a few rollouts."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.problem import Problem, WindowData
+from deal_hw.calib.refine import samples_in
+from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.types import FloatArray
+
+WINDOW_S = 0.5
+MOST_WINDOWS = 12
+NOTHING = 1e-9
+"""Predictions that agree to this many standard deviations of the noise are the same [-]."""
+FAINT = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visibility:
+    """How much predictions change from one end of a parameter's range to the other.
+
+    Attributes:
+        names: The K parameters.
+        effect: Largest change of any sample, in standard deviations of the noise, (K,).
+    """
+
+    names: tuple[str, ...]
+    effect: FloatArray
+
+    @property
+    def invisible(self) -> tuple[str, ...]:
+        """Parameters that change nothing."""
+        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < NOTHING)
+
+    @property
+    def faint(self) -> tuple[str, ...]:
+        """Parameters whose whole range changes no sample by more than the noise."""
+        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if NOTHING <= e < FAINT)
+
+
+def look(problem: Problem) -> Visibility:
+    """Compare rollouts at both ends of each parameter's range with the nominal one.
+
+    Raises:
+        InsufficientDataError: The recordings hold no window.
+    """
+    space = problem.space
+    K = len(space)
+    theta = np.repeat(space.nominal[None], 1 + 2 * K, axis=0)
+    for k in range(K):
+        theta[1 + 2 * k, k], theta[2 + 2 * k, k] = space.low[k], space.high[k]
+    latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
+    effect = np.zeros(K)
+    for data in _some(_windows(problem)):
+        predicted = problem.predict(theta, latency, data).observed
+        change = np.abs(predicted[1:] - predicted[:1]) / data.std
+        # A member that diverges at the end of its range is seen, to be sure.
+        change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
+        effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
+    return Visibility(space.names, effect)
+
+
+def require_visible(found: Visibility) -> None:
+    """Refuse parameters that no rollout sees.
+
+    Raises:
+        ConfigurationError: There are such; the message names them.
+    """
+    if found.invisible:
+        raise ConfigurationError(
+            f"no rollout of these recordings sees {', '.join(found.invisible)}: predictions are the same "
+            "from one end of the range to the other. Remove them from the parameters (or give them as --known), "
+            "or record a motion that shows them"
+        )
+
+
+def _windows(problem: Problem) -> list[WindowData]:
+    try:
+        return problem.windows(samples_in(problem, WINDOW_S))
+    except InsufficientDataError:
+        return problem.windows(samples_in(problem, 0.0))
+
+
+def _some(windows: list[WindowData]) -> list[WindowData]:
+    """Return about MOST_WINDOWS of the windows, evenly over all recordings."""
+    total = sum(len(data.windows) for data in windows)
+    every = max(total // MOST_WINDOWS, 1)
+    kept, first = [], 0
+    for data in windows:
+        W = len(data.windows)
+        rows = np.arange((-first) % every, W, every)
+        first += W
+        if not rows.size:
+            continue
+        arrays = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
+        kept.append(
+            dataclasses.replace(
+                data,
+                windows=dataclasses.replace(data.windows, start=data.windows.start[rows]),
+                **{name: getattr(data, name)[rows] for name in arrays},
+            )
+        )
+    return kept

@@ -1,0 +1,104 @@
+"""The calibration benches: methods against hidden truths, one row a cell.
+
+- honest: each seed's truth lies off the centre of a fixed range whose centre is the wrong nominal model.
+- mismatch: the same on robots that do what no simulator here does (profile ``realistic``).
+- paper: ranges [theta / xi, xi theta] on a linear scale around the truth itself, as DEAL's tables have it. A
+  searcher that ignores the data and returns the centre of the log range scores 0 there.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from deal_hw.calibration import Budget
+from deal_hw.cli.bench_loop import calibration_row
+from deal_hw.cli.bench_tasks import TASKS, make_case
+from deal_hw.errors import DealHwError, UnknownNameError
+
+Protocol = Literal["honest", "mismatch", "paper"]
+PAPER_NOTE = "centred target: a searcher that ignores the data scores 0 here"
+KEY = ("task", "space", "profile", "method", "polish", "xi", "seed")
+"""What names a cell."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One calibration of one robot by one method.
+
+    Attributes:
+        protocol: How truth and range lie to each other.
+        task: Name of the task.
+        space: Name of the parameter set; "" for the task's default.
+        profile: Profile of the robot.
+        method: Name of the method.
+        polish: Whether the polish follows.
+        xi: Ratio of the search range.
+        seed: Decides everything.
+    """
+
+    protocol: Protocol
+    task: str
+    space: str
+    profile: str
+    method: str
+    polish: bool
+    xi: float
+    seed: int
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What names the cell in a file of rows."""
+        return tuple(getattr(self, name) for name in KEY)
+
+
+def make_cells(
+    protocol: Protocol,
+    tasks: Sequence[str],
+    profile: str,
+    methods: Sequence[str],
+    xis: Sequence[float],
+    seeds: Sequence[int],
+    *,
+    space: str = "",
+    polish_all: bool = False,
+) -> list[Cell]:
+    """Return the cells of a bench, seed by seed, so that a stopped bench has whole seeds.
+
+    Raises:
+        UnknownNameError: There is no such task or method.
+    """
+    from deal_hw.calib.methods import check_method
+
+    for task in tasks:
+        if task not in TASKS:
+            raise UnknownNameError("task", task, TASKS)
+    for method in methods:
+        check_method(method)
+    return [
+        Cell(
+            protocol=protocol, task=task, space=space, profile=profile, method=method,
+            polish=polish_all or method == "default", xi=xi, seed=seed,
+        )
+        for task, xi, seed, method in itertools.product(tasks, xis, seeds, methods)
+    ]  # fmt: skip
+
+
+def run_cell(cell: Cell, *, population: int, generations: int, threads: int | None) -> dict[str, Any]:
+    """Run one cell; an error is kept in the row, so that the other cells still run."""
+    row: dict[str, Any] = {"bench": cell.protocol}
+    row |= {name: getattr(cell, name) for name in KEY} | {"error": ""}
+    if cell.protocol == "paper":
+        row["note"] = PAPER_NOTE
+    budget = Budget(population=population, generations=generations, polish=cell.polish)
+    try:
+        case = make_case(
+            cell.task, cell.profile, cell.seed, cell.xi, cell.space, centred=cell.protocol == "paper"
+        )
+        part, _ = calibration_row(case, cell.method, budget, threads)
+        row |= part
+    except DealHwError as err:
+        row["error"] = f"{type(err).__name__}: {err}"
+    return row

@@ -1,0 +1,343 @@
+"""``deal-hw calibrate --model``: any robot, from its MJCF and recordings of positions and commands."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deal_hw.cli.calibrate_run import Narrowing, Work
+from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.data.checks import Verdict
+    from deal_hw.data.importing.grid import Recording
+    from deal_hw.data.importing.table import Table
+    from deal_hw.sim.describe import Sampling
+    from deal_hw.sim.episode import Episode
+    from deal_hw.sim.joint_facts import JointFacts
+    from deal_hw.sim.model import RobotModel
+
+HELDOUT_PART = 0.25
+STRETCH_S = 5.0
+"""Fitted recordings are cut into parts of about this length, so that memory does not grow with them [s]."""
+HELDOUT_STRETCH_S = 20.0
+MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation")
+"""Checks that mean something where commands are efforts and not positions."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recordings:
+    """Any robot: its MuJoCo model and its recordings. Step by step in docs/any-robot.md."""
+
+    model: Path | None = None
+    """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
+
+    data: tuple[Path, ...] = ()
+    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
+
+    columns: Path | None = None
+    """Column map (YAML, docs/import.md); without it the channels' meaning is guessed from their names."""
+
+    parameters: Path | None = None
+    """What to search (YAML, docs/parameters.md); by default friction, damping and armature of every joint and
+    gain of every actuator of the model."""
+
+    write_parameters: Path | None = None
+    """Write such a file for --model, to edit, and do nothing else."""
+
+    holdout_part: float | None = None
+    """Without --holdout this last share of each recording only judges the result; 0.25 by default, 0 for
+    none."""
+
+    fit_seconds: float = 60.0
+    """Fit stretches that lie evenly over the recordings and add up to so many seconds; more is slower."""
+
+    physics_step: float | None = None
+    """Wanted physics step [s]; by default the MJCF's timestep. A whole number fits into a sampling period."""
+
+    force: bool = False
+    """Use recordings although a plausibility check failed."""
+
+
+def write_parameters(config: Recordings) -> int:
+    """Write a commented parameter file for a model; return 0.
+
+    Raises:
+        ConfigurationError: There is no model, or the file exists.
+    """
+    path = config.write_parameters
+    if config.model is None or path is None:
+        raise ConfigurationError("--write-parameters needs --model robot.xml")
+    if path.exists():
+        raise ConfigurationError(f"{path} exists; name another file, or remove it")
+    from deal_hw.sim.describe import compile_model
+    from deal_hw.sim.parameters.template import template
+
+    text = template(compile_model(config.model), config.model.name)
+    path.write_text(text, encoding="utf-8")
+    again = f"deal-hw calibrate --model {config.model} --parameters {path} --data ..."
+    print(f"written: {path}; edit it, then: {again}")
+    return 0
+
+
+def prepare_model(
+    config: Recordings,
+    holdout: Sequence[Path],
+    narrowing: Narrowing,
+    *,
+    std: Callable[[RobotModel], FloatArray | None],
+    threads: int | None = None,
+    quiet: bool = False,
+) -> Work:
+    """Read and check everything that a calibration of any robot needs; nothing here takes long.
+
+    Args:
+        config: Model and recordings.
+        holdout: Recordings that only judge the result.
+        narrowing: What the command line changes about the parameters.
+        std: What a prediction may be off, as in :class:`deal_hw.calib.problem.Problem`.
+        threads: Simulation threads.
+        quiet: Say nothing of what was guessed and warned of.
+
+    Raises:
+        ConfigurationError: A setting, the model or a parameter cannot be used.
+        DatasetError: A recording cannot be read, understood or trusted.
+        InsufficientDataError: The recordings are too short.
+    """
+    try:
+        from deal_hw.data.importing.columns import read_column_map
+        from deal_hw.sim.describe import compile_model, describe, sampling
+        from deal_hw.sim.joint_facts import joint_facts
+        from deal_hw.sim.model import load_model
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+
+    share = _holdout_share(config, holdout)
+    if config.model is None or not config.data:
+        raise ConfigurationError("--model needs recordings to fit: --data rec.csv [more ...]")
+    if both := sorted({p.resolve() for p in config.data} & {p.resolve() for p in holdout}):
+        raise ConfigurationError(
+            f"{both[0]} is to be fitted and held out; a held-out recording must not be seen"
+        )
+
+    def say(text: str) -> None:
+        if not quiet:
+            print(text, file=sys.stderr)
+
+    model = compile_model(config.model)
+    space = _space(config, narrowing, model)
+    facts = joint_facts(config.model)
+    columns = None if config.columns is None else read_column_map(config.columns)
+    fitted, held = (_read(paths, columns, facts, say) for paths in (config.data, holdout))
+    rates = _rates(config, [*fitted, *held], model, sampling)
+    description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
+    _no_base(description.floating_base)
+    verdicts = {
+        table.name: _examine(table, facts, config.force, servo=description.actuation == "position", say=say)
+        for table in (*fitted, *held)
+    }
+    robot = load_model(description, rates.step_s)
+    fit_recordings = [r for table in fitted for r in _on_grid(table, robot, rates)]
+    episodes = [_align(r, robot) for r in fit_recordings]
+    judge = [_align(r, robot) for table in held for r in _on_grid(table, robot, rates)]
+    episodes, judge = _divide(episodes, judge, share, config.fit_seconds, say)
+    _look(robot, space, episodes, std(robot), threads, say)
+    return Work(
+        robot=robot,
+        space=space,
+        episodes=episodes,
+        holdout=judge,
+        shown=fit_recordings[0].trajectory,
+        telemetry=[
+            f"{name}: {verdict.severity} {verdict.name}: {verdict.message}"
+            for name, found in verdicts.items()
+            for verdict in found
+        ],
+        provenance={
+            "model": str(config.model),
+            "description_digest": description.digest(),
+            "recordings": [dict(table.source) for table in fitted],
+            "holdout": [dict(table.source) for table in held] or f"last {share:.0%} of each recording",
+            "fitted_s": round(sum(_seconds(e) for e in episodes), 3),
+            "heldout_s": round(sum(_seconds(e) for e in judge), 3),
+            "sampling": dataclasses.asdict(rates),
+        },
+        advice="name recordings of other motion with --holdout",
+    )
+
+
+def _holdout_share(config: Recordings, holdout: Sequence[Path]) -> float:
+    if holdout and config.holdout_part:
+        raise ConfigurationError("give --holdout or --holdout-part, not both")
+    if holdout:
+        return 0.0
+    share = HELDOUT_PART if config.holdout_part is None else config.holdout_part
+    if not 0 <= share < 1:
+        raise ConfigurationError(f"--holdout-part must be at least 0 and below 1, got {share:g}")
+    if not config.fit_seconds > 0:
+        raise ConfigurationError(f"--fit-seconds must be above 0, got {config.fit_seconds:g}")
+    return share
+
+
+def _space(config: Recordings, narrowing: Narrowing, model: Any) -> ParameterSpace:
+    from deal_hw.sim.parameters import check_space
+    from deal_hw.sim.parameters.template import template
+    from deal_hw.sim.parameters.yaml_space import parse_space, read_space
+
+    if config.parameters is None:
+        space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
+    else:
+        space = read_space(config.parameters, model)
+    space = narrowing.apply(space)
+    check_space(model, space)
+    return space
+
+
+def _read(paths: Sequence[Path], columns: Any, facts: JointFacts, say: Callable[[str], None]) -> list[Table]:
+    from deal_hw.data.importing.load import load_tables
+
+    return [table for path in paths for table in load_tables(path, columns, facts.names, say)]
+
+
+def _rates(
+    config: Recordings, tables: Sequence[Table], model: Any, fit: Callable[[float, float], Sampling]
+) -> Sampling:
+    """Check that the recordings belong together; return how they lie on the physics grid."""
+    from deal_hw.data.importing.grid import common_period
+    from deal_hw.data.plausibility import examine, require
+
+    first = tables[0]
+    for table in tables:
+        if (table.joint_names, table.actuated) != (first.joint_names, first.actuated):
+            raise ConfigurationError(
+                f"{table.name} has positions of {', '.join(table.joint_names)} and commands of "
+                f"{', '.join(table.actuated) or 'none'}, {first.name} of {', '.join(first.joint_names)} and "
+                f"{', '.join(first.actuated) or 'none'}; calibrate them apart"
+            )
+        # A clock that is no clock has no period; say that before anything else fails on it.
+        early = ("size", "finite", "clock", "rate", "commands")
+        require([v for v in examine(table) if v.name in early], table.name)
+    timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
+    return fit(common_period(tables), timestep)
+
+
+def _no_base(free: str | None) -> None:
+    if free is not None:
+        raise ConfigurationError(
+            f"the model floats (free joint {free!r}); recordings of a floating robot are not read yet. Hold "
+            "the robot by its trunk, record that, and remove the free joint from a copy of the MJCF"
+        )
+
+
+def _examine(
+    table: Table, facts: JointFacts, force: bool, *, servo: bool, say: Callable[[str], None]
+) -> list[Verdict]:
+    """Check a recording and tell what is wrong; return what is worth keeping.
+
+    Raises:
+        DatasetError: A check failed, and that is not to be overlooked.
+    """
+    from deal_hw.data.checks import Severity
+    from deal_hw.data.plausibility import examine, require
+    from deal_hw.errors import DatasetError
+
+    limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
+    found = [v for v in examine(table, limits) if v.severity is not Severity.OK]
+    if not servo:
+        found = [v for v in found if v.name in MOTOR_CHECKS]
+    for verdict in found:
+        say(f"{table.name}: {verdict.severity} {verdict.name}: {verdict.message}")
+    if not force:
+        try:
+            require(found, table.name)
+        except DatasetError as err:
+            raise DatasetError(f"{err}. Correct the column map, or overrule with --force") from err
+    return found
+
+
+def _on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]:
+    """Put a recording on the grid, with the gains of the model and commands in the actuators' unit."""
+    from deal_hw.data.importing.grid import Gains, to_trajectories
+
+    description = robot.description
+    gains = Gains(
+        stiffness=description.stiffness,
+        damping=description.damping,
+        effort_limit=description.effort_limit,
+        speed_limit=description.speed_limit,
+    )
+    if description.actuation == "motor":
+        model, actuators = robot.model, list(robot.actuator)
+        full = model.actuator_gear[actuators, 0] * model.actuator_gainprm[actuators, 0]
+        table = dataclasses.replace(table, target=table.target / full)
+    return to_trajectories(table, gains, rates.period_s)
+
+
+def _align(recording: Recording, robot: RobotModel) -> Episode:
+    from deal_hw.sim.episode import align, fill_gaps
+
+    return fill_gaps(align(recording.trajectory, robot.description))
+
+
+def _divide(
+    episodes: Sequence[Episode],
+    judge: Sequence[Episode],
+    share: float,
+    seconds: float,
+    say: Callable[[str], None],
+) -> tuple[list[Episode], list[Episode]]:
+    """Return stretches to fit and stretches to judge by."""
+    from deal_hw.sim.episode_parts import split_last, spread, stretches
+
+    fit, held = list(episodes), list(judge)
+    if share > 0:
+        pairs = [split_last(e, share) for e in episodes]
+        fit, held = [first for first, _ in pairs], [last for _, last in pairs]
+    parts = [p for e in fit for p in stretches(e, STRETCH_S)]
+    chosen = spread(parts, seconds)
+    if len(chosen) < len(parts):
+        say(
+            f"fitting {sum(map(_seconds, chosen)):.0f} s of {sum(map(_seconds, parts)):.0f} s, in "
+            f"{len(chosen)} stretches that lie evenly over them (--fit-seconds)"
+        )
+    return chosen, [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
+
+
+def _seconds(episode: Episode) -> float:
+    return (len(episode.sample) - 1) * episode.period_s
+
+
+def _look(
+    robot: RobotModel,
+    space: ParameterSpace,
+    episodes: Sequence[Episode],
+    known_std: FloatArray | None,
+    threads: int | None,
+    say: Callable[[str], None],
+) -> None:
+    """Check before any search that the recordings are long enough, move, and show every parameter."""
+    from deal_hw.calib.excitation import check_excitation
+    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.visible import look, require_visible
+
+    problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
+    try:
+        check_excitation(problem)
+    except InsufficientDataError as err:
+        # What it advises is for robots that deal-hw drives.
+        raise InsufficientDataError(
+            str(err).partition("; record again with")[0] + "; record more motion"
+        ) from err
+    found = look(problem)
+    require_visible(found)
+    if found.faint:
+        say(
+            f"hardly visible, and so hardly to be found: {', '.join(found.faint)} (from one end of the range "
+            "to the other no prediction changes by more than the noise)"
+        )

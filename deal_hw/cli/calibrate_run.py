@@ -1,0 +1,340 @@
+"""What every calibration does once its recordings are on the device's grid: search, judge, report, write."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.cli.calibrate_live import open_checkpoint
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import FloatArray, Trajectory
+
+if TYPE_CHECKING:
+    from deal_hw.sim.episode import Episode
+    from deal_hw.sim.model import RobotModel
+
+TABLE_WIDTH = 100
+HELDOUT_WINDOW_S = 0.2
+"""The same as in :mod:`deal_hw.calib.validate`, which is not loaded before it is needed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """What is to be calibrated, read and checked.
+
+    Attributes:
+        robot: The nominal model.
+        space: What to search.
+        episodes: Recordings to fit.
+        holdout: Recordings that only judge the result.
+        shown: The recording that ``--watch`` shows.
+        telemetry: Verdicts on the recordings, for the report.
+        provenance: Where all of it comes from: plain JSON values.
+        advice: How to get a held-out recording where there is none.
+    """
+
+    robot: RobotModel
+    space: ParameterSpace
+    episodes: Sequence[Episode]
+    holdout: Sequence[Episode]
+    shown: Trajectory
+    telemetry: Sequence[str]
+    provenance: Mapping[str, Any]
+    advice: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Narrowing:
+    """What the command line changes about a parameter space.
+
+    Attributes:
+        free: Search exactly these; empty: as the space has it.
+        known: Values measured by other means, by name (SI).
+        ranges: Other ranges: name, low, high (SI).
+        xi: Log ranges reach a factor xi to either side of the nominal value; None: as the space has them.
+    """
+
+    free: Sequence[str]
+    known: Mapping[str, float]
+    ranges: Sequence[tuple[str, float, float]]
+    xi: float | None
+
+    def apply(self, space: ParameterSpace) -> ParameterSpace:
+        """Return the changed space.
+
+        Raises:
+            UnknownNameError: A name is not known; the message lists the names.
+            ConfigurationError: A range is empty, reversed, or excludes the nominal value; or nothing is left.
+        """
+        if self.free:
+            space = space.with_free(self.free)
+        if self.xi is not None:
+            space = space.with_ratio(self.xi)
+        space = space.with_known(self.known)
+        for parameter, low, high in self.ranges:
+            space = space.with_range(parameter, low, high)
+        if not len(space):
+            raise ConfigurationError("every parameter is known: there is nothing to search")
+        return space
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateReport:
+    """What a calibration wrote.
+
+    Attributes:
+        result: What was found.
+        files: The files by name.
+    """
+
+    result: CalibrationResult
+    files: dict[str, Path]
+
+
+def calibrate_episodes(
+    robot: RobotModel,
+    space: ParameterSpace,
+    episodes: Sequence[Episode],
+    holdout: Sequence[Episode],
+    *,
+    method: str,
+    budget: Budget,
+    rng: np.random.Generator,
+    latency_s: float | None = None,
+    threads: int | None = None,
+    quiet: bool = True,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    watch: ProgressCallback | None = None,
+    known_std: FloatArray | None = None,
+    heldout_window_s: float = HELDOUT_WINDOW_S,
+) -> CalibrationResult:
+    """Calibrate from recordings on the device's time grid; the heart of the verb, without files.
+
+    Args:
+        robot: The nominal model.
+        space: What to search.
+        episodes: Recordings to fit.
+        holdout: Recordings that only judge the result; the search never sees them.
+        method: Name of the method.
+        budget: How much it may use.
+        rng: The only source of randomness.
+        latency_s: Total latency if it is known [s].
+        threads: Simulation threads.
+        quiet: Show no progress.
+        checkpoint: File that holds the state after each generation; None to keep none.
+        resume: Go on with what that file holds.
+        watch: Called with the progress, too.
+        known_std: What a prediction may be off, positions then velocities, (2 C,); None: the sensor noise, as
+            the recordings show it.
+        heldout_window_s: Held-out predictions restart this often [s].
+    """
+    try:
+        from deal_hw.calib.heldout import heldout_rmse
+        from deal_hw.calib.methods import make_method
+        from deal_hw.calib.problem import Problem
+        from deal_hw.calib.validate import heldout_nrmse
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+
+    problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s, known_std=known_std)
+    searcher = make_method(method, polish=budget.polish)
+    with show_progress(f"calibrate ({method})", quiet) as report:
+
+        def progress(p: Progress) -> None:
+            report(p)
+            if watch is not None:
+                watch(p)
+
+        if checkpoint is None:
+            result = searcher.run(problem, budget, rng, progress)
+        else:
+            store = open_checkpoint(checkpoint, resume, problem, searcher, budget, rng)
+            result = searcher.run(problem, budget, rng, progress, store)
+    if not holdout:
+        return result
+    candidates = {"nominal": (space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}
+    errors = heldout_nrmse(robot, space, holdout, candidates, window_s=heldout_window_s, threads=threads)
+    rmse = heldout_rmse(robot, space, holdout, candidates, window_s=heldout_window_s, threads=threads)
+    return dataclasses.replace(
+        result, heldout_nrmse=errors, provenance={**result.provenance, "heldout_rmse": rmse.to_json()}
+    )
+
+
+def residual_std(words: Sequence[str], robot: RobotModel) -> FloatArray | None:
+    """Return what ``--residual-std`` means, positions then velocities, (2 C,); None where it is not given.
+
+    Raises:
+        ConfigurationError: It is neither one number nor pairs of a joint and a number above 0.
+        UnknownNameError: A joint is not known.
+    """
+    if not words:
+        return None
+    joints = robot.description.joint_names
+    pairs = [(name, words[0]) for name in joints] if len(words) == 1 else _pairs(words)
+    given: dict[str, float] = {}
+    for name, word in pairs:
+        if name not in joints:
+            raise UnknownNameError("joint", name, joints)
+        given[name] = _positive(word)
+    if (len(words) > 1 and len(words) % 2) or set(given) != set(joints):
+        raise ConfigurationError(
+            f"--residual-std {' '.join(words)}: give one number, or a name and a number for each of "
+            f"{', '.join(joints)}"
+        )
+    C = len(robot.coordinates)
+    std = np.ones(2 * C)
+    std[:C][robot.joints] = [given[name] for name in joints]
+    return std
+
+
+def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
+    # An odd word at the end is refused by the caller, which can say what was expected.
+    return list(zip(words[::2], words[1::2], strict=False))
+
+
+def _positive(word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError as err:
+        raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err
+    if not (np.isfinite(value) and value > 0):
+        raise ConfigurationError(f"--residual-std must be above 0, got {word}")
+    return value
+
+
+def finish(
+    work: Work,
+    result: CalibrationResult,
+    folder: Path,
+    settings: Mapping[str, Any],
+    *,
+    page: bool = True,
+    threads: int | None = None,
+    quiet: bool = True,
+) -> CalibrateReport:
+    """Note where a result comes from, write the result folder, print the result.
+
+    Args:
+        work: What was calibrated.
+        result: What was found.
+        folder: Where to write.
+        settings: What else the provenance says: plain JSON values.
+        page: Write report.html.
+        threads: Simulation threads.
+        quiet: Print nothing.
+    """
+    from deal_hw.calib.folder import write_result
+
+    names = ("deal-hw", "mujoco", "numpy", "scipy", "torch")
+    result = dataclasses.replace(
+        result,
+        provenance={
+            **result.provenance,
+            **work.provenance,
+            **settings,
+            "versions": {name: metadata.version(name) for name in names},
+            "processors": len(os.sched_getaffinity(0)),
+        },
+    )
+    report = None
+    if page:
+        from deal_hw.calib.report.gather import gather
+
+        report = gather(
+            work.robot, result, work.episodes, work.holdout, telemetry=work.telemetry, threads=threads
+        )
+    files = write_result(folder, work.robot, result, report)
+    if not quiet:
+        print_result(result, work.advice)
+        print("written: " + ", ".join(str(f) for f in files.values()))
+    return CalibrateReport(result=result, files=files)
+
+
+@contextmanager
+def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
+    """Show a progress bar on a terminal; nothing otherwise."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda progress: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+    )
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, note="")
+
+        def report(p: Progress) -> None:
+            bar.update(
+                task, description=f"{title}: {p.stage}", completed=p.done, total=p.total, note=p.message
+            )
+
+        yield report
+
+
+def print_result(result: CalibrationResult, advice: str) -> None:
+    """Print the parameters with their intervals, and what the data cannot tell.
+
+    Args:
+        result: What was found.
+        advice: How to get a held-out recording where there is none.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
+    for name, align in (
+        ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"),
+        ("90 % interval", "left"), ("verdict", "left"),
+    ):  # fmt: skip
+        table.add_column(name, justify="right" if align == "right" else "left")
+    for k, p in enumerate(result.space):
+        low, high = result.interval[k]
+        verdict = result.verdicts[k] if result.verdicts else "-"
+        table.add_row(
+            p.name,
+            p.unit,
+            f"{p.nominal:.4g}",
+            f"{result.estimate[k]:.4g}",
+            f"{low:.4g} .. {high:.4g}",
+            verdict,
+        )
+    low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
+    table.add_row("latency", "ms", "0", f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}", "")
+    console = Console()
+    if console.width < TABLE_WIDTH:
+        console = Console(width=TABLE_WIDTH)
+    console.print(table)
+    for words in result.null_directions:
+        console.print(f"the data cannot tell: {words}")
+    for words in result.alarms:
+        console.print(f"[bold]alarm:[/bold] {words}")
+    if not result.heldout_nrmse:
+        console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
+        return
+    window_s = result.provenance.get("heldout_window_s", HELDOUT_WINDOW_S)
+    errors = ", ".join(f"{name} {value:.4f}" for name, value in result.heldout_nrmse.items())
+    console.print(f"held-out error over the signal's range ({window_s:g} s windows): {errors}")
+    rmse = result.provenance.get("heldout_rmse", {}).get("mean", {})
+    if rmse:
+        errors = ", ".join(
+            f"{name} {'diverged' if value is None else f'{value:.4g}'}" for name, value in rmse.items()
+        )
+        console.print(f"held-out RMSE, mean over the joints [rad, m]: {errors}")

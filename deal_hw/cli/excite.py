@@ -1,0 +1,262 @@
+"""``deal-hw excite``: compute what to play on a robot so that a recording of it tells most."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import tyro
+
+from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
+from deal_hw.control.excitation import RichBehaviour, RichConfig
+from deal_hw.control.excitation_plan import (
+    ExcitationBehaviour,
+    ExcitationDesign,
+    ExcitationPlan,
+    make_plan,
+)
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import parameter_spaces, robot_description
+from deal_hw.errors import MissingExtraError, UnknownNameError
+from deal_hw.parameters import ParameterDistribution, ParameterSpace
+
+if TYPE_CHECKING:
+    from deal_hw.calib.excitation_search import Optimum
+
+BALANCE_S = 0.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excite:
+    """Compute what to play on a robot so that a recording of it tells most."""
+
+    robot: tyro.conf.Positional[str]
+    """The robot, such as cartpole."""
+
+    out: Path
+    """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
+
+    family: Literal["optimal", "multisine", "chirp", "steps"] = "optimal"
+    """optimal: the most telling of many of the others, by simulation; multisine: a sum of sines with a low
+    peak; chirp: a sweep; steps: random set-points."""
+
+    seconds: float = 4.0
+    """Length of the recording [s]."""
+
+    amplitude: float = 1.0
+    """Not for optimal: share of the largest amplitude that the safety limits allow."""
+
+    low_hz: float = 0.3
+    """Not for optimal: least frequency of multisine and chirp."""
+
+    high_hz: float = 5.0
+    """Not for optimal: greatest frequency of multisine and chirp."""
+
+    effort: float = 1.0
+    """Not for optimal: factor on the effort limit that is sent in the second half."""
+
+    speed: float = 1.0
+    """Not for optimal: factor on the speed limit that is sent in the second half."""
+
+    policy: Path | None = None
+    """Policy that balances at first (.onnx); by default the one shipped for the robot, if any."""
+
+    calibration: Path | None = None
+    """distribution.json of a calibration: robots are drawn from it instead of the whole ranges."""
+
+    space: str = ""
+    """Parameters to tell, such as k9; by default the robot's first set."""
+
+    xi: float = 5.0
+    """Ranges reach a factor XI to either side of nominal."""
+
+    criterion: Literal["determinant", "mean"] = "determinant"
+    """determinant: most information in all; mean: least mean standard deviation."""
+
+    draws: int = 8
+    """Robots that each candidate is tried on."""
+
+    candidates: int = 40
+    """Random candidates."""
+
+    rounds: int = 24
+    """Changes that are tried on the best of them."""
+
+    seed: int = 0
+    """Fixes everything random."""
+
+    threads: int | None = None
+    """Simulation threads; by default all CPUs."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExciteReport:
+    """What was computed.
+
+    Attributes:
+        plan: What will be played.
+        path: Where it was written.
+        optimum: How it was found; None where it was not searched.
+    """
+
+    plan: ExcitationPlan
+    path: Path
+    optimum: Optimum | None = None
+
+
+def excite(config: Excite) -> ExciteReport:
+    """Compute an excitation, write it, return it.
+
+    Raises:
+        DealHwError: A setting is unusable, or no candidate keeps the limits.
+    """
+    description = robot_description(config.robot)
+    balance = balancer(description, config.policy)
+    optimum = None
+    if config.family == "optimal":
+        optimum = _search(config, description, balance)
+        plan = optimum.plan
+    else:
+        plan = make_plan(
+            description,
+            ExcitationDesign(
+                family=config.family, seconds=config.seconds, amplitude=config.amplitude,
+                low_hz=config.low_hz, high_hz=config.high_hz, effort=(1.0, config.effort),
+                speed=(1.0, config.speed), seed=config.seed,
+                balance_s=_balance_s(config.seconds) if balance is not None else 0.0,
+            ),
+        )  # fmt: skip
+    plan.write(config.out)
+    if not config.quiet:
+        print(plan.words)
+        print(
+            f"written: {config.out}; play it with `deal-hw collect {config.robot} --excite {config.out} ...`"
+        )
+    return ExciteReport(plan=plan, path=config.out, optimum=optimum)
+
+
+def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
+    """Return what makes a robot's balancing behaviour; None where the robot has no policy."""
+    path = policy or shipped_policy(description.name)
+    if path is None:
+        return None
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    return lambda: PolicyBehaviour(OnnxPolicy(path), description)
+
+
+def _balance_s(seconds: float) -> float:
+    return min(BALANCE_S, 0.25 * seconds)
+
+
+def _search(
+    config: Excite, description: RobotDescription, balance: Callable[[], Behaviour] | None
+) -> Optimum:
+    try:
+        from deal_hw.calib.excitation_search import SearchSettings, search_excitation
+        from deal_hw.calib.experiment_design import Experiment
+        from deal_hw.sim.model import load_model
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+    settings = SearchSettings(
+        candidates=config.candidates, screening=min(3, config.draws), rounds=config.rounds,
+        criterion=config.criterion,
+    )  # fmt: skip
+    rng = np.random.default_rng(config.seed)
+    quiet_plan = make_plan(
+        description,
+        ExcitationDesign(
+            family="steps", seconds=config.seconds, amplitude=0.01,
+            balance_s=_balance_s(config.seconds) if balance is not None else 0.0,
+        ),
+    )  # fmt: skip
+
+    def play(plan: ExcitationPlan) -> Behaviour:
+        return ExcitationBehaviour(plan, description, balance() if balance is not None else None)
+
+    experiment = Experiment(
+        load_model(description), _knowledge(config), config.seconds, config.draws, rng,
+        rest=lambda: play(quiet_plan), threads=config.threads,
+    )  # fmt: skip
+    references: dict[str, Callable[[], Behaviour]] = {
+        family: _player(play, make_plan(description, design))
+        for family, design in _plain_designs(config, balance is not None).items()
+    }
+    if balance is not None:
+        rich = RichConfig(duration_s=config.seconds)
+        references["rich"] = lambda: RichBehaviour(description, balance(), rich, config.seed)
+    shown = not config.quiet and sys.stderr.isatty()
+    optimum = search_excitation(
+        experiment, rng, settings, balance=balance, references=references, notify=_note if shown else None
+    )
+    if not config.quiet:
+        print_optimum(experiment.space, optimum, experiment.refused)
+    return optimum
+
+
+def _player(play: Callable[[ExcitationPlan], Behaviour], plan: ExcitationPlan) -> Callable[[], Behaviour]:
+    return lambda: play(plan)
+
+
+def _plain_designs(config: Excite, balances: bool) -> dict[str, ExcitationDesign]:
+    balance_s = _balance_s(config.seconds) if balances else 0.0
+    return {
+        "multisine": ExcitationDesign(
+            family="multisine", seconds=config.seconds, balance_s=balance_s, seed=config.seed
+        ),
+        "chirp": ExcitationDesign(family="chirp", seconds=config.seconds, balance_s=balance_s),
+    }
+
+
+def _knowledge(config: Excite) -> ParameterDistribution:
+    from deal_hw.calib.experiment_design import default_knowledge
+
+    if config.calibration is not None:
+        from deal_hw.cli.train import read_distribution
+
+        path = config.calibration
+        return read_distribution(path / "distribution.json" if path.is_dir() else path)
+    table = parameter_spaces(config.robot)
+    name = config.space or next(iter(table))
+    if name not in table:
+        raise UnknownNameError("parameter set", name, table)
+    return default_knowledge(table[name]().with_ratio(config.xi))
+
+
+def _note(done: int, total: int, text: str) -> None:
+    print(f"\r{done}/{total} {text:<60.60}", end="" if done < total else "\n", file=sys.stderr, flush=True)
+
+
+def print_optimum(space: ParameterSpace, optimum: Optimum, refused: int) -> None:
+    """Print what the best excitation and the plain ones are predicted to tell."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="predicted standard deviation (% of the value; in the unit on a linear scale)")
+    table.add_column("parameter")
+    columns = {"optimal": optimum.prediction, **optimum.references}
+    for name in columns:
+        table.add_column(name, justify="right")
+    for k, p in enumerate(space):
+        factor = 100.0 if p.scale == "log" else 1.0
+        cells = [f"{factor * c.std[k]:.2f}" if c.usable else "-" for c in columns.values()]
+        table.add_row(p.name, *cells)
+    table.add_row(
+        "information [nats]", *[f"{c.gain:.1f}" if c.usable else c.tripped for c in columns.values()]
+    )
+    console = Console()
+    console.print(table)
+    discarded = sum(optimum.tripped.values())
+    reasons = "; ".join(f"{count} x {why}" for why, count in optimum.tripped.items())
+    print(
+        f"{optimum.tried} candidates, {discarded} discarded" + (f" ({reasons})" if reasons else "")
+        + (f"; {refused} draws of parameters refused" if refused else "")
+    )  # fmt: skip

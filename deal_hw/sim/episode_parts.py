@@ -1,0 +1,80 @@
+"""Parts of an episode: stretches short enough for many members, and a last part to judge by."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from deal_hw.sim.episode import Episode
+from deal_hw.types import FloatArray
+
+LEAD_S = 0.1
+"""Commands kept before a part's first sample: as long as any latency reaches back [s]."""
+
+
+def part(episode: Episode, first: int, last: int) -> Episode:
+    """Return the samples first .. last - 1 of an episode, with the commands that act on them.
+
+    Set-points without a speed limit depend on nothing older than the latency. With a limit the set-point at
+    the part's beginning is taken to have reached its target.
+    """
+    rows = slice(first, last)
+    lead = round(LEAD_S / episode.step_s)
+    origin = max(int(episode.sample[first]) - lead, 0)
+    until = max(int(episode.sample[last - 1]), origin + 1)
+    steps = slice(origin, until)
+    start = episode.start_setpoint if origin == 0 else episode.target[origin - 1]
+
+    def rows_of(values: FloatArray | None) -> FloatArray | None:
+        return values if values is None or values.ndim == 1 else values[rows]
+
+    return dataclasses.replace(
+        episode,
+        sample=episode.sample[rows] - origin,
+        position=episode.position[rows],
+        velocity=episode.velocity[rows],
+        target=episode.target[steps],
+        stiffness=episode.stiffness[steps],
+        damping=episode.damping[steps],
+        effort_limit=episode.effort_limit[steps],
+        speed_limit=episode.speed_limit[steps],
+        usable=episode.usable[rows],
+        start_setpoint=start,
+        first_row=episode.first_row + first,
+        origin=episode.origin + origin,
+        reported=None if episode.reported is None else episode.reported[rows],
+        reference=None if episode.reference is None else episode.reference[rows],
+        estimate_std=rows_of(episode.estimate_std),
+    )
+
+
+def stretches(episode: Episode, seconds: float) -> list[Episode]:
+    """Cut an episode into parts of equal length, none longer than ``seconds``; they share end samples."""
+    T = len(episode.sample)
+    count = max(int(np.ceil((T - 1) * episode.period_s / seconds)), 1)
+    edges = np.linspace(0, T - 1, count + 1).round().astype(int)
+    return [part(episode, int(a), int(b) + 1) for a, b in itertools.pairwise(edges) if b > a]
+
+
+def split_last(episode: Episode, share: float) -> tuple[Episode, Episode]:
+    """Return an episode without its last part, and that part.
+
+    Args:
+        episode: The episode.
+        share: Share of the samples in the last part, between 0 and 1.
+    """
+    at = round((1.0 - share) * (len(episode.sample) - 1))
+    return part(episode, 0, at + 1), part(episode, at, len(episode.sample))
+
+
+def spread(parts: Sequence[Episode], seconds: float) -> list[Episode]:
+    """Return parts that lie evenly over all and add up to about so many seconds; all where they are fewer."""
+    lengths = np.array([(len(p.sample) - 1) * p.period_s for p in parts])
+    if lengths.sum() <= seconds:
+        return list(parts)
+    count = max(int(seconds / lengths.mean()), 1)
+    chosen = np.unique(((np.arange(count) + 0.5) * len(parts) / count).astype(int))
+    return [parts[i] for i in chosen]

@@ -1,0 +1,116 @@
+"""What policies observe of a floating base."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from deal_hw.drivers.go2.description import DESCRIPTION
+from deal_hw.errors import ConfigurationError
+from deal_hw.policy import (
+    ObservationBuilder,
+    ObservationTerm,
+    PolicySpec,
+    base_features,
+    in_base_frame,
+)
+
+J = len(DESCRIPTION.joint_names)
+
+
+def spec(*terms: ObservationTerm) -> PolicySpec:
+    return PolicySpec(
+        robot="go2",
+        joint_names=DESCRIPTION.joint_names,
+        actuated=DESCRIPTION.actuated,
+        observation=terms,
+        action_scale=(0.5,) * J,
+        default_position=DESCRIPTION.default_position,
+        stiffness=DESCRIPTION.stiffness,
+        damping=DESCRIPTION.damping,
+        effort_limit=DESCRIPTION.effort_limit,
+        speed_limit=DESCRIPTION.speed_limit,
+        control_rate_hz=50.0,
+    )
+
+
+coordinate = st.floats(-4.0, 4.0)
+
+
+@given(st.lists(coordinate, min_size=6, max_size=6))
+def test_vectors_turn_as_scipy_turns_them(values: list[float]) -> None:
+    """Any rotation vector, zero and beyond half a turn included."""
+    turn, vector = np.array(values[:3]), np.array(values[3:])
+    wanted = Rotation.from_rotvec(turn).inv().apply(vector)
+    np.testing.assert_allclose(in_base_frame(turn, vector), wanted, atol=1e-9)
+
+
+def test_features_by_hand() -> None:
+    """Turned left by 90 degrees and moving along the world's y axis: ahead is where it moves."""
+    position, velocity = np.zeros(6), np.zeros(6)
+    position[2], position[5] = 0.3, np.pi / 2
+    velocity[:] = 0.0, 2.0, 0.0, 0.1, 0.2, 0.3
+    # Gravity is below; the world's x axis is to the right, at -y; angular velocity is the base's own already.
+    wanted = [0, 0, -1, 0, -1, 0, 0.1, 0.2, 0.3, 2, 0, 0, 0.3]
+    np.testing.assert_allclose(base_features(position, velocity), wanted, atol=1e-12)
+
+
+def test_terms_of_the_base_are_picked_scaled_and_remembered() -> None:
+    """Height now, gravity a tick ago, the command, and a joint that the base in front does not shift."""
+    builder = ObservationBuilder(
+        spec(
+            ObservationTerm("height", "z", 2.0),
+            ObservationTerm("gravity", "y", 1.0, 1),
+            ObservationTerm("command", "x", 10.0),
+            ObservationTerm("position", DESCRIPTION.joint_names[0], 1.0),
+        )
+    )
+    builder.command = np.array([0.4, 0.0, 0.0])
+    position, velocity = np.zeros(6 + J), np.zeros(6 + J)
+    position[2], position[6:] = 0.3, DESCRIPTION.default_position
+    position[6] += 0.05
+    np.testing.assert_allclose(builder.build(position, velocity), [0.6, 0.0, 4.0, 0.05], rtol=1e-6)
+    # Rolled by 30 degrees: gravity has -sin(30) along y, seen a tick later.
+    rolled = position.copy()
+    rolled[3] = np.pi / 6
+    assert builder.build(rolled, velocity)[1] == 0.0
+    assert builder.build(position, velocity)[1] == pytest.approx(-0.5)
+
+
+def test_terms_without_the_base_need_no_base() -> None:
+    """Joint terms read the joints, whether the state comes with a base or not."""
+    position = np.arange(6.0 + J)
+    built = [
+        ObservationBuilder(spec(ObservationTerm("position", "FL_hip_joint", 1.0))).build(x, x)
+        for x in (position, position[6:])
+    ]
+    np.testing.assert_array_equal(*built)
+
+
+def test_a_state_without_a_base_is_refused() -> None:
+    """The message says how many coordinates are needed and were given."""
+    builder = ObservationBuilder(spec(ObservationTerm("height", "z", 1.0)))
+    with pytest.raises(ConfigurationError, match=r"'go2' observes the base: it needs 6 \+ 12 .* got 12"):
+        builder.build(np.zeros(J), np.zeros(J))
+
+
+@pytest.mark.parametrize(
+    ("quantity", "axis", "known"), [("gravity", "FL_hip_joint", "'x', 'y', 'z'"), ("height", "x", "'z'")]
+)
+def test_axes_that_are_not_there_are_refused(quantity: str, axis: str, known: str) -> None:
+    """The message lists the axes of the quantity."""
+    with pytest.raises(ConfigurationError, match=f"axis '{axis}'; known: .*{known}"):
+        spec(ObservationTerm(quantity, axis, 1.0))  # type: ignore[arg-type]
+
+
+def test_terms_of_the_base_survive_json() -> None:
+    """A spec that observes the base comes back from its text."""
+    made = spec(ObservationTerm("gravity", "z", 1.0), ObservationTerm("command", "y", 0.5))
+    assert PolicySpec.from_json(made.to_json()) == made
+    assert made.observes_base
+    assert not dataclasses.replace(made, observation=made.observation[1:]).observes_base

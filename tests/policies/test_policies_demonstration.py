@@ -1,0 +1,177 @@
+"""pi_0 in the loop: shipped files, targets that they drive, populations in the calibrator's closed loop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.coordinates import Members
+from deal_hw.calib.identity import digest
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.rollouts import control_ticks, rollout_population
+from deal_hw.drivers import parameter_spaces, robot_description
+from deal_hw.errors import PolicyMismatchError, UnknownNameError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.policies.demonstration import (
+    ASSETS,
+    SHIPPED,
+    Demonstration,
+    PopulationDemonstration,
+    demonstration_policy,
+    limited_action,
+)
+from deal_hw.policies.go2_env import walk_spec
+from deal_hw.policy import Observation, PolicySpec, base_features
+from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.target import TargetRecording, record_target
+from deal_hw.types import FloatArray
+
+FLOATING = ("ant", "go2")
+GO2 = robot_description("go2")
+WALK = (0.4, 0.0, 0.0)
+
+
+def loaded(robot: str) -> tuple[RobotModel, ParameterSpace]:
+    space = next(iter(parameter_spaces(robot).values()))()
+    return load_model(robot_description(robot)), space.with_ratio(2.0)
+
+
+def recorded(
+    robot: str, seed: int, seconds: float
+) -> tuple[RobotModel, ParameterSpace, FloatArray, TargetRecording]:
+    model, space = loaded(robot)
+    rng = np.random.default_rng(seed)
+    theta = space.sample(rng, 1)[0]
+    behaviour = Demonstration(demonstration_policy(robot), model.description, WALK)
+    return model, space, theta, record_target(model, space, theta, behaviour, seconds=seconds, rng=rng)
+
+
+@pytest.mark.parametrize("robot", SHIPPED)
+def test_shipped_policies_fit_their_robots_and_their_records(robot: str) -> None:
+    """Each loads, is small, was made for this robot, and is the file that its record speaks of."""
+    policy = demonstration_policy(robot)
+    policy.spec.check_fits(robot_description(robot))
+    path = ASSETS / f"{robot}_udr.onnx"
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert path.stat().st_size < 200_000
+    assert record["spec_digest"] == policy.spec.digest()
+    assert record["distribution_digest"] == policy.spec.trained_under
+    if robot in FLOATING:
+        assert record["onnx_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert {"return_mean", "fall_rate", "forward_speed_m_s"} <= record["evaluation"].keys()
+        assert {"seconds", "seed", "machine", "training"} <= record.keys()
+
+
+def test_there_is_no_policy_for_every_robot() -> None:
+    """The message lists those that have one."""
+    with pytest.raises(UnknownNameError, match="cartpole"):
+        demonstration_policy("so101")
+
+
+@pytest.mark.parametrize("robot", FLOATING)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_target_is_driven_without_divergence_and_moves(robot: str, seed: int) -> None:
+    """Two seconds on a random truth: finite states, commands inside the limits, joints that move."""
+    model, _, _, made = recorded(robot, seed, 2.0)
+    description = model.description
+    assert np.isfinite(made.position).all() and np.isfinite(made.velocity).all()
+    low, high = np.array(description.limits.target).T
+    target = made.episode.target
+    assert (target >= low - 1e-9).all() and (target <= high + 1e-9).all()
+    assert (np.abs(np.diff(target, axis=0)) <= np.array(description.limits.target_step) + 1e-9).all()
+    assert made.position[:, model.joints].std(axis=0).min() > 5e-3
+    # Staying up is stated in the records of these early checkpoints; here they must not lie on their backs.
+    down = base_features(made.position[:, :6], made.velocity[:, :6])[:, 2]
+    assert (down < -0.3).mean() > 0.5
+
+
+@pytest.mark.parametrize("robot", FLOATING)
+def test_the_truth_in_closed_loop_repeats_the_target(robot: str) -> None:
+    """In the calibrator's closed loop the true member does what the target did, and others do otherwise."""
+    model, space, theta, made = recorded(robot, 2, 0.6)
+    problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0)
+    population = PopulationDemonstration(demonstration_policy(robot), model.description, WALK)
+    ticks = control_ticks(problem, 0)
+    members = Members(np.stack([theta, space.center]), np.zeros(2))
+    position, _, action = rollout_population(problem, members, 0, ticks, population)
+    wanted = made.episode.target[ticks.action]
+    joints = made.position[ticks.sample][:, model.joints]
+    short = 10
+    assert np.abs(action[0, :short] - wanted[:short]).max() < 1e-3
+    assert np.abs(position[0, :short, model.joints] - joints[:short]).max() < 1e-3
+    assert np.abs(position[1, :short, model.joints] - joints[:short]).max() > 1e-3
+
+
+class Leap:
+    """Asks for the largest action at once, and remembers what it saw."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+        self.seen: list[Observation] = []
+
+    def act_batch(self, observations: Observation) -> FloatArray:
+        """Return ones, (B, A)."""
+        self.seen.append(observations)
+        return np.ones((len(observations), len(self.spec.actuated)))
+
+
+def resting(count: int) -> tuple[FloatArray, FloatArray]:
+    position = np.zeros((count, 18))
+    position[:, 2], position[:, 6:] = 0.26, GO2.default_position
+    return position, np.zeros_like(position)
+
+
+def test_tick_zero_forgets_and_members_that_diverged_rest() -> None:
+    """The second rollout equals the first; a member that is NaN is sent the default pose again."""
+    population = PopulationDemonstration(Leap(walk_spec(GO2)), GO2, WALK)
+    position, velocity = resting(3)
+    first = [population(position, velocity, tick) for tick in range(3)]
+    again = [population(position, velocity, tick) for tick in range(3)]
+    np.testing.assert_array_equal(first, again)
+    calf = GO2.actuated.index("FL_calf_joint")
+    # -1.8 + 0.5 after one tick; 0.8, the whole scale, after two.
+    np.testing.assert_allclose([a[0, calf] for a in first], [-1.3, -1.0, -1.0])
+    position[1] = np.nan
+    sent = [population(position, velocity, tick) for tick in range(2)]
+    np.testing.assert_array_equal(sent[1][1], GO2.default_position)
+    np.testing.assert_array_equal(sent[1][0], first[1][0])
+    assert population(position[:2], velocity[:2], 5).shape == (2, 12)
+
+
+def test_the_wish_is_observed() -> None:
+    """A wanted speed of 0.4 m/s arrives at the policy, scaled by 2."""
+    policy = Leap(walk_spec(GO2))
+    Demonstration(policy, GO2, WALK)(*(values[0] for values in resting(1)), 0.0)
+    told = [term.quantity for term in policy.spec.observation].index("command")
+    assert policy.seen[0][0, told] == pytest.approx(0.8)
+
+
+def test_actions_are_clipped_and_limited() -> None:
+    """2 becomes 1; a step of 0.5 rad at a scale of 0.8 is one of 0.625."""
+    scale = np.full(12, 0.8)
+    far = limited_action(GO2, scale, np.full(12, 2.0), np.full(12, 0.9))
+    np.testing.assert_allclose(far, 1.0)
+    np.testing.assert_allclose(limited_action(GO2, scale, np.full(12, -2.0), np.zeros(12)), -0.625)
+
+
+def test_a_policy_for_another_robot_is_refused() -> None:
+    """The cart-pole's policy does not drive a Go2."""
+    with pytest.raises(PolicyMismatchError, match="'cartpole'"):
+        Demonstration(demonstration_policy("cartpole"), GO2)
+
+
+def test_a_checkpoint_tells_policies_and_wishes_apart(tmp_path: Path) -> None:
+    """The digest of a search with pi_0 in the loop depends on the policy and on what it is told."""
+    ant = PopulationDemonstration(demonstration_policy("ant"), robot_description("ant"))
+    made = [
+        PopulationDemonstration(demonstration_policy("go2"), GO2, wanted)
+        for wanted in (WALK, (0.0, 0.0, 0.0))
+    ]
+    assert len({digest(ant), digest(made[0]), digest(made[1])}) == 3
+    again = PopulationDemonstration(demonstration_policy("go2"), GO2, WALK)
+    again(*resting(2), 0)
+    assert digest(again) == digest(made[0])

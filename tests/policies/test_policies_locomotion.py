@@ -1,0 +1,247 @@
+"""The tasks of ant and Go2: environment contract, rewards by hand, and a training short enough to watch."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import math
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from deal_hw.drivers import parameter_spaces, robot_description
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.ant_env import AntEnv, RunTask, run_spec
+from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
+from deal_hw.policies.locomotion import LocomotionEnv, judge
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policy import Observation, PolicySpec
+from deal_hw.types import FloatArray
+
+ROOT = Path(__file__).resolve().parents[2]
+ROBOTS = ("ant", "go2")
+
+
+def udr(robot: str) -> ParameterDistribution:
+    space = next(iter(parameter_spaces(robot).values()))()
+    return ParameterDistribution.uniform(space.with_ratio(5.0), (0.0, 0.02))
+
+
+def make(robot: str, count: int = 4, **task: float) -> LocomotionEnv:
+    if robot == "ant":
+        return AntEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))  # type: ignore[arg-type]
+    return Go2Env(robot_description(robot), udr(robot), count, task=WalkTask(**task))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def env(request: pytest.FixtureRequest) -> LocomotionEnv:
+    """Return an environment of four robots with episodes of 0.4 s."""
+    return make(request.param, ticks=20)
+
+
+def state(count: int, joints: int) -> tuple[FloatArray, FloatArray]:
+    """Return the states of robots at 0.26 m, upright and at rest."""
+    position = np.zeros((count, 6 + joints))
+    position[:, 2] = 0.26
+    return position, np.zeros_like(position)
+
+
+def test_what_comes_out_is_what_the_spaces_say(env: LocomotionEnv) -> None:
+    """Shapes, types and finite values; gymnasium's own spaces contain what is observed and sampled."""
+    observation, _ = env.reset(seed=3)
+    env.action_space.seed(0)
+    for _ in range(25):
+        assert observation in env.observation_space
+        assert np.isfinite(observation).all()
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        over = terminated | truncated
+        assert reward.shape == terminated.shape == truncated.shape == (4,)
+        assert np.isfinite(reward).all()
+        assert not (terminated & truncated).any()
+        assert over.any() == ("final_obs" in info)
+
+
+def test_a_seed_decides_everything(env: LocomotionEnv) -> None:
+    """Parameters, latencies, starts and commands come from the seed, not from what was before."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (22, 4, len(env.layout.actuated)))
+    runs = []
+    for seed in (5, 5, 6):
+        first = env.reset(seed=seed)[0]
+        runs.append(np.stack([first, *(env.step(action)[0] for action in actions)]))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def test_episodes_start_from_robots_that_have_settled(env: LocomotionEnv) -> None:
+    """Nobody starts in the air, fallen, or moving."""
+    env.reset(seed=0)
+    position, velocity = env.loop.position, env.loop.velocity
+    assert not env.ended(position, velocity).any()
+    assert (position[:, 2] < env.loop.batch.robot.model.qpos0[2]).all()
+    np.testing.assert_array_equal(velocity, 0.0)
+
+
+def test_ant_reward_by_hand() -> None:
+    """1 * 1.5 + 0.2 - 0.1 * (0.5^2 + 0.5^2) = 1.65; sideways counts nothing."""
+    env = make("ant", 2)
+    position, velocity = state(2, 8)
+    velocity[0, :3] = 1.5, 9.0, 0.0
+    action = np.zeros((2, 8))
+    action[0, :2] = 0.5, -0.5
+    reward = env.reward(position, velocity, action, np.ones((2, 8)))
+    np.testing.assert_allclose(reward, [1.65, 0.2], atol=1e-12)
+
+
+def test_ant_ends_on_its_back_or_in_the_air() -> None:
+    """At a tilt of 89 degrees it may go on, at 91 not; nor above a metre."""
+    env = make("ant", 3)
+    position, velocity = state(3, 8)
+    position[:2, 4] = np.radians([89.0, 91.0])
+    position[2, 2] = 1.01
+    assert env.ended(position, velocity).tolist() == [False, True, True]
+
+
+def test_go2_reward_by_hand() -> None:
+    """Upright: tracking and height; turned by 90 degrees about z: velocities count in the base's frame."""
+    env = make("go2", 3)
+    assert isinstance(env, Go2Env)
+    env.command[:] = 0.0
+    env.command[1:, 0] = 0.4
+    position, velocity = state(3, 12)
+    # Stands as told, 2 cm low: 1.5 + 0.5 - 10 * 0.02^2 = 1.996.
+    position[0, 2] = 0.24
+    # Heads along the world's y axis at 0.2 m/s, 0.2 too slow, and yaws at 0.5 rad/s; one action changed by 1:
+    # 1.5 exp(-0.04 / 0.08) + 0.5 - 0.1 * 0.25 - 0.02 = 1.5 exp(-0.5) + 0.455.
+    position[1, 5] = math.pi / 2
+    velocity[1, :6] = 0.0, 0.2, 0.0, 0.0, 0.0, 0.5
+    # Tilted by 30 degrees, sin^2 = 0.25: 1.5 exp(-0.16 / 0.08) + 0.5 - 2 * 0.25 = 1.5 exp(-2).
+    position[2, 3] = math.pi / 6
+    before, action = np.zeros((3, 12)), np.zeros((3, 12))
+    action[1, 7] = -1.0
+    wanted = [1.996, 1.5 * math.exp(-0.5) + 0.455, 1.5 * math.exp(-2.0)]
+    np.testing.assert_allclose(env.reward(position, velocity, action, before), wanted, atol=1e-12)
+
+
+def test_go2_ends_when_it_tilts_or_sinks() -> None:
+    """The limits are 60 degrees and 0.1 m."""
+    env = make("go2", 4)
+    position, velocity = state(4, 12)
+    position[:2, 3] = np.radians([59.0, 61.0])
+    position[2:, 2] = 0.101, 0.099
+    assert env.ended(position, velocity).tolist() == [False, True, False, True]
+
+
+def test_go2_commands_are_drawn_and_observed() -> None:
+    """A fifth of the episodes stand, the others walk at 0.1 to 0.5 m/s, and the policy is told which."""
+    env = make("go2", 200)
+    assert isinstance(env, Go2Env)
+    observation, _ = env.reset(seed=0)
+    speed = env.command[:, 0]
+    assert 20 <= (speed == 0).sum() <= 60
+    assert ((speed == 0) | ((speed >= 0.1) & (speed <= 0.5))).all()
+    told = [term.quantity for term in env.layout.observation].index("command")
+    np.testing.assert_allclose(observation[:, told], 2.0 * speed, rtol=1e-6)
+
+
+def test_targets_move_no_faster_than_safety_allows() -> None:
+    """From rest, an action of 1 moves the calf's target by 0.5 rad, and the policy sees 0.5 / 0.8."""
+    env = make("go2", 1)
+    env.reset(seed=0)
+    observation = env.step(np.ones((1, 12)))[0]
+    last = [k for k, t in enumerate(env.layout.observation) if t.quantity == "action" and "calf" in t.joint]
+    np.testing.assert_allclose(observation[0, last], 0.5 / 0.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("spec", "robot"), [(run_spec, "ant"), (walk_spec, "go2")])
+def test_specs_fit_their_robots_and_stay_inside_the_limits(spec: type[PolicySpec], robot: str) -> None:
+    """What is trained here may be deployed there: no reachable target is outside the safety limits."""
+    description = robot_description(robot)
+    layout: PolicySpec = spec(description)  # type: ignore[call-arg, arg-type]
+    layout.check_fits(description)
+    low, high = np.array(description.limits.target).T
+    middle = np.array(description.default_position) if description.actuation == "position" else np.zeros(8)
+    assert (middle - layout.action_scale >= low).all() and (middle + layout.action_scale <= high).all()
+
+
+class Still:
+    """A policy that does nothing."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+
+    def act_batch(self, observations: Observation) -> FloatArray:
+        """Return zeros, (B, A)."""
+        return np.zeros((len(observations), len(self.spec.actuated)))
+
+
+def test_judgement_counts_the_first_episode_only() -> None:
+    """Ants at rest, speed not counted: nobody falls, and 20 ticks at 0.2 give 4, not more."""
+    found = judge(Still(make("ant").layout), make("ant", 6, ticks=20, forward_weight=0.0), 1)
+    assert found["fall_rate"] == 0.0 and found["time_up"] == 1.0 and found["robots"] == 6
+    assert found["return_mean"] == pytest.approx(4.0)
+
+
+def test_what_ended_early_is_judged_up_to_there() -> None:
+    """Robots that count as fallen at once get one fall each and no time up but the tick of the fall."""
+    env = make("go2", 3, ticks=10)
+    assert isinstance(env, Go2Env)
+    env.task = dataclasses.replace(env.task, lowest_m=1.0)
+    found = judge(Still(env.layout), env, 1)
+    assert found["fall_rate"] == 1.0 and found["time_up"] == pytest.approx(0.1)
+    assert found["return_mean"] == -env.task.fall_cost and found["forward_speed_m_s"] is None
+
+
+def test_a_fixed_base_is_refused() -> None:
+    """The message names the robot and what it lacks."""
+    description = dataclasses.replace(robot_description("go2"), floating_base=None)
+    with pytest.raises(ConfigurationError, match="'go2' has a fixed base; locomotion needs a free one"):
+        Go2Env(description, udr("go2"), 1)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "message"),
+    [
+        (RunTask, {"ticks": 0}, "ticks must be at least 1, got 0"),
+        (RunTask, {"top_height_m": 0.0}, "top_height_m must be positive, got 0.0"),
+        (WalkTask, {"ticks": 0}, "ticks must be at least 1, got 0"),
+        (WalkTask, {"tracking_width": 0.0}, "tracking_width must be positive, got 0.0"),
+        (WalkTask, {"speed_m_s": (0.5, 0.1)}, "speed_m_s must be"),
+        (WalkTask, {"standing": 2.0}, r"standing must lie in \[0, 1\], got 2.0"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(
+    task: type[RunTask | WalkTask], settings: dict[str, float], message: str
+) -> None:
+    """The message names the setting and what was given."""
+    with pytest.raises(ConfigurationError, match=message):
+        task(**settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    """Return the training command as a module."""
+    spec = importlib.util.spec_from_file_location(
+        "train_demo_policy", ROOT / "tools" / "train_demo_policy.py"
+    )
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_short_training_makes_a_policy_that_acts(robot: str, tool: ModuleType, tmp_path: Path) -> None:
+    """A few hundred steps give a small file, its record, and actions in [-1, 1]."""
+    path = tmp_path / f"{robot}.onnx"
+    tool.train(robot, path, seed=1, steps=160, members=8, judged=4)
+    policy = OnnxPolicy(path)
+    observation = np.random.default_rng(0).standard_normal(len(policy.spec.observation)).astype(np.float32)
+    assert np.abs(policy.act(observation)).max() <= 1.0
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["training"]["config"]["steps"] == 160
+    assert record["evaluation"]["robots"] == record["at_rest"]["robots"] == 4
+    assert path.stat().st_size < 200_000
