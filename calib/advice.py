@@ -1,7 +1,7 @@
 """What to record next: which excitation tells most about what a recording left open.
 
-All figures are computed: each excitation of a menu is simulated at the estimate, and its Fisher information is
-added to what the calibration knows already.
+All figures are computed: each excitation of a menu is simulated at the estimate, and its Fisher information
+is added to what the calibration knows already.
 """
 
 from __future__ import annotations

@@ -43,11 +43,19 @@ class SearchSettings:
     """Designs that are tried on all members."""
     rounds: int = 24
     """Changes of one coordinate that are tried on the best."""
+    confirmed: int = 6
+    """Designs that are tried again on the members of the confirmation, where there is one."""
     criterion: Criterion = "determinant"
     """determinant: most information in all (D-optimal); mean: least mean standard deviation (A-optimal)."""
 
     def __post_init__(self) -> None:
-        if self.candidates < 1 or self.screening < 1 or self.finalists < 1 or self.rounds < 0:
+        if (
+            self.candidates < 1
+            or self.screening < 1
+            or self.finalists < 1
+            or self.rounds < 0
+            or self.confirmed < 1
+        ):
             raise ConfigurationError(f"not a usable search for an excitation: {self}")
 
 
@@ -92,6 +100,7 @@ def search_excitation(
     *,
     balance: Callable[[], Behaviour] | None = None,
     references: Mapping[str, MakeBehaviour] | None = None,
+    confirmation: Experiment | None = None,
     notify: Callable[[int, int, str], None] | None = None,
 ) -> Optimum:
     """Search the most telling excitation that keeps every member inside the limits.
@@ -102,6 +111,9 @@ def search_excitation(
         settings: How thoroughly.
         balance: Makes what balances at first; None for robots that stand by themselves.
         references: Other excitations to compare with.
+        confirmation: The same experiment on other members, and more of them: the best designs are tried on
+            these, too, the one that is best there is returned, with what it tells there. Without it a search
+            on few members finds what suits those few.
         notify: Called with candidates done, candidates expected and a short line.
 
     Raises:
@@ -111,10 +123,13 @@ def search_excitation(
     description = experiment.robot.description
     count = _Count()
     total = wanted.candidates + min(wanted.finalists, wanted.candidates) + wanted.rounds
+    total += wanted.confirmed if confirmation is not None else 0
 
-    def predict(design: ExcitationDesign, draws: int | None = None) -> Prediction:
+    def predict(
+        design: ExcitationDesign, draws: int | None = None, on: Experiment = experiment
+    ) -> Prediction:
         plan = make_plan(description, design)
-        found = experiment.predict(
+        found = on.predict(
             lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None), draws
         )
         count.note(found)
@@ -137,19 +152,36 @@ def search_excitation(
         )
     best, design = max(finals, key=lambda pair: score(pair[0], wanted))
     trace = [score(best, wanted)]
+    steps = [(best, design)]
     for k in range(wanted.rounds):
         moved = _moved(description, design, k, balance is not None, rng)
         found = predict(moved)
         if score(found, wanted) > score(best, wanted):
             best, design = found, moved
+            steps.append((best, design))
         trace.append(score(best, wanted))
+    if confirmation is not None:
+        # Half of them along the way that the best came, half the other finalists.
+        chosen = steps[::-1][: (wanted.confirmed + 1) // 2]
+        others = sorted(finals, key=lambda pair: -score(pair[0], wanted))
+        there = [d for _, d in chosen]
+        chosen += [pair for pair in others if pair[1] not in there][: wanted.confirmed - len(chosen)]
+        again = [(predict(d, on=confirmation), d) for _, d in chosen]
+        best, design = max(again, key=lambda pair: score(pair[0], wanted))
+        if not best.usable:
+            raise CalibrationError(
+                f"what suits {len(experiment.scenario)} draws of {description.name!r} trips on one of "
+                f"{len(confirmation.scenario)} others ({best.tripped}); give narrower ranges (--xi, "
+                "--calibration) or more draws (--draws)"
+            )
+    judge = experiment if confirmation is None else confirmation
     plan = make_plan(description, design)
     predicted = dict(zip(experiment.space.names, map(float, best.std), strict=True))
     return Optimum(
         design=design,
         plan=dataclasses.replace(plan, predicted=predicted),
         prediction=best,
-        references={name: experiment.predict(make) for name, make in (references or {}).items()},
+        references={name: judge.predict(make) for name, make in (references or {}).items()},
         tried=count.tried,
         tripped=count.tripped,
         trace=tuple(trace),

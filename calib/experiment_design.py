@@ -169,7 +169,8 @@ class Experiment:
         self.refused = 0
         """Draws that could not be run."""
         self._runners: dict[int, TrialRunner] = {}
-        drawn = _draw(robot.description, known, rng, draws * DRAWS_PER_MEMBER)
+        self._rest = rest
+        drawn = _draw(robot.description, known, rng, draws)
         self.scenario = self._runnable(drawn, draws, rest)
 
     def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour | None) -> Scenario:
@@ -187,6 +188,10 @@ class Experiment:
             )
         self.refused = (kept[-1] + 1) - draws
         return drawn.part(kept)
+
+    def afresh(self, draws: int, rng: np.random.Generator) -> Experiment:
+        """Return the same experiment on other members: what was chosen on some is judged on others."""
+        return Experiment(self.robot, self.known, self.seconds, draws, rng, self._rest, self.threads)
 
     def assume(self, covariance: FloatArray) -> None:
         """Take this covariance, (K, K), as what is known before, instead of the distribution's."""
@@ -243,10 +248,16 @@ def default_knowledge(
 
 
 def _draw(
-    description: RobotDescription, known: ParameterDistribution, rng: np.random.Generator, count: int
+    description: RobotDescription, known: ParameterDistribution, rng: np.random.Generator, draws: int
 ) -> Scenario:
+    count = draws * DRAWS_PER_MEMBER
     if known.covariance is None:
-        theta = known.space.unnormalize(rng.uniform(*INNER, (count, len(known.space))))
+        # Latin hypercubes: each parameter is at its low and at its high end on some member, for it is at the
+        # ends that something leaves no trace, as a high effort limit does.
+        K = len(known.space)
+        cubes = [rng.permuted(np.tile(np.arange(draws), (K, 1)), axis=1).T for _ in range(DRAWS_PER_MEMBER)]
+        unit = (np.concatenate(cubes) + rng.random((count, K))) / draws
+        theta = known.space.unnormalize(INNER[0] + (INNER[1] - INNER[0]) * unit)
     else:
         theta = known.sample(rng, count)
     low, high = known.latency_s

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial.distance import cdist, pdist
 
 from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.innovations import cut, whitened_residual
+from deal_hw.calib.innovations import Whitening, cut, linearise, whitened_residual
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.rollouts import (
     PopulationPolicy,
@@ -191,10 +191,16 @@ class TrajectoryFitness(Stateless):
         self._windows = cut(problem, settings.horizon_ticks)
         coordinates = Coordinates(problem)
         self._centre = coordinates.members(np.full((1, coordinates.count), 0.5))
+        # Made on first use and kept: a small population's call costs less than its metric.
+        self._whitenings: list[Whitening] | None = None
 
     def score(self, members: Members) -> FloatArray:
         """See :meth:`Fitness.score`."""
-        residual = whitened_residual(self._problem, members, self._centre, self._windows)
+        if self._whitenings is None:
+            self._whitenings = [linearise(self._problem, self._centre, data) for data in self._windows]
+        residual = whitened_residual(
+            self._problem, members, self._centre, self._windows, whitenings=self._whitenings
+        )
         with np.errstate(over="ignore"):
             error = np.mean(residual**2, axis=1)
         return np.where(np.isfinite(error), -np.log(np.maximum(error, 1e-300)), -np.inf)

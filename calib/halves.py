@@ -21,8 +21,8 @@ from deal_hw.calib.refine import Polished, polish_windows
 from deal_hw.calib.report.inputs import HalvesRow
 from deal_hw.calib.residuals import Point, Shooting
 from deal_hw.calib.statements import statement, widened_to, with_rows
-from deal_hw.types import FloatArray
 from deal_hw.sim.windows import Windows
+from deal_hw.types import FloatArray
 
 ITERATIONS = 6
 MOST_STEPS = 3e8
@@ -59,7 +59,8 @@ class Halves:
             return {"note": self.note}
         return {
             "parameters": {
-                r.name: {"first": list(r.first), "second": list(r.second), "agree": r.agree} for r in self.rows
+                r.name: {"first": list(r.first), "second": list(r.second), "agree": r.agree}
+                for r in self.rows
             },
             "flagged": list(self.flagged),
             "steps": self.steps,
@@ -113,7 +114,9 @@ def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> 
         block = max(1, min(round(known.clustered.block_samples / shooting.length), windows // FEWEST_WINDOWS))
     estimates, stds, intervals = [], [], []
     for half in range(2):
-        found = polish_windows(*half_of(shooting, polished.point, half, block), ITERATIONS, fixed_latency=True)
+        found = polish_windows(
+            *half_of(shooting, polished.point, half, block), ITERATIONS, fixed_latency=True
+        )
         told = statement(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: what all of them say of clustering holds for it, too.
         std = np.sqrt(np.diag(told.covariance)) * np.maximum(known.widened / told.widened, 1.0)

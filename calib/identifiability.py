@@ -164,7 +164,7 @@ def uncertainty(
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
     factor = np.maximum(factor, 1.0)
     covariance = covariance * np.outer(factor, factor)
-    for k in np.flatnonzero(bound):
+    for k in map(int, np.flatnonzero(bound)):
         covariance[k, k] = (
             _bound_std(data / inflation + np.diag(belief), free, k, slope[k] / inflation, flat) ** 2
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -17,7 +18,8 @@ from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.sim.digest import model_digest
 
 PACKAGES = ("deal-hw", "mujoco", "numpy", "scipy", "torch")
-"""Whose versions may change a run's numbers."""
+OPTIONAL = ("botorch", "cma", "gpytorch")
+"""Whose versions may change a run's numbers; the optional ones where they are installed."""
 
 
 def run_identity(
@@ -51,9 +53,17 @@ def run_identity(
             "method": method_settings(method),
             "budget": budget,
             "generator": generator_state(rng),
-            "versions": {name: metadata.version(name) for name in PACKAGES},
+            "versions": _versions(),
         }
     )
+
+
+def _versions() -> dict[str, str]:
+    found = {name: metadata.version(name) for name in PACKAGES}
+    for name in OPTIONAL:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
 def method_settings(method: CalibrationMethod[Problem]) -> dict[str, Any]:

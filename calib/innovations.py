@@ -8,6 +8,7 @@ of Sigma leaves unit variance where the model is right, and takes out what a wro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,6 +158,7 @@ def whitened_residual(
     centre: Members,
     windows: list[WindowData],
     offsets: list[FloatArray] | None = None,
+    whitenings: Sequence[Whitening] | None = None,
 ) -> FloatArray:
     """Return recording minus prediction of every window, whitened around one simulator.
 
@@ -167,6 +169,7 @@ def whitened_residual(
         windows: The windows.
         offsets: Start states to linearise around, one array for each of ``windows``; replaced by the next
             ones to use. None for the smoothed states.
+        whitenings: Made before around the same simulator and start states, one for each of ``windows``.
 
     Returns:
         (N, M); not finite in rows of members that diverged.
@@ -177,7 +180,10 @@ def whitened_residual(
             whitened = (data.measured - predict(problem, members, data).observed) / data.std
             parts.append(whitened.reshape(len(whitened), -1))
             continue
-        whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
+        if whitenings is not None:
+            whitening = whitenings[i]
+        else:
+            whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
         predicted = predict(problem, members, data, *whitening.starts(data)).observed
         whitened = whitening.innovation(data.measured, predicted)
         parts.append(whitened.reshape(len(whitened), -1))

@@ -10,9 +10,13 @@ import numpy as np
 
 from deal_hw.calib.attempts import Attempts
 from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.identifiability import MISMATCH_CHI2, Z90, Uncertainty, intervals, uncertainty
+from deal_hw.calib.folds import Choice, at_estimate, choose
+from deal_hw.calib.identifiability import MISMATCH_CHI2, Z90, Uncertainty, intervals
+from deal_hw.calib.judgement import Validation, judge, unexplained
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import Polished, polish
+from deal_hw.calib.robust import HEAVY_TAILS, kurtosis, robust_polish
+from deal_hw.calib.statements import statement, with_rows
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,
@@ -71,10 +75,17 @@ class PolishedMethod(CalibrationMethod[Problem]):
     Args:
         search: The search.
         name: Name of the whole.
+        settings: What is checked afterwards.
     """
 
-    def __init__(self, search: CalibrationMethod[Problem], name: str | None = None) -> None:
+    def __init__(
+        self,
+        search: CalibrationMethod[Problem],
+        name: str | None = None,
+        settings: Validation | None = None,
+    ) -> None:
         self.search = search
+        self.settings = settings or Validation()
         self.name = name or search.name
 
     def run(
@@ -93,13 +104,24 @@ class PolishedMethod(CalibrationMethod[Problem]):
         check_excitation(problem)
         attempts = Attempts(self.search, problem, rng, checkpoint)
         searched, polished, restarts = _until_explained(attempts, problem, budget, progress)
-        scan = None if problem.fixed_latency_s is not None else scan_latency(problem, polished, progress)
+        choice = self._choose(problem, budget, rng, searched, polished, progress)
+        scan = None
+        if choice is not None and choice.chosen == "search":
+            length, states = polished.shooting.length, polished.shooting.states(polished.point)
+            polished = at_estimate(problem, searched, length, states)
+        elif problem.fixed_latency_s is None:
+            scan = scan_latency(problem, polished, progress)
         whole = scan is not None and scan.polished[scan.best].normal.cost < polished.normal.cost + SCAN_WORSE
         if scan is not None and whole:
             polished = scan.polished[scan.best]
-        known = _uncertainty(problem, polished, fixed_latency=whole or scan is None)
+        decided = whole or problem.fixed_latency_s is not None
+        if choice is not None and choice.chosen == "robust polish":
+            polished = robust_polish(problem, polished, decided)
+        polished = with_rows(polished)
+        known = statement(problem, polished, fixed_latency=decided)
         if scan is not None and whole:
             known = _average(problem, scan, known)
+        known, facts = judge(problem, polished, known, self.settings)
         provenance = dict(searched.provenance) | {
             "search": searched.method,
             "search_seconds": searched.seconds,
@@ -109,9 +131,11 @@ class PolishedMethod(CalibrationMethod[Problem]):
             "window_s": polished.shooting.length * problem.episodes[0].period_s,
             "noise_std": problem.noise.position_std.tolist(),
             "timing_std_s": problem.noise.timing_std_s,
-            "inflation": known.inflation,
             "polish_iterations": polished.iterations,
+            **facts,
         }
+        if choice is not None:
+            provenance["folds"] = choice.to_json()
         if scan is not None:
             chi2 = [p.chi2 for p in scan.polished]
             provenance["latency_scan"] = {
@@ -135,6 +159,26 @@ class PolishedMethod(CalibrationMethod[Problem]):
             seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
         )
+
+    def _choose(
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        searched: CalibrationResult,
+        polished: Polished,
+        progress: ProgressCallback | None,
+    ) -> Choice | None:
+        """Return what inner folds say of the polish; None where it explains the recording."""
+        if not self.settings.folds or not unexplained(polished):
+            return None
+        if progress is not None:
+            progress(Progress("folds", 0, 1, "does the polish help on what it has not seen?"))
+        robust = self.settings.robust and kurtosis(polished.normal.residual) > HEAVY_TAILS
+        # Drawn after all searches, so that a resumed run draws the same.
+        seed = int(rng.integers(2**32))
+        length = polished.shooting.length
+        return choose(problem, self.search, budget, seed, length, searched.steps, robust)
 
 
 def _until_explained(
@@ -218,20 +262,6 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
     return LatencyScan(ticks, tuple(found[t] for t in ticks))
 
 
-def _uncertainty(problem: Problem, polished: Polished, fixed_latency: bool) -> Uncertainty:
-    return uncertainty(
-        problem.space,
-        polished.theta,
-        polished.latency_s,
-        polished.normal.hessian,
-        polished.chi2,
-        polished.normal.residual,
-        problem.latency_range_s,
-        fixed_latency=fixed_latency,
-        timing_std_s=problem.noise.timing_std_s,
-    )
-
-
 def _average(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:
     """Widen the best latency's statement by what the other plausible latencies would say."""
     space, tick = problem.space, problem.episodes[0].step_s
@@ -249,6 +279,6 @@ def _average(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertai
     return dataclasses.replace(
         best,
         covariance=covariance,
-        interval=intervals(space, scan.polished[scan.best].theta, covariance),
+        interval=intervals(space, scan.polished[scan.best].theta, covariance, best.shape),
         latency_interval_s=(max(latency - half, low), min(latency + half, high)),
     )

@@ -7,10 +7,13 @@ measured of them are the M channels that predictions are compared with.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.noise import NoiseModel, noise_model, white_noise_std
 from deal_hw.calib.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
@@ -169,6 +172,21 @@ class Problem:
     def steps(self) -> int:
         """Physics steps simulated so far."""
         return sum(batch.steps for batch in self._batches.values())
+
+    def part(self, chosen: Sequence[npt.NDArray[np.bool_]]) -> Problem:
+        """Return the problem with only these samples of each recording usable.
+
+        Noise, smoothed states and simulators are shared, so nothing is estimated anew.
+
+        Args:
+            chosen: One mask a recording, (T,).
+        """
+        other = copy.copy(self)
+        other.episodes = [
+            dataclasses.replace(e, usable=e.usable & mask)
+            for e, mask in zip(self.episodes, chosen, strict=True)
+        ]
+        return other
 
     @property
     def exact(self) -> bool:

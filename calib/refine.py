@@ -178,7 +178,8 @@ def _solve(
             damped_step(point.value, normal.gradient, normal.hessian, damping, low, high, fixed_latency)
             for damping in DAMPINGS
         ]
-        candidates = [shooting.moved(point, normal, step) for step in steps]
+        settled = shooting.settled(point, normal)
+        candidates = [shooting.moved(point, settled, step) for step in steps]
         costs = shooting.costs(candidates)
         best = int(np.argmin(costs))
         if not costs[best] < normal.cost:

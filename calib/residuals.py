@@ -7,6 +7,7 @@ it.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -233,6 +234,22 @@ class Shooting:
             velocity.append(point.velocity[e] + state[:, C:])
         return Point(point.value + step, tuple(position), tuple(velocity))
 
+    def settled(self, point: Point, normal: Normal) -> Normal:
+        """Return the normal equations with only those start-state steps that help.
+
+        Next to a kink (stick-slip, a pole that passes the top) the derivative of a window's start state may
+        lead uphill, and without this one such window would hold up all parameters.
+        """
+        if self.problem.exact:
+            return normal
+        C, values, back = self.problem.coordinates, np.repeat(point.value[None], 2, axis=0), []
+        for e, (gain, shift) in enumerate(normal.back):
+            x = np.stack([point.position[e], point.position[e] - shift[:, :C]])
+            v = np.stack([point.velocity[e], point.velocity[e] - shift[:, C:]])
+            before, after = self._window_costs(e, values, x, v)
+            back.append((gain, np.where((after <= before)[:, None], shift, 0.0)))
+        return dataclasses.replace(normal, back=tuple(back))
+
     @property
     def state_std(self) -> FloatArray:
         """Standard deviation of smoothed start states over all episodes, (2 C,)."""
@@ -248,7 +265,7 @@ class Shooting:
             x = np.stack([p.position[e] for p in points])
             v = np.stack([p.velocity[e] for p in points])
             total += self._window_costs(e, values, x, v).sum(axis=1)
-        return total
+        return np.asarray(total)
 
     def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""

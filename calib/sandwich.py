@@ -71,7 +71,7 @@ class _Level:
         power = np.sum(self.shift**2, axis=0)
         product = np.sum((self.shift[1:] * self.shift[:-1])[self.follows], axis=0)
         correlation = float(np.mean(product / np.maximum(power, 1e-300)))
-        return correlation > 2.0 / np.sqrt(len(self.shift))
+        return bool(correlation > 2.0 / np.sqrt(len(self.shift)))
 
 
 def clustered(
@@ -89,6 +89,8 @@ def clustered(
     Returns:
         None where the recordings do not hold enough blocks.
     """
+    if not rows:
+        return None
     found: Clustered | None = None
     hanging = True
     for parts, group in _levels(rows, samples):

@@ -73,8 +73,8 @@ def require_visible(found: Visibility) -> None:
     if found.invisible:
         raise ConfigurationError(
             f"no rollout of these recordings sees {', '.join(found.invisible)}: predictions are the same "
-            "from one end of the range to the other. Remove them from the parameters (or give them as --known), "
-            "or record a motion that shows them"
+            "from one end of the range to the other. Remove them from the parameters (or give them with "
+            "--known), or record a motion that shows them"
         )
 
 

@@ -114,6 +114,10 @@ class AntEnv(LocomotionEnv):
         forward = task.forward_weight * velocity[:, 0]
         return np.asarray(forward + task.healthy_reward - task.control_weight * np.square(action).sum(axis=1))
 
+    def forward_speed(self) -> FloatArray:
+        """Return the speeds along the world's x axis, (N,) [m/s]."""
+        return self.loop.velocity[:, 0]
+
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
         """Return who lies on the back or flew off."""
         seen = base(position, velocity)

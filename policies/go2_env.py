@@ -136,6 +136,10 @@ class Go2Env(LocomotionEnv):
         """The wanted velocity of each member's base: x, y [m/s] and yaw rate [rad/s], (N, 3)."""
         return self._builder.command
 
+    def wanted_speed(self) -> FloatArray:
+        """Return the commanded forward speeds, (N,) [m/s]."""
+        return self.command[:, 0]
+
     def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
         """Draw the commands of the members that start anew."""
         count = int(where.sum())

@@ -80,6 +80,14 @@ class LocomotionEnv(ServoVectorEnv):
         """Return the actions after the safety limit on the targets' steps."""
         return limited_action(self.description, self._scale, action, before)
 
+    def forward_speed(self) -> FloatArray:
+        """Return how fast each member goes ahead, (N,) [m/s]: along its base's x axis, by default."""
+        return np.asarray(base(self.loop.position, self.loop.velocity)[:, LINEAR][:, 0])
+
+    def wanted_speed(self) -> FloatArray | None:
+        """Return how fast each member should go, (N,) [m/s]; None where faster is better."""
+        return None
+
     def _settled(self, threads: int | None) -> FloatArray:
         # Fixed draws: the pool is part of the task and does not depend on the seed of a reset.
         space, robot = self.distribution.space, self.loop.batch.robot
@@ -153,22 +161,26 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         seed: Decides the draws.
 
     Returns:
-        Plain JSON values: returns (undiscounted), the share that fell, the share of the time they were up,
-        and the mean forward speed of those that did not fall [m/s].
+        Plain JSON values: returns (undiscounted), the share that fell, the share of the time they were up;
+        of those that did not fall, the mean forward speed [m/s] and how far each one's mean speed is from
+        the wanted one, on average.
     """
     observation, _ = env.reset(seed=seed)
     count = env.num_envs
     going, total, lasted, way = np.ones(count, dtype=bool), np.zeros(count), np.zeros(count), np.zeros(count)
     fell: BoolArray = np.zeros(count, dtype=bool)
+    wanted = env.wanted_speed()
+    wanted = None if wanted is None else wanted.copy()
     for _ in range(env.ticks):
-        speed = base(env.loop.position, env.loop.velocity)[:, LINEAR][:, 0]
+        speed = env.forward_speed()
         observation, reward, terminated, truncated, _ = env.step(policy.act_batch(observation))
         total += np.where(going, reward, 0.0)
         way += np.where(going, speed, 0.0)
         lasted += going
         fell |= going & terminated
         going &= ~(terminated | truncated)
-    up = ~fell
+    up, mean = ~fell, way / lasted
+    error = None if wanted is None else np.abs(mean - wanted)
     return {
         "robots": count,
         "seed": seed,
@@ -178,5 +190,6 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         "return_quartiles": [float(x) for x in np.quantile(total, (0.25, 0.5, 0.75))],
         "fall_rate": float(fell.mean()),
         "time_up": float((lasted / env.ticks).mean()),
-        "forward_speed_m_s": float((way[up] / lasted[up]).mean()) if up.any() else None,
+        "forward_speed_m_s": float(mean[up].mean()) if up.any() else None,
+        "speed_error_m_s": float(error[up].mean()) if up.any() and error is not None else None,
     }

@@ -38,7 +38,7 @@ LATENCY_S = (0.0, 0.02)
 MEMBERS = 64
 JUDGED = 256
 JUDGE_SEED = 1_000_003
-"""Training seeds the environment from 0 ... 2^31 by a generator; held out means drawn by another one."""
+"""Robots, commands and starts that the policy is judged by are the draws of this seed, none of training's."""
 
 COMMON = SacConfig(
     hidden=(128, 128), gradient_steps=8, batch=256, learning_rate=1e-3, final_learning_rate=3e-4,
@@ -75,15 +75,19 @@ def train(robot: str, path: Path, *, seed: int, steps: int | None, members: int,
         "machine": f"one thread of {platform.machine()}, shared, Python {platform.python_version()}",
     }
     exported = export_network(policy.network, policy.spec, path)
-    held_out = make(description, distribution, judged)
-    record["evaluation"] = judge(exported, held_out, JUDGE_SEED)
-    record["at_rest"] = judge(_Rest(exported), held_out, JUDGE_SEED)
     record["onnx_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-    path.with_suffix(".json").write_text(
-        json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8"
-    )
-    print(f"{robot}: {record['evaluation']}\nat rest: {record['at_rest']}\nwrote {path}")
+    add_judgement(robot, exported, record, judged)
     return exported
+
+
+def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged: int) -> None:
+    """Judge a policy under the distribution that it was trained under, and write its record."""
+    env = ENVIRONMENTS[robot](robot_description(robot), udr(robot), judged)
+    record["evaluation"] = judge(policy, env, JUDGE_SEED)
+    record["at_rest"] = judge(_Rest(policy), env, JUDGE_SEED)
+    text = json.dumps(record, indent=1, sort_keys=True)
+    policy.path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    print(f"{robot}: {record['evaluation']}\nat rest: {record['at_rest']}\nwrote {policy.path}")
 
 
 def udr(robot: str) -> ParameterDistribution:
@@ -120,8 +124,13 @@ def main() -> None:
     parser.add_argument("--members", type=int, default=MEMBERS)
     parser.add_argument("--judged", type=int, default=JUDGED, help="robots that the policy is judged by")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--judge", action="store_true", help="train nothing, judge the file that is there")
     args = parser.parse_args()
     path = args.out or ASSETS / f"{args.robot}_udr.onnx"
+    if args.judge:
+        record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        add_judgement(args.robot, OnnxPolicy(path), record, args.judged)
+        return
     train(args.robot, path, seed=args.seed, steps=args.steps, members=args.members, judged=args.judged)
 
 

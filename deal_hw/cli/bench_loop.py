@@ -15,7 +15,7 @@ import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.bench_tasks import Case, make_case
-from deal_hw.cli.calibrate import calibrate_episodes
+from deal_hw.cli.calibrate_run import calibrate_episodes
 from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import PolicyBehaviour

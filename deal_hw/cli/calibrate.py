@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
@@ -180,7 +180,11 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             known_std=known_std,
             heldout_window_s=config.heldout_window,
         )
-    settings = {"seed": config.seed, "xi": config.xi, "heldout_window_s": config.heldout_window}
+    settings: dict[str, Any] = {
+        "seed": config.seed,
+        "xi": config.xi,
+        "heldout_window_s": config.heldout_window,
+    }
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)
     report = finish(

@@ -9,13 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from deal_hw.cli.calibrate_checks import (
+    examine_recording,
+    refuse_floating,
+    require_visible_parameters,
+    warn_of_gravity,
+)
 from deal_hw.cli.calibrate_run import Narrowing, Work
-from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError
+from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.data.checks import Verdict
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
     from deal_hw.sim.describe import Sampling
@@ -27,8 +32,6 @@ HELDOUT_PART = 0.25
 STRETCH_S = 5.0
 """Fitted recordings are cut into parts of about this length, so that memory does not grow with them [s]."""
 HELDOUT_STRETCH_S = 20.0
-MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation")
-"""Checks that mean something where commands are efforts and not positions."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +60,10 @@ class Recordings:
 
     fit_seconds: float = 60.0
     """Fit stretches that lie evenly over the recordings and add up to so many seconds; more is slower."""
+
+    window: float = 0.4
+    """Length of the search's longest windows of prediction [s]; the first ones are a quarter of it. Longer ones
+    see slow things (weight, friction that holds) and cost memory with the square of the samples in them."""
 
     physics_step: float | None = None
     """Wanted physics step [s]; by default the MJCF's timestep. A whole number fits into a sampling period."""
@@ -137,9 +144,11 @@ def prepare_model(
     fitted, held = (_read(paths, columns, facts, say) for paths in (config.data, holdout))
     rates = _rates(config, [*fitted, *held], model, sampling)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
-    _no_base(description.floating_base)
+    refuse_floating(description.floating_base)
     verdicts = {
-        table.name: _examine(table, facts, config.force, servo=description.actuation == "position", say=say)
+        table.name: examine_recording(
+            table, facts, config.force, servo=description.actuation == "position", say=say
+        )
         for table in (*fitted, *held)
     }
     robot = load_model(description, rates.step_s)
@@ -147,7 +156,8 @@ def prepare_model(
     episodes = [_align(r, robot) for r in fit_recordings]
     judge = [_align(r, robot) for table in held for r in _on_grid(table, robot, rates)]
     episodes, judge = _divide(episodes, judge, share, config.fit_seconds, say)
-    _look(robot, space, episodes, std(robot), threads, say)
+    warn_of_gravity(robot, space, episodes, say)
+    require_visible_parameters(robot, space, episodes, std(robot), threads, say)
     return Work(
         robot=robot,
         space=space,
@@ -206,7 +216,7 @@ def _read(paths: Sequence[Path], columns: Any, facts: JointFacts, say: Callable[
 
 
 def _rates(
-    config: Recordings, tables: Sequence[Table], model: Any, fit: Callable[[float, float], Sampling]
+    config: Recordings, tables: Sequence[Table], model: Any, fit: Callable[[float, float, float], Sampling]
 ) -> Sampling:
     """Check that the recordings belong together; return how they lie on the physics grid."""
     from deal_hw.data.importing.grid import common_period
@@ -224,41 +234,7 @@ def _rates(
         early = ("size", "finite", "clock", "rate", "commands")
         require([v for v in examine(table) if v.name in early], table.name)
     timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
-    return fit(common_period(tables), timestep)
-
-
-def _no_base(free: str | None) -> None:
-    if free is not None:
-        raise ConfigurationError(
-            f"the model floats (free joint {free!r}); recordings of a floating robot are not read yet. Hold "
-            "the robot by its trunk, record that, and remove the free joint from a copy of the MJCF"
-        )
-
-
-def _examine(
-    table: Table, facts: JointFacts, force: bool, *, servo: bool, say: Callable[[str], None]
-) -> list[Verdict]:
-    """Check a recording and tell what is wrong; return what is worth keeping.
-
-    Raises:
-        DatasetError: A check failed, and that is not to be overlooked.
-    """
-    from deal_hw.data.checks import Severity
-    from deal_hw.data.plausibility import examine, require
-    from deal_hw.errors import DatasetError
-
-    limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    found = [v for v in examine(table, limits) if v.severity is not Severity.OK]
-    if not servo:
-        found = [v for v in found if v.name in MOTOR_CHECKS]
-    for verdict in found:
-        say(f"{table.name}: {verdict.severity} {verdict.name}: {verdict.message}")
-    if not force:
-        try:
-            require(found, table.name)
-        except DatasetError as err:
-            raise DatasetError(f"{err}. Correct the column map, or overrule with --force") from err
-    return found
+    return fit(common_period(tables), timestep, config.window)
 
 
 def _on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]:
@@ -311,33 +287,3 @@ def _divide(
 
 def _seconds(episode: Episode) -> float:
     return (len(episode.sample) - 1) * episode.period_s
-
-
-def _look(
-    robot: RobotModel,
-    space: ParameterSpace,
-    episodes: Sequence[Episode],
-    known_std: FloatArray | None,
-    threads: int | None,
-    say: Callable[[str], None],
-) -> None:
-    """Check before any search that the recordings are long enough, move, and show every parameter."""
-    from deal_hw.calib.excitation import check_excitation
-    from deal_hw.calib.problem import Problem
-    from deal_hw.calib.visible import look, require_visible
-
-    problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
-    try:
-        check_excitation(problem)
-    except InsufficientDataError as err:
-        # What it advises is for robots that deal-hw drives.
-        raise InsufficientDataError(
-            str(err).partition("; record again with")[0] + "; record more motion"
-        ) from err
-    found = look(problem)
-    require_visible(found)
-    if found.faint:
-        say(
-            f"hardly visible, and so hardly to be found: {', '.join(found.faint)} (from one end of the range "
-            "to the other no prediction changes by more than the noise)"
-        )

@@ -337,4 +337,4 @@ def print_result(result: CalibrationResult, advice: str) -> None:
         errors = ", ".join(
             f"{name} {'diverged' if value is None else f'{value:.4g}'}" for name, value in rmse.items()
         )
-        console.print(f"held-out RMSE, mean over the joints [rad, m]: {errors}")
+        console.print(f"held-out RMSE in rad or m, mean over the joints: {errors}")

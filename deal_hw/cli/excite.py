@@ -58,10 +58,13 @@ class Excite:
     """Not for optimal: greatest frequency of multisine and chirp."""
 
     effort: float = 1.0
-    """Not for optimal: factor on the effort limit that is sent in the second half."""
+    """Not for optimal: factor on the effort limit that is sent from SPLIT on."""
 
     speed: float = 1.0
-    """Not for optimal: factor on the speed limit that is sent in the second half."""
+    """Not for optimal: factor on the speed limit that is sent from SPLIT on."""
+
+    split: float = 0.5
+    """Not for optimal: fraction of the run from which on the two factors hold; 0 for all of it."""
 
     policy: Path | None = None
     """Policy that balances at first (.onnx); by default the one shipped for the robot, if any."""
@@ -80,6 +83,9 @@ class Excite:
 
     draws: int = 8
     """Robots that each candidate is tried on."""
+
+    confirm: int = 24
+    """Other robots on which the best candidates are judged in the end."""
 
     candidates: int = 40
     """Random candidates."""
@@ -125,15 +131,7 @@ def excite(config: Excite) -> ExciteReport:
         optimum = _search(config, description, balance)
         plan = optimum.plan
     else:
-        plan = make_plan(
-            description,
-            ExcitationDesign(
-                family=config.family, seconds=config.seconds, amplitude=config.amplitude,
-                low_hz=config.low_hz, high_hz=config.high_hz, effort=(1.0, config.effort),
-                speed=(1.0, config.speed), seed=config.seed,
-                balance_s=_balance_s(config.seconds) if balance is not None else 0.0,
-            ),
-        )  # fmt: skip
+        plan = make_plan(description, _given_design(config, balance is not None))
     plan.write(config.out)
     if not config.quiet:
         print(plan.words)
@@ -141,6 +139,24 @@ def excite(config: Excite) -> ExciteReport:
             f"written: {config.out}; play it with `deal-hw collect {config.robot} --excite {config.out} ...`"
         )
     return ExciteReport(plan=plan, path=config.out, optimum=optimum)
+
+
+def _given_design(config: Excite, balances: bool) -> ExcitationDesign:
+    if config.family == "optimal":
+        raise RuntimeError("unreachable: an optimal excitation is searched, not given")
+    whole = config.split <= 0
+    return ExcitationDesign(
+        family=config.family,
+        seconds=config.seconds,
+        amplitude=config.amplitude,
+        low_hz=config.low_hz,
+        high_hz=config.high_hz,
+        split=1.0 if whole else config.split,
+        effort=(config.effort, 1.0) if whole else (1.0, config.effort),
+        speed=(config.speed, 1.0) if whole else (1.0, config.speed),
+        seed=config.seed,
+        balance_s=_balance_s(config.seconds) if balances else 0.0,
+    )
 
 
 def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
@@ -195,7 +211,13 @@ def _search(
         references["rich"] = lambda: RichBehaviour(description, balance(), rich, config.seed)
     shown = not config.quiet and sys.stderr.isatty()
     optimum = search_excitation(
-        experiment, rng, settings, balance=balance, references=references, notify=_note if shown else None
+        experiment,
+        rng,
+        settings,
+        balance=balance,
+        references=references,
+        confirmation=experiment.afresh(config.confirm, rng),
+        notify=_note if shown else None,
     )
     if not config.quiet:
         print_optimum(experiment.space, optimum, experiment.refused)

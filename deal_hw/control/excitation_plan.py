@@ -271,7 +271,9 @@ def words(design: ExcitationDesign) -> str:
             for name, factor in (("effort", part.effort_limit), ("speed", part.speed_limit))
             if factor != 1.0
         ]
-        parts.append(f"{' and '.join(sent)} from {part.start:.0%} to {part.stop:.0%} of the run")
+        whole = part.start == 0.0 and part.stop == 1.0
+        when = "all the time" if whole else f"from {part.start:.0%} to {part.stop:.0%} of the run"
+        parts.append(f"{' and '.join(sent)} {when}")
     return ", ".join(parts)
 
 

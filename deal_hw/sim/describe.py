@@ -17,8 +17,8 @@ from deal_hw.sim.fields import element_id
 from deal_hw.sim.model import actuator_of
 from deal_hw.sim.parameters.kind import HINGE, SLIDE
 
-WINDOW_RATE_HZ = 50.0
-"""Windows are cut in control periods; of recordings that are sampled faster, some samples make one period."""
+WINDOW_TICKS = 20
+"""Control periods in the longest window of a search: it is what ``--window`` divides into."""
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -58,22 +58,25 @@ def compile_model(mjcf: Path) -> Any:
         raise ConfigurationError(f"model {mjcf} does not compile: {err}") from err
 
 
-def sampling(period_s: float, timestep_s: float) -> Sampling:
+def sampling(period_s: float, timestep_s: float, window_s: float) -> Sampling:
     """Fit the physics grid to a sampling period: a whole number of steps, each near the wanted one.
 
     Args:
         period_s: Sampling period of the recordings [s].
         timestep_s: Wanted physics step, such as the MJCF's [s].
+        window_s: Wanted length of a search's longest windows [s].
 
     Raises:
-        ConfigurationError: The step is not positive.
+        ConfigurationError: The step or the window is not positive.
     """
+    if not window_s > 0:
+        raise ConfigurationError(f"the window must be above 0, got {window_s:g} s")
     if not timestep_s > 0:
         raise ConfigurationError(f"the physics step must be above 0, got {timestep_s:g} s")
     return Sampling(
         period_s=period_s,
         substeps=max(round(period_s / timestep_s), 1),
-        samples_per_tick=max(round(1.0 / (period_s * WINDOW_RATE_HZ)), 1),
+        samples_per_tick=max(round(window_s / WINDOW_TICKS / period_s), 1),
     )
 
 
@@ -133,7 +136,7 @@ def describe(
             "effort_limit": "forcerange of the same actuators; infinite where there is none",
             "state_rate_hz": "the recording's own stamps",
             "device_rate_hz": "the physics step: the MJCF's timestep fitted into the sampling period",
-            "control_rate_hz": f"unit of window lengths: sampling rate divided to {WINDOW_RATE_HZ:g} Hz",
+            "control_rate_hz": "unit of window lengths: the sampling rate over a whole number",
         },
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.identifiability import correlation_time, intervals, null_directions, uncertainty
+from deal_hw.calib.identifiability import correlation_time, intervals, uncertainty
 from deal_hw.calib.metrics import error_percent, interval_score, log_error_x100
 from deal_hw.calib.noise import noise_model, white_noise_std
 from deal_hw.calib.pipeline import LatencyScan, PolishedMethod

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.bench import Bench, bench, parse_seeds
+from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
 from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
 
 FIELDS = {
@@ -61,3 +61,60 @@ def test_foreign_file_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="not a bench file"):
         bench(Bench(bench="loop", methods="centre", out=out))
     assert out.read_text() == '{"a": 1}'
+
+
+def test_ratios() -> None:
+    """Numbers above one, and an error that shows how."""
+    assert parse_ratios("3, 5,20") == (3.0, 5.0, 20.0)
+    for text in ("", "a", "1", "5,0.5"):
+        with pytest.raises(ConfigurationError, match="--xi"):
+            parse_ratios(text)
+
+
+def test_honest_rows_for_every_task(tmp_path: Path) -> None:
+    """Cells are tasks by methods; null rows score the centre's error everywhere."""
+    out = tmp_path / "honest.json"
+    settings = Bench(
+        bench="honest", task="cartpole,ant,go2", profile="ideal", seeds="3", methods="centre,nominal",
+        xi="3", out=out, threads=1, quiet=True,
+    )  # fmt: skip
+    assert bench(settings) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert len(rows) == 3 * 2
+    for row in rows:
+        assert set(row) >= FIELDS and row["bench"] == "honest" and not row["polish"]
+        assert row["log_error_x100"] == pytest.approx(row["null_log_error_x100"])
+        assert row["log_error_x100"] > 10, "an honest truth is not the centre"
+    assert bench(settings) == 0
+    assert json.loads(out.read_text())["rows"] == rows
+
+
+def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> None:
+    """With the target at its place the nominal row scores 0 and every row says what that means."""
+    out = tmp_path / "paper.json"
+    settings = Bench(
+        bench="paper", task="ant", profile="ideal", seeds="3", methods="centre,nominal", out=out, quiet=True
+    )
+    assert bench(settings) == 0
+    rows = {row["method"]: row for row in json.loads(out.read_text())["rows"]}
+    assert rows["nominal"]["error_percent"] == 0.0
+    # The centre of a linear range [p / 5, 5 p] is 2.6 p.
+    assert rows["centre"]["error_percent"] == pytest.approx(160.0)
+    assert "scores 0" in rows["centre"]["note"]
+
+
+def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:
+    """One cell's error does not stop the others, and the exit code says that one failed."""
+    out = tmp_path / "mismatch.json"
+    settings = Bench(
+        bench="mismatch", task="ant,cartpole", seeds="3", methods="centre", out=out, threads=1, quiet=True
+    )
+    assert bench(settings) == 1
+    errors = {row["task"]: row["error"] for row in json.loads(out.read_text())["rows"]}
+    assert "no profile 'realistic'" in errors["ant"] and errors["cartpole"] == ""
+
+
+def test_an_unknown_task_is_refused(tmp_path: Path) -> None:
+    """The tasks are listed."""
+    with pytest.raises(UnknownNameError, match="go2"):
+        bench(Bench(bench="honest", task="humanoid", out=tmp_path / "honest.json"))

@@ -26,6 +26,10 @@ LAYER = {
 
 CONFINED = {
     "torch": {"calib", "policies"},
+    "botorch": {"calib"},
+    "gpytorch": {"calib"},
+    "cma": {"calib"},
+    "pyarrow": {"data"},
     "stable_baselines3": {"policies"},
     "gymnasium": {"policies"},
     "onnx": {"policies"},

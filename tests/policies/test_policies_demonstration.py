@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.coordinates import Members
+from deal_hw.calib.deal_paper import DealPaper, PaperSettings
 from deal_hw.calib.identity import digest
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.rollouts import control_ticks, rollout_population
+from deal_hw.calibration import Budget
 from deal_hw.drivers import parameter_spaces, robot_description
 from deal_hw.errors import PolicyMismatchError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -25,7 +27,8 @@ from deal_hw.policies.demonstration import (
     limited_action,
 )
 from deal_hw.policies.go2_env import walk_spec
-from deal_hw.policy import Observation, PolicySpec, base_features
+from deal_hw.policy import Observation, PolicySpec, in_base_frame
+from deal_hw.sim.chart import IDENTITY, to_vector
 from deal_hw.sim.model import RobotModel, load_model
 from deal_hw.sim.target import TargetRecording, record_target
 from deal_hw.types import FloatArray
@@ -85,7 +88,9 @@ def test_a_target_is_driven_without_divergence_and_moves(robot: str, seed: int) 
     assert (np.abs(np.diff(target, axis=0)) <= np.array(description.limits.target_step) + 1e-9).all()
     assert made.position[:, model.joints].std(axis=0).min() > 5e-3
     # Staying up is stated in the records of these early checkpoints; here they must not lie on their backs.
-    down = base_features(made.position[:, :6], made.velocity[:, :6])[:, 2]
+    assert made.episode.reference is not None
+    turn = to_vector(made.episode.reference, IDENTITY)
+    down = in_base_frame(turn, np.broadcast_to([0.0, 0.0, -1.0], turn.shape))[:, 2]
     assert (down < -0.3).mean() > 0.5
 
 
@@ -104,6 +109,18 @@ def test_the_truth_in_closed_loop_repeats_the_target(robot: str) -> None:
     assert np.abs(action[0, :short] - wanted[:short]).max() < 1e-3
     assert np.abs(position[0, :short, model.joints] - joints[:short]).max() < 1e-3
     assert np.abs(position[1, :short, model.joints] - joints[:short]).max() > 1e-3
+
+
+@pytest.mark.parametrize("robot", FLOATING)
+def test_the_paper_takes_pi_0_in_the_loop(robot: str) -> None:
+    """`deal-paper` with the policy instead of its recorded actions runs to the end, inside the ranges."""
+    model, space, _, made = recorded(robot, 3, 1.0)
+    problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0)
+    population = PopulationDemonstration(demonstration_policy(robot), model.description, WALK)
+    method = DealPaper(PaperSettings(ticks=20), population)
+    budget = Budget(population=4, generations=2, polish=False)
+    found = method.run(problem, budget, np.random.default_rng(0))
+    assert (found.estimate >= space.low).all() and (found.estimate <= space.high).all()
 
 
 class Leap:

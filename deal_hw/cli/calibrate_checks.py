@@ -1,0 +1,120 @@
+"""Checks of any robot's recordings against its model and parameters, before any long work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.data.checks import Verdict
+    from deal_hw.data.importing.table import Table
+    from deal_hw.sim.episode import Episode
+    from deal_hw.sim.joint_facts import JointFacts
+    from deal_hw.sim.model import RobotModel
+
+DROOP_EXPLAINED, DROOP_LEAST = 0.5, 0.01
+"""A droop is believed where the model's gravity explains this share of it, and it is this large [rad, m]."""
+MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation")
+"""Checks that mean something where commands are efforts and not positions."""
+
+
+def refuse_floating(free: str | None) -> None:
+    """Refuse a model with a free joint: there is no reader for recordings of a base yet.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    if free is not None:
+        raise ConfigurationError(
+            f"the model floats (free joint {free!r}); recordings of a floating robot are not read yet. Hold "
+            "the robot by its trunk, record that, and remove the free joint from a copy of the MJCF"
+        )
+
+
+def examine_recording(
+    table: Table, facts: JointFacts, force: bool, *, servo: bool, say: Callable[[str], None]
+) -> list[Verdict]:
+    """Check a recording and tell what is wrong; return what is worth keeping.
+
+    Raises:
+        DatasetError: A check failed, and that is not to be overlooked.
+    """
+    from deal_hw.data.checks import Severity
+    from deal_hw.data.plausibility import examine, require
+    from deal_hw.errors import DatasetError
+
+    limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
+    found = [v for v in examine(table, limits) if v.severity is not Severity.OK]
+    if not servo:
+        found = [v for v in found if v.name in MOTOR_CHECKS]
+    for verdict in found:
+        say(f"{table.name}: {verdict.severity} {verdict.name}: {verdict.message}")
+    if not force:
+        try:
+            require(found, table.name)
+        except DatasetError as err:
+            raise DatasetError(f"{err}. Correct the column map, or overrule with --force") from err
+    return found
+
+
+def warn_of_gravity(
+    robot: RobotModel, space: ParameterSpace, episodes: list[Episode], say: Callable[[str], None]
+) -> None:
+    """Warn where gravity contradicts a joint's sign or a servo's gain."""
+    from deal_hw.sim.droop import droop
+
+    found = droop(robot, episodes)
+    if found is None:
+        return
+    searched = {p.elements: p for p in space if p.kind == "servo_stiffness"}
+    names = robot.actuator_names
+    for a, joint in enumerate(robot.description.actuated):
+        if found.explained[a] < DROOP_EXPLAINED or found.deviation[a] < DROOP_LEAST:
+            continue
+        gain, own = float(found.gain[a]), robot.description.stiffness[a]
+        parameter = next((p for elements, p in searched.items() if names[a] in elements), None)
+        low, high = (own / 2, own * 2) if parameter is None else (parameter.low, parameter.high)
+        if gain < 0:
+            say(
+                f"warning: {joint} hangs against gravity (off its command by {found.deviation[a]:.2g}, "
+                f"torque in the model {found.load[a]:.2g}): is its sign in the column map right, its zero?"
+            )
+        elif not low <= gain <= high:
+            say(
+                f"warning: {joint} hangs as with a gain of about {gain:.3g}; the model has {own:.4g}, and "
+                f"{low:.3g} to {high:.3g} is searched: give `nominal: {gain:.2g}` in the parameters"
+            )
+
+
+def require_visible_parameters(
+    robot: RobotModel,
+    space: ParameterSpace,
+    episodes: Sequence[Episode],
+    known_std: FloatArray | None,
+    threads: int | None,
+    say: Callable[[str], None],
+) -> None:
+    """Check before any search that the recordings are long enough, move, and show every parameter."""
+    from deal_hw.calib.excitation import check_excitation
+    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.visible import look, require_visible
+
+    problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
+    try:
+        check_excitation(problem)
+    except InsufficientDataError as err:
+        # What it advises is for robots that deal-hw drives.
+        raise InsufficientDataError(
+            str(err).partition("; record again with")[0] + "; record more motion"
+        ) from err
+    found = look(problem)
+    require_visible(found)
+    if found.faint:
+        say(
+            f"hardly visible, and so hardly to be found: {', '.join(found.faint)} (from one end of the range "
+            "to the other no prediction changes by more than the noise)"
+        )

@@ -1,0 +1,110 @@
+"""Bounds, priors, null directions and verdicts from normal equations, by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.identifiability import Z90, Uncertainty, uncertainty
+from deal_hw.calib.null_space import null_space, sparse_basis
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.types import FloatArray
+
+
+def _space(*names: str) -> ParameterSpace:
+    return ParameterSpace(
+        Parameter(name=n, kind="body_mass", elements=("b",), unit="kg", nominal=1.0, low=0.2, high=5.0)
+        for n in names
+    )
+
+
+def _told(
+    space: ParameterSpace,
+    theta: list[float],
+    hessian: FloatArray,
+    gradient: FloatArray | None = None,
+    prior: FloatArray | None = None,
+) -> Uncertainty:
+    """Statement with a decided latency and white residuals of variance 1 / 1.44: inflation is then 1.44."""
+    whole = np.zeros((len(space) + 1,) * 2)
+    whole[: len(space), : len(space)] = hessian
+    white = np.random.default_rng(0).normal(size=(4, 50, 2))
+    return uncertainty(
+        space, np.array(theta), 0.0, whole, 1.0, (white,), (0.0, 0.04), fixed_latency=True,
+        gradient=gradient, prior=prior,
+    )  # fmt: skip
+
+
+def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
+    """Strongly correlated with one at its bound, the other is as sure as if that one were known."""
+    hessian = 1e4 * np.array([[1.0, 0.9], [0.9, 1.0]])
+    inside = _told(_space("a", "b"), [1.0, 2.0], hessian)
+    at = _told(_space("a", "b"), [1.0, 5.0], hessian, gradient=np.array([0.0, -50.0, 0.0]))
+    assert list(at.shape.bound) == [0, 1]
+    assert at.covariance[0, 0] == pytest.approx(1.44 / 1e4, rel=1e-3)
+    assert inside.covariance[0, 0] == pytest.approx(1.44 / 1e4 / 0.19, rel=1e-2)
+    assert any(words.startswith("b ended at the bound") for words in at.alarms)
+
+
+def test_the_interval_at_a_bound_lies_on_one_side() -> None:
+    """Without a slope it is the half normal's 90 %, 1.645 std; with a steep one ln 10 over the slope."""
+    flat = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]))
+    std = np.sqrt(1.44 / 1e4)
+    assert flat.interval[1] == pytest.approx([5.0 * np.exp(-Z90 * std), 5.0], rel=1e-4)
+    steep = _told(_space("a", "b"), [1.0, 0.2], np.diag([1e4, 1e4]), gradient=np.array([0.0, 1440.0, 0.0]))
+    # Slope 1000 after inflation, curvature small beside it: an exponential law.
+    assert steep.interval[1, 0] == 0.2
+    assert steep.interval[1, 1] == pytest.approx(0.2 * np.exp(np.log(10) / 1000), rel=1e-3)
+
+
+def test_a_bound_that_the_data_do_not_press_is_none() -> None:
+    """At the bound, but the cost falls inwards: the parameter stays free."""
+    told = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]), gradient=np.array([0.0, 5.0, 0.0]))
+    assert list(told.shape.bound) == [0, 0]
+
+
+def test_a_prior_resolves_a_common_factor() -> None:
+    """Only a / b is seen; weighed to 1 %, both are known to 1 %, and no null direction is left."""
+    data = 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    blind = _told(_space("a", "b"), [1.0, 1.0], data)
+    assert blind.verdicts == ("not identifiable", "not identifiable")
+    assert len(blind.null_directions) == 1
+    space = _space("a", "b")
+    assert blind.interval == pytest.approx(
+        np.stack([space.unnormalize(np.full(2, 0.05)), space.unnormalize(np.full(2, 0.95))], axis=1)
+    )
+    weight = np.array([1 / 0.01**2, 0.0, 0.0])
+    weighed = _told(space, [1.0, 1.0], data + np.diag(weight[:2]), prior=weight)
+    assert weighed.null_directions == ()
+    assert weighed.verdicts == ("identifiable", "identifiable")
+    # The prior is no data: a residual that is too large does not make the scale less sure.
+    assert weighed.covariance[0, 0] == pytest.approx(1e-4, rel=0.01)
+
+
+def test_what_a_null_direction_hardly_moves_keeps_its_value() -> None:
+    """C moves by a hundredth of a and b along the direction that nobody sees: it is identified to 1 %."""
+    v = np.array([1.0, 1.0, 0.01])
+    projector = np.eye(3) - np.outer(v, v) / (v @ v)
+    told = _told(_space("a", "b", "c"), [1.0, 1.0, 1.0], 1e8 * projector)
+    assert told.verdicts == ("not identifiable", "not identifiable", "identifiable")
+
+
+def test_sparse_basis_finds_the_readable_directions() -> None:
+    """Any rotation of (1,1,1,0,0) and (0,0,1,-1,2) comes back as these two."""
+    readable = np.array([[1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0, 2.0]])
+    angle = 0.7
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ readable
+    found = sparse_basis(np.linalg.qr(turned.T)[0].T)
+    found = found / np.max(np.abs(found), axis=1, keepdims=True)
+    for wanted in readable / np.max(np.abs(readable), axis=1, keepdims=True):
+        assert min(min(np.abs(f - wanted).max(), np.abs(f + wanted).max()) for f in found) < 1e-6
+
+
+def test_null_space_leaves_the_ranges_own_spread() -> None:
+    """One direction of two parameters unseen: each keeps 1 / sqrt(2) of its range's standard deviation."""
+    space = _space("a", "b")
+    found = null_space(space, 1e8 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
+    assert found.std == pytest.approx(space.width / np.sqrt(12) / np.sqrt(2), rel=1e-3)
+    assert found.directions == pytest.approx(np.ones((1, 2))) or found.directions == pytest.approx(
+        -np.ones((1, 2))
+    )

@@ -1,0 +1,125 @@
+"""The verb `excite` and `collect --excite`: what is written, what is played, and on what it runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.cli.collect import Collect, _excitation
+from deal_hw.cli.excite import Excite, excite
+from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.control.excitation_plan import ExcitationBehaviour, read_plan
+from deal_hw.control.loop import Outcome
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.oracle import draw_truth
+from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.drivers.so101.description import DESCRIPTION as ARM
+from deal_hw.errors import ConfigurationError, UnknownNameError
+
+POLICY = str(shipped_policy("cartpole") or "")
+TRUTHS = [nominal_truth("sensor", 3, actuation_ticks=9), draw_truth("sensor", 3, xi=5.0)]
+
+
+@pytest.fixture(scope="module")
+def optimal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An excitation that was searched for, in no time."""
+    path = tmp_path_factory.mktemp("run") / "optimal.json"
+    report = excite(
+        Excite(
+            robot="cartpole", out=path, seconds=2.0, candidates=4, draws=2, confirm=2, rounds=2, threads=1,
+            quiet=True,
+        )
+    )  # fmt: skip
+    assert report.optimum is not None
+    assert report.optimum.tried >= 4 + 1 + 2
+    assert set(report.optimum.references) == {"multisine", "chirp", "rich"}
+    return path
+
+
+def test_optimal_is_written_with_what_it_will_tell(optimal: Path) -> None:
+    """The file holds a plan for this robot and a predicted spread for each of the nine parameters."""
+    plan = read_plan(optimal)
+    plan.check_fits(DESCRIPTION)
+    assert len(plan.predicted) == 9
+    assert all(0 < std < 1 for std in plan.predicted.values())
+
+
+@pytest.mark.parametrize("truth", TRUTHS, ids=["nominal", "drawn"])
+@pytest.mark.parametrize("kind", ["multisine", "chirp", "steps", "optimal"])
+def test_each_excitation_keeps_the_limits(kind: str, truth: Truth, optimal: Path, tmp_path: Path) -> None:
+    """Recorded through driver, bytes and safety module: the run ends by itself, no command was clipped."""
+    name = kind
+    if kind == "optimal":
+        name = str(optimal)
+    elif kind == "steps":
+        name = str(tmp_path / "steps.json")
+        settings = Excite(
+            robot="cartpole", out=Path(name), family="steps", seconds=2.0, amplitude=0.5, effort=0.15,
+            speed=2.5, quiet=True,
+        )  # fmt: skip
+        excite(settings)
+    plan = RunPlan(robot="cartpole", profile="excite", excite=name, policy=POLICY, seconds=2.0, seed=3)
+    assert RunPlan.from_json(json.loads(json.dumps(plan.to_json()))) == plan
+    run = VirtualCartpole(truth).run(make_behaviour(plan, DESCRIPTION), plan.seconds)
+    assert (run.report.outcome, run.report.clipped) == (Outcome.FINISHED, {})
+    assert np.ptp(run.trajectory.position[:, 0]) > 0.02
+    again = make_behaviour(plan, DESCRIPTION)
+    assert isinstance(again, ExcitationBehaviour)
+
+
+def test_seeds_give_other_multisines() -> None:
+    """Episode k is recorded with SEED + k."""
+    asked = []
+    for seed in (0, 0, 1):
+        plan = RunPlan(robot="so101", profile="excite", excite="multisine", seconds=10.0, seed=seed)
+        behaviour = make_behaviour(plan, ARM)
+        assert isinstance(behaviour, ExcitationBehaviour)
+        asked.append(behaviour._plan.offsets(np.linspace(0, 10, 50)))
+    np.testing.assert_array_equal(asked[0], asked[1])
+    assert np.max(np.abs(asked[2] - asked[0])) > 0.05
+
+
+def test_collect_finds_what_to_play(optimal: Path) -> None:
+    """A family keeps SECONDS, a file says how long it is, no excitation leaves the profile."""
+    base = {"robot": "cartpole", "port": "x"}
+    assert _excitation(Collect(**base, excite="chirp", seconds=3.0)) == ("chirp", 3.0)  # type: ignore[arg-type]
+    assert _excitation(Collect(**base, excite=str(optimal))) == (str(optimal), 2.0)  # type: ignore[arg-type]
+    assert _excitation(Collect(**base)) == ("", 4.0)  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match="--out RUN"):
+        _excitation(Collect(**base, excite="optimal"))  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match="multisine, chirp, or a file"):
+        _excitation(Collect(**base, excite="sine"))  # type: ignore[arg-type]
+
+
+def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> None:
+    """Another robot's, or of another length than the run."""
+    with pytest.raises(ConfigurationError, match="made for robot 'cartpole'"):
+        make_behaviour(RunPlan(robot="so101", profile="excite", excite=str(optimal), seconds=2.0), ARM)
+    with pytest.raises(ConfigurationError, match="is 2 s long"):
+        make_behaviour(
+            RunPlan(robot="cartpole", profile="excite", excite=str(optimal), policy=POLICY, seconds=4.0),
+            DESCRIPTION,
+        )
+    with pytest.raises(UnknownNameError, match="k99"):
+        excite(Excite(robot="cartpole", out=tmp_path / "x.json", space="k99", quiet=True))
+
+
+def test_playing_needs_no_extra(optimal: Path) -> None:
+    """The control process plays an optimal excitation without torch, mujoco and scipy."""
+    code = (
+        "import sys; from deal_hw.cli.run_plan import RunPlan, make_behaviour; "
+        "from deal_hw.drivers import robot_description; import deal_hw.cli.collect; "
+        f"plan = RunPlan(robot='cartpole', profile='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
+        "seconds=2.0); make_behaviour(plan, robot_description('cartpole')); "
+        "print([m for m in ('torch', 'mujoco', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.strip() == "[]"
