@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.signal import fftconvolve
+from scipy.stats import chi2 as chi2_law
 
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import Polished
@@ -24,10 +25,13 @@ from deal_hw.types import FloatArray
 
 Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "contact"]
 
-NOTICED = 0.1
+NOTICED = 0.03
 """A cause that explains less than this share of the excess is not named."""
 
-LOW_SPEEDS = (0.05, 0.2)
+BY_CHANCE = 1e-3
+"""Nor is one that random columns would match with this probability."""
+
+LOW_SPEEDS = (0.1, 0.4)
 """Speeds, as parts of a joint's rms speed, within which friction's excess at low speed falls to 1/e."""
 
 PLAY_S = 0.03
@@ -38,6 +42,12 @@ DELAY_PIECE_S = 0.1
 
 BURST_PART, BURST_SHARE, BURST_KURTOSIS = 0.05, 0.4, 8.0
 """Bursts: this part of the time holds that share of the residual, whose kurtosis is that high (noise: 3)."""
+
+BURST_SIZE = 40.0
+"""A burst's squared residual over the median's."""
+
+CERTAIN = 4.0
+"""Standard errors by which the residual must exceed noise before anything is said of it."""
 
 STILL = 1e-3
 """Part of the rms speed below which a velocity has no direction."""
@@ -144,21 +154,20 @@ def diagnose(
     gain = np.asarray(np.linalg.pinv(hessian, rcond=1e-12, hermitian=True), dtype=np.float64)
     moved = np.concatenate([m.velocity.reshape(-1, m.velocity.shape[2]) for m in found])
     scale = np.asarray(np.sqrt(np.mean(moved**2, axis=0)), dtype=np.float64)
-    residual = [m.rows.residual for m in found]
-    total = float(sum(np.sum(r**2) for r in residual))
+    left = _Left.of(found, gain)
     count = sum(_count(m) for m in found)
-    # What noise leaves is not to be explained; a residual of twice its size is half excess.
-    excess = max(total - count, 1e-9 * total)
-    chance = max(total / count, 1.0) * correlation_samples
+    # What white noise leaves is not to be explained; neither is what is not certain to be more.
+    excess = max(left.total - count, (1.0 - 1.0 / correlation_samples) * left.total)
+    if excess < CERTAIN * np.sqrt(2.0 * correlation_samples * count):
+        return ()
+    chance = max(left.total / count, 1.0) * correlation_samples
     results: list[Finding] = []
     for cause, make in _SIGNATURES.items():
         columns = [make(m, scale) for m in found]
-        explained, each, used = _explained(found, columns, residual, gain)
-        share = (explained - used * chance) / excess
-        results.append(_finding(cause, share, each, joint_names))
-    explained, used = _varying_delay(found)
-    each = np.asarray(scale)
-    results.append(_finding("delay", (explained - used * chance) / excess, each, joint_names))
+        explained, each, used = _explained(left, columns, gain)
+        results.append(_finding(cause, explained, used, chance, excess, each, joint_names))
+    explained, used = _varying_delay(left)
+    results.append(_finding("delay", explained, used, chance, excess, scale, joint_names))
     bursts = _bursts(found)
     if bursts:
         results.append(Finding("contact", bursts[0], (), f"{ADVICE['contact']} {bursts[1]}"))
@@ -173,38 +182,75 @@ def _count(motion: Motion) -> int:
     return int(max(weighed - W * S, 1))
 
 
-def _finding(cause: Cause, share: float, each: FloatArray, names: Sequence[str]) -> Finding:
+def _finding(
+    cause: Cause,
+    explained: float,
+    used: int,
+    chance: float,
+    excess: float,
+    each: FloatArray,
+    names: Sequence[str],
+) -> Finding:
+    share = min((explained - used * chance) / excess, 1.0)
+    if chi2_law.sf(explained / chance, max(used, 1)) > BY_CHANCE:
+        share = 0.0
     order = np.argsort(-each)
     chosen = tuple(names[j] for j in order[:4] if each[j] >= 0.25 * each[order[0]])
-    return Finding(cause, float(min(share, 1.0)), chosen, f"{ADVICE[cause]} {', '.join(chosen)}")
+    return Finding(cause, float(share), chosen, f"{ADVICE[cause]} {', '.join(chosen)}")
 
 
-def _explained(
-    found: Sequence[Motion], columns: Sequence[FloatArray], residual: Sequence[FloatArray], gain: FloatArray
-) -> tuple[float, FloatArray, int]:
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """What start states and parameters leave of the residual.
+
+    Attributes:
+        motions: The episodes.
+        effective: Derivatives by parameters while start states follow, (W, R, P) each.
+        normal: Start states' normal matrices, (W, S, S) each.
+        residual: The residual without what either explains, (W, R) each.
+        total: Its sum of squares.
+    """
+
+    motions: Sequence[Motion]
+    effective: Sequence[FloatArray]
+    normal: Sequence[FloatArray]
+    residual: Sequence[FloatArray]
+    total: float
+
+    @classmethod
+    def of(cls, found: Sequence[Motion], gain: FloatArray) -> _Left:
+        """Take it out of the motions' residuals; ``gain`` is the parameters' covariance, (P, P)."""
+        both = [eliminated(m.rows) for m in found]
+        residual = [
+            _without_starts(m.rows.start, normal, m.rows.residual[..., None])[..., 0]
+            for m, (_, normal) in zip(found, both, strict=True)
+        ]
+        back = sum(np.einsum("wrp,wr->p", J, r) for (J, _), r in zip(both, residual, strict=True))
+        residual = [r - J @ (gain @ back) for (J, _), r in zip(both, residual, strict=True)]
+        total = float(sum(np.sum(r**2) for r in residual))
+        return cls(found, [J for J, _ in both], [n for _, n in both], residual, total)
+
+
+def _explained(left: _Left, columns: Sequence[FloatArray], gain: FloatArray) -> tuple[float, FloatArray, int]:
     """Return by how much columns, (W, H, M, J, n) each, lower the cost, alone by joint, and their number."""
     J, n = columns[0].shape[3:]
-    P = gain.shape[0]
     matrix, vector = np.zeros((J * n, J * n)), np.zeros(J * n)
-    cross, back = np.zeros((P, J * n)), np.zeros(P)
-    for motion, own, r in zip(found, columns, residual, strict=True):
-        W = len(r)
-        S = motion.rows.start.shape[2]
+    cross = np.zeros((gain.shape[0], J * n))
+    parts = zip(left.motions, columns, left.effective, left.normal, left.residual, strict=True)
+    for motion, own, effective, normal, r in parts:
+        W, _, S = motion.rows.start.shape
         x = np.concatenate([own.reshape(W, -1, J * n), np.zeros((W, S, J * n))], axis=1)
-        effective, normal = eliminated(motion.rows)
         x = _without_starts(motion.rows.start, normal, x)
-        left = _without_starts(motion.rows.start, normal, r[..., None])[..., 0]
         matrix += np.einsum("wri,wrj->ij", x, x)
-        vector += np.einsum("wri,wr->i", x, left)
+        vector += np.einsum("wri,wr->i", x, r)
         cross += np.einsum("wrp,wri->pi", effective, x)
-        back += np.einsum("wrp,wr->p", effective, left)
-    # What the parameters can do about either is theirs.
-    matrix -= cross.T @ gain @ cross
-    vector -= cross.T @ gain @ back
+    # What the parameters can do of it is theirs; the residual has nothing of that left.
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    matrix -= cross.T @ gain @ cross
     solved = np.linalg.lstsq(matrix / np.outer(size, size), vector / size, rcond=1e-6)
     explained = float(solved[0] @ (vector / size))
-    each = np.sum((vector / size).reshape(J, n) ** 2, axis=1)
+    own_size = np.sqrt(np.maximum(np.diag(matrix), 1e-6 * size**2))
+    each = np.sum((vector / own_size).reshape(J, n) ** 2, axis=1)
     return explained, each, int(solved[2])
 
 
@@ -273,21 +319,18 @@ _SIGNATURES: dict[Cause, Callable[[Motion, FloatArray], FloatArray]] = {
 }
 
 
-def _varying_delay(found: Sequence[Motion]) -> tuple[float, int]:
+def _varying_delay(left: _Left) -> tuple[float, int]:
     """Return by how much a timing error of each short piece lowers the cost, and how many pieces are."""
     explained, used = 0.0, 0
-    for motion in found:
+    for motion, normal, r in zip(left.motions, left.normal, left.residual, strict=True):
         W, H, M, _ = motion.direct.shape
         size = max(round(DELAY_PIECE_S / motion.period_s), 2)
         pieces = max(H // size, 1)
         label = np.minimum(np.arange(H) // size, pieces - 1)
         moved = np.einsum("whmj,whj->whm", motion.direct, motion.velocity)
         x = (moved[..., None] * (label[:, None, None] == np.arange(pieces))).reshape(W, H * M, pieces)
-        S = motion.rows.start.shape[2]
-        x = np.concatenate([x, np.zeros((W, S, pieces))], axis=1)
-        normal = eliminated(motion.rows)[1]
+        x = np.concatenate([x, np.zeros((W, motion.rows.start.shape[2], pieces))], axis=1)
         x = _without_starts(motion.rows.start, normal, x)
-        r = _without_starts(motion.rows.start, normal, motion.rows.residual[..., None])[..., 0]
         matrix, vector = np.einsum("wri,wrj->wij", x, x), np.einsum("wri,wr->wi", x, r)
         solved = np.einsum("wij,wj->wi", np.linalg.pinv(matrix, rcond=1e-6, hermitian=True), vector)
         explained += float(np.sum(solved * vector))
@@ -308,9 +351,10 @@ def _bursts(found: Sequence[Motion]) -> tuple[float, str] | None:
         times.append(motion.time_s.ravel())
         values.append(r.ravel())
     joined = np.concatenate(values)
-    kurtosis = float(np.mean(joined**4) / max(np.mean(joined**2) ** 2, 1e-300))
+    kurtosis = float(np.mean(joined**4)) / max(float(np.mean(joined**2)) ** 2, 1e-300)
     each, time = np.concatenate(power), np.concatenate(times)
     most = np.argsort(-each)[: max(round(BURST_PART * len(each)), 1)]
+    most = most[each[most] > BURST_SIZE * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))
     if kurtosis < BURST_KURTOSIS or share < BURST_SHARE:
         return None

@@ -16,6 +16,7 @@ from deal_hw.control.excitation_plan import (
     ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
+    Family,
     largest_factor,
     make_plan,
 )
@@ -37,10 +38,8 @@ class SearchSettings:
 
     candidates: int = 40
     """Random designs."""
-    screening: int = 3
-    """Members that random designs are tried on."""
     finalists: int = 4
-    """Designs that are tried on all members."""
+    """Designs that are kept; one that is worse than all of these is given up as soon as that is sure."""
     rounds: int = 24
     """Changes of one coordinate that are tried on the best."""
     confirmed: int = 6
@@ -49,13 +48,7 @@ class SearchSettings:
     """determinant: most information in all (D-optimal); mean: least mean standard deviation (A-optimal)."""
 
     def __post_init__(self) -> None:
-        if (
-            self.candidates < 1
-            or self.screening < 1
-            or self.finalists < 1
-            or self.rounds < 0
-            or self.confirmed < 1
-        ):
+        if self.candidates < 1 or self.finalists < 1 or self.rounds < 0 or self.confirmed < 1:
             raise ConfigurationError(f"not a usable search for an excitation: {self}")
 
 
@@ -70,7 +63,7 @@ class Optimum:
         references: What other excitations tell, on the same members, by name.
         tried: Designs tried.
         tripped: Those that were discarded, by reason.
-        trace: The best score after each design that was tried on all members.
+        trace: The best score, at first and after each change of a coordinate.
     """
 
     design: ExcitationDesign
@@ -89,7 +82,7 @@ class _Count:
 
     def note(self, prediction: Prediction) -> None:
         self.tried += 1
-        if not prediction.usable:
+        if prediction.tripped:
             self.tripped[prediction.tripped] = self.tripped.get(prediction.tripped, 0) + 1
 
 
@@ -122,40 +115,43 @@ def search_excitation(
     wanted = settings or SearchSettings()
     description = experiment.robot.description
     count = _Count()
-    total = wanted.candidates + min(wanted.finalists, wanted.candidates) + wanted.rounds
-    total += wanted.confirmed if confirmation is not None else 0
+    designs = usual_designs(description, experiment.seconds, balance is not None)
+    designs += [
+        _draw(description, experiment.seconds, balance is not None, rng) for _ in range(wanted.candidates)
+    ]
+    total = len(designs) + wanted.rounds + (wanted.confirmed if confirmation is not None else 0)
 
-    def predict(
-        design: ExcitationDesign, draws: int | None = None, on: Experiment = experiment
-    ) -> Prediction:
+    def predict(design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment) -> Prediction:
         plan = make_plan(description, design)
         found = on.predict(
-            lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None), draws
+            lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None),
+            lambda bound: score(bound, wanted) > bar,
         )
         count.note(found)
         if notify is not None:
-            notify(count.tried, total, f"{design.family}: {found.tripped or f'{found.gain:.1f} nats'}")
+            outcome = "less than others" if found.beaten else found.tripped or f"{found.gain:.1f} nats"
+            notify(count.tried, total, f"{design.family}: {outcome}")
         return found
 
-    drawn = [
-        _draw(description, experiment.seconds, balance is not None, rng) for _ in range(wanted.candidates)
-    ]
-    screened = [(score(predict(d, wanted.screening), wanted), i) for i, d in enumerate(drawn)]
-    ranked = [i for s, i in sorted(screened, reverse=True) if np.isfinite(s)][: wanted.finalists]
-    finals = [(predict(drawn[i]), drawn[i]) for i in ranked]
-    finals = [pair for pair in finals if pair[0].usable]
+    finals: list[tuple[Prediction, ExcitationDesign]] = []
+    for design in designs:
+        full = len(finals) >= wanted.finalists
+        found = predict(design, score(finals[-1][0], wanted) if full else -np.inf)
+        if found.usable:
+            finals = sorted([*finals, (found, design)], key=lambda pair: -score(pair[0], wanted))
+            finals = finals[: wanted.finalists]
     if not finals:
         reasons = ", ".join(f"{n} x {why}" for why, n in count.tripped.items())
         raise CalibrationError(
             f"none of {count.tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
             "draw from narrower ranges (--xi, --calibration), or try more (--candidates)"
         )
-    best, design = max(finals, key=lambda pair: score(pair[0], wanted))
+    best, design = finals[0]
     trace = [score(best, wanted)]
     steps = [(best, design)]
     for k in range(wanted.rounds):
         moved = _moved(description, design, k, balance is not None, rng)
-        found = predict(moved)
+        found = predict(moved, score(best, wanted))
         if score(found, wanted) > score(best, wanted):
             best, design = found, moved
             steps.append((best, design))
@@ -163,9 +159,8 @@ def search_excitation(
     if confirmation is not None:
         # Half of them along the way that the best came, half the other finalists.
         chosen = steps[::-1][: (wanted.confirmed + 1) // 2]
-        others = sorted(finals, key=lambda pair: -score(pair[0], wanted))
         there = [d for _, d in chosen]
-        chosen += [pair for pair in others if pair[1] not in there][: wanted.confirmed - len(chosen)]
+        chosen += [pair for pair in finals if pair[1] not in there][: wanted.confirmed - len(chosen)]
         again = [(predict(d, on=confirmation), d) for _, d in chosen]
         best, design = max(again, key=lambda pair: score(pair[0], wanted))
         if not best.usable:
@@ -193,6 +188,21 @@ def score(prediction: Prediction, settings: SearchSettings) -> float:
     if not prediction.usable:
         return -np.inf
     return prediction.gain if settings.criterion == "determinant" else -float(np.mean(prediction.std))
+
+
+def usual_designs(description: RobotDescription, seconds: float, balances: bool) -> list[ExcitationDesign]:
+    """Return designs that are known to be fair, such as the profile `rich`: the search starts from these."""
+    effort, speed = _factor_ranges(description)
+    low, fast = max(0.15, effort[0]), min(2.5, speed[1])
+    top = _top_hz(description)
+    fair: tuple[tuple[Family, float], ...] = (("steps", 0.5), ("multisine", 1.0), ("chirp", 1.0))
+    return [
+        ExcitationDesign(
+            family=family, seconds=seconds, amplitude=amplitude, high_hz=min(4.0, top), low_hz=0.3,
+            balance_s=min(0.6, 0.25 * seconds) if balances else 0.0, effort=(1.0, low), speed=(1.0, fast),
+        )
+        for family, amplitude in fair
+    ]  # fmt: skip
 
 
 def _top_hz(description: RobotDescription) -> float:

@@ -7,6 +7,7 @@ information: the same windows, sensor noise, unknown start states and latency as
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -48,17 +49,19 @@ class Prediction:
         gain: Information over what is known before [nats], from the members' mean covariance.
         tripped: Why a member would have been stopped, or why nothing can be predicted; "" where all is well.
         clipped: Commands that the safety filter changed, over all members.
+        beaten: Whether it was given up because others tell more.
     """
 
     std: FloatArray
     gain: float
     tripped: str = ""
     clipped: int = 0
+    beaten: bool = False
 
     @property
     def usable(self) -> bool:
-        """Whether all members ran to the end."""
-        return not self.tripped
+        """Whether all members ran to the end, and were all looked at."""
+        return not self.tripped and not self.beaten
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +171,8 @@ class Experiment:
         self.prior = Prior.of(known)
         self.refused = 0
         """Draws that could not be run."""
-        self._runners: dict[int, TrialRunner] = {}
+        self._runner: TrialRunner | None = None
+        self._order = list(range(draws))
         self._rest = rest
         drawn = _draw(robot.description, known, rng, draws)
         self.scenario = self._runnable(drawn, draws, rest)
@@ -201,38 +205,42 @@ class Experiment:
             )
         )
 
-    def predict(self, make: MakeBehaviour, draws: int | None = None) -> Prediction:
+    def predict(self, make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
         """Predict what a behaviour tells.
 
         Args:
             make: Makes the behaviour.
-            draws: How many of the members to use; all by default.
+            bar: Asked after each member whether to go on, with what the behaviour would tell if the members
+                left were known exactly: no prediction ends above that. Members that left the last finished
+                behaviour most in the dark come first, so most others end after one or two.
         """
-        D = len(self.scenario) if draws is None else min(draws, len(self.scenario))
-        if D not in self._runners:
-            self._runners[D] = TrialRunner(
-                self.robot, self.space, self.scenario.part(range(D)), self.seconds, self.threads
-            )
-        trials = self._runners[D].run([make() for _ in range(D)], until_trip=True)
-        K = len(self.space)
+        D, K = len(self.scenario), len(self.space)
+        if self._runner is None:
+            self._runner = TrialRunner(self.robot, self.space, self.scenario, self.seconds, self.threads)
+        trials = self._runner.run([make() for _ in range(D)], until_trip=True)
         clipped = sum(trial.clipped for trial in trials)
+        nothing = Prediction(np.full(K, np.nan), -np.inf, clipped=clipped)
         tripped = next((trial.tripped for trial in trials if trial.tripped), "")
         if tripped:
-            return Prediction(np.full(K, np.nan), -np.inf, tripped, clipped)
-        total = np.zeros((K, K))
-        for n, trial in enumerate(trials):
+            return dataclasses.replace(nothing, tripped=tripped)
+        covariances = np.zeros((D, K, K))
+        found = nothing
+        for n in self._order:
             try:
-                hessian = self.information(trial, n)
+                covariances[n] = self.prior.posterior(self.information(trials[n], n))
             except InsufficientDataError as err:
-                return Prediction(np.full(K, np.nan), -np.inf, str(err), clipped)
-            covariance = self.prior.posterior(hessian)
-            if not np.isfinite(covariance).all():
-                return Prediction(np.full(K, np.nan), -np.inf, "a member diverged in its windows", clipped)
-            total += covariance
-        # Covariances are averaged, not gains: what leaves no trace on one robot in eight must not be made up
-        # for by what is a little sharper on the other seven.
-        mean = total / len(trials)
-        return Prediction(np.sqrt(np.diag(mean)), self.prior.gain(mean), "", clipped)
+                return dataclasses.replace(nothing, tripped=str(err))
+            if not np.isfinite(covariances[n]).all():
+                return dataclasses.replace(nothing, tripped="a member diverged in its windows")
+            # Covariances are averaged, not gains: what leaves no trace on one robot in eight must not be made
+            # up for by what is a little sharper on the other seven.
+            mean = np.mean(covariances, axis=0)
+            found = Prediction(np.sqrt(np.diag(mean)), self.prior.gain(mean), clipped=clipped)
+            if bar is not None and not bar(found):
+                return dataclasses.replace(nothing, beaten=True)
+        dark = np.einsum("nkk,kk->n", covariances, self.prior.information[:K, :K])
+        self._order = np.argsort(-dark).tolist()
+        return found
 
     def information(self, trial: Trial, n: int) -> FloatArray:
         """Return the information of member ``n``'s trial, (K + 1, K + 1)."""

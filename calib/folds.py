@@ -23,8 +23,8 @@ from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.types import FloatArray
 
-LONG_S = 10.0
-"""Recordings that are longer together are cut into two folds, others into three: little is left to fit."""
+FOLDS = 2
+"""Each costs a search and a polish."""
 
 BLOCKS = 2
 """Stretches of each recording that a fold leaves out."""
@@ -89,17 +89,15 @@ def choose(
         robust: Try the robust polish, too.
     """
     window_s = length * problem.episodes[0].period_s
-    seconds = sum(float(np.sum(e.usable)) * e.period_s for e in problem.episodes)
-    count = 2 if seconds > LONG_S else 3
-    if count * search_steps > MOST_STEPS:
-        note = f"left out: {count} searches would take {count * search_steps:.1g} physics steps"
+    if FOLDS * search_steps > MOST_STEPS:
+        note = f"left out: {FOLDS} searches would take {FOLDS * search_steps:.1g} physics steps"
         return Choice("polish", {}, window_s, note=note)
     before = problem.steps
     candidates: dict[str, Fit] = {"search": _searched, "polish": _polished}
     if robust:
         candidates["robust polish"] = _robust
     errors: dict[str, list[float]] = {name: [] for name in candidates}
-    for fold, left_out in enumerate(fold_masks(problem, count)):
+    for fold, left_out in enumerate(fold_masks(problem)):
         train = problem.part([~mask for mask in left_out])
         try:
             searched = search.run(train, budget, np.random.default_rng([seed, fold]))
@@ -115,7 +113,7 @@ def choose(
     return Choice(chosen, {n: tuple(v) for n, v in errors.items()}, window_s, problem.steps - before)
 
 
-def fold_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]]:
+def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each fold which samples of each recording it leaves out, (T,) each.
 
     Each fold leaves out some stretches of every recording, so that all phases of the motion are on both

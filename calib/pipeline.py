@@ -178,7 +178,9 @@ class PolishedMethod(CalibrationMethod[Problem]):
         # Drawn after all searches, so that a resumed run draws the same.
         seed = int(rng.integers(2**32))
         length = polished.shooting.length
-        return choose(problem, self.search, budget, seed, length, searched.steps, robust)
+        # A fold needs no more generations than the whole did.
+        less = dataclasses.replace(budget, generations=max(len(searched.trace), FEWEST_GENERATIONS))
+        return choose(problem, self.search, less, seed, length, searched.steps, robust)
 
 
 def _until_explained(

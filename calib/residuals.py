@@ -24,6 +24,9 @@ secant says more of them than a derivative."""
 CONTACT_STATE_STEP = 0.5
 """Step of start states there, in standard deviations of the smoothed ones."""
 
+EXACT_STEP = 1e-5
+"""Parameter step where states are exact: the residual then has no floor to hide a secant's error under."""
+
 LATENCY_STEP_S = 2e-4
 POSITION_STEP = 1e-6
 VELOCITY_STEP = 1e-4
@@ -111,7 +114,7 @@ class Shooting:
         self._prior_information = np.append(1 / std**2, 0.0)
         C = problem.coordinates
         self._start_information = [1 / d.prior_std**2 for d in self.data]
-        self._parameter_step = PARAMETER_STEP
+        self._parameter_step = EXACT_STEP if problem.exact else PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
         if problem.robot.base is not None and not problem.exact:
             self._parameter_step = CONTACT_STEP
@@ -266,6 +269,13 @@ class Shooting:
             v = np.stack([p.velocity[e] for p in points])
             total += self._window_costs(e, values, x, v).sum(axis=1)
         return np.asarray(total)
+
+    def window_costs(self, point: Point) -> list[FloatArray]:
+        """Return the cost of each window of each episode at a point, (W,) each."""
+        return [
+            self._window_costs(e, point.value[None], point.position[e][None], point.velocity[e][None])[0]
+            for e in range(len(self.data))
+        ]
 
     def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deal_hw.calib.coordinates import Members
+from deal_hw.calib.halves import halves_rows
 from deal_hw.calib.innovations import whitened_residual
 from deal_hw.calib.problem import Problem, WindowData
 from deal_hw.calib.refine import samples_in
@@ -43,7 +44,7 @@ def gather(
         episodes: The fitted recordings.
         holdout: Recordings that the search has not seen.
         telemetry: Verdicts of the telemetry checks, in words.
-        halves: Agreement of disjoint halves of the data.
+        halves: Agreement of disjoint halves of the data; by default what the result's provenance says.
         threads: Simulation threads.
     """
     overlays: list[Overlay] = []
@@ -68,7 +69,7 @@ def gather(
         residuals=tuple(residuals),
         tick_s=episodes[0].step_s if episodes else None,
         telemetry=tuple(telemetry),
-        halves=tuple(halves),
+        halves=tuple(halves) or halves_rows(result.provenance),
         left_out=tuple(left_out),
     )
 

@@ -23,7 +23,7 @@ TEMPLATE = "report.html.j2"
 AT_BOUND = 1e-6
 """A parameter so near an end of its range, as a share of the range, ended there."""
 
-_HIDDEN = ("latency_scan", "search_estimate", "versions", "settings", "budget")
+_HIDDEN = ("latency_scan", "search_estimate", "versions", "settings", "budget", "halves")
 """Provenance with a place of its own on the page."""
 
 

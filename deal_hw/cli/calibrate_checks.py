@@ -95,15 +95,19 @@ def require_visible_parameters(
     space: ParameterSpace,
     episodes: Sequence[Episode],
     known_std: FloatArray | None,
+    window_s: float,
     threads: int | None,
     say: Callable[[str], None],
 ) -> None:
     """Check before any search that the recordings are long enough, move, and show every parameter."""
     from deal_hw.calib.excitation import check_excitation
-    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.problem import SMOOTHING_S, Problem
+    from deal_hw.calib.refine import samples_in
     from deal_hw.calib.visible import look, require_visible
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
+    # Raises where not even one window of that length fits.
+    problem.windows(samples_in(problem, window_s), offset=round(SMOOTHING_S / 2 / episodes[0].period_s))
     try:
         check_excitation(problem)
     except InsufficientDataError as err:

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from deal_hw.sim.model import RobotModel
 
 HELDOUT_PART = 0.25
-STRETCH_S = 5.0
-"""Fitted recordings are cut into parts of about this length, so that memory does not grow with them [s]."""
+STRETCH_S = 2.5
+"""Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
 HELDOUT_STRETCH_S = 20.0
 
 
@@ -62,8 +62,8 @@ class Recordings:
     """Fit stretches that lie evenly over the recordings and add up to so many seconds; more is slower."""
 
     window: float = 0.4
-    """Length of the search's longest windows of prediction [s]; the first ones are a quarter of it. Longer ones
-    see slow things (weight, friction that holds) and cost memory with the square of the samples in them."""
+    """Length of the search's longest windows of prediction [s]; the first ones are a quarter of it. Longer
+    ones see slow things (weight, friction that holds) and cost memory with the square of their samples."""
 
     physics_step: float | None = None
     """Wanted physics step [s]; by default the MJCF's timestep. A whole number fits into a sampling period."""
@@ -155,9 +155,9 @@ def prepare_model(
     fit_recordings = [r for table in fitted for r in _on_grid(table, robot, rates)]
     episodes = [_align(r, robot) for r in fit_recordings]
     judge = [_align(r, robot) for table in held for r in _on_grid(table, robot, rates)]
-    episodes, judge = _divide(episodes, judge, share, config.fit_seconds, say)
+    episodes, judge = _divide(episodes, judge, share, config, say)
     warn_of_gravity(robot, space, episodes, say)
-    require_visible_parameters(robot, space, episodes, std(robot), threads, say)
+    require_visible_parameters(robot, space, episodes, std(robot), config.window, threads, say)
     return Work(
         robot=robot,
         space=space,
@@ -265,7 +265,7 @@ def _divide(
     episodes: Sequence[Episode],
     judge: Sequence[Episode],
     share: float,
-    seconds: float,
+    config: Recordings,
     say: Callable[[str], None],
 ) -> tuple[list[Episode], list[Episode]]:
     """Return stretches to fit and stretches to judge by."""
@@ -275,8 +275,8 @@ def _divide(
     if share > 0:
         pairs = [split_last(e, share) for e in episodes]
         fit, held = [first for first, _ in pairs], [last for _, last in pairs]
-    parts = [p for e in fit for p in stretches(e, STRETCH_S)]
-    chosen = spread(parts, seconds)
+    parts = [p for e in fit for p in stretches(e, max(STRETCH_S, 3 * config.window))]
+    chosen = spread(parts, config.fit_seconds)
     if len(chosen) < len(parts):
         say(
             f"fitting {sum(map(_seconds, chosen)):.0f} s of {sum(map(_seconds, parts)):.0f} s, in "

@@ -16,7 +16,7 @@ import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.calibrate_live import open_checkpoint
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
@@ -148,6 +148,7 @@ def calibrate_episodes(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
+    _require_windows(holdout, heldout_window_s)
     problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s, known_std=known_std)
     searcher = make_method(method, polish=budget.polish)
     with show_progress(f"calibrate ({method})", quiet) as report:
@@ -170,6 +171,26 @@ def calibrate_episodes(
     return dataclasses.replace(
         result, heldout_nrmse=errors, provenance={**result.provenance, "heldout_rmse": rmse.to_json()}
     )
+
+
+def _require_windows(holdout: Sequence[Episode], window_s: float) -> None:
+    """Check before any search that held-out recordings can be judged by.
+
+    Raises:
+        InsufficientDataError: None of them holds a window.
+    """
+    from deal_hw.sim.episode import fill_gaps
+    from deal_hw.sim.windows import cut_windows
+
+    problem: InsufficientDataError | None = None
+    for episode in map(fill_gaps, holdout):
+        try:
+            cut_windows(episode, max(round(window_s / episode.period_s), 1))
+            return
+        except InsufficientDataError as err:
+            problem = err
+    if problem is not None:
+        raise InsufficientDataError(f"the held-out recordings are too short: {problem} (--heldout-window)")
 
 
 def residual_std(words: Sequence[str], robot: RobotModel) -> FloatArray | None:
@@ -312,7 +333,7 @@ def print_result(result: CalibrationResult, advice: str) -> None:
             p.name,
             p.unit,
             f"{p.nominal:.4g}",
-            f"{result.estimate[k]:.4g}",
+            "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}",
             f"{low:.4g} .. {high:.4g}",
             verdict,
         )

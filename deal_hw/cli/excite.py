@@ -81,7 +81,7 @@ class Excite:
     criterion: Literal["determinant", "mean"] = "determinant"
     """determinant: most information in all; mean: least mean standard deviation."""
 
-    draws: int = 8
+    draws: int = 24
     """Robots that each candidate is tried on."""
 
     confirm: int = 24
@@ -183,7 +183,7 @@ def _search(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
     settings = SearchSettings(
-        candidates=config.candidates, screening=min(3, config.draws), rounds=config.rounds,
+        candidates=config.candidates, rounds=config.rounds,
         criterion=config.criterion,
     )  # fmt: skip
     rng = np.random.default_rng(config.seed)

@@ -76,8 +76,10 @@ def _parameters(result: CalibrationResult) -> str:
     for k, p in enumerate(result.space):
         verdict = result.verdicts[k] if result.verdicts else ""
         low, high = result.interval[k]
+        # What the data cannot tell has no value, whatever number the search ended at.
+        estimate = "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}"
         lines.append(
-            f"| {p.name} | {p.nominal:.4g} | {result.estimate[k]:.4g} | {low:.4g} to {high:.4g} | {p.unit} | "
+            f"| {p.name} | {p.nominal:.4g} | {estimate} | {low:.4g} to {high:.4g} | {p.unit} | "
             f"{'' if verdict == 'identifiable' else verdict} |"
         )
     return "\n".join(lines)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,14 @@ from numpy.linalg import inv
 
 from deal_hw.calib.advice import advise, excitation_menu, predict_menu, sentences
 from deal_hw.calib.excitation_search import SearchSettings, score, search_excitation
-from deal_hw.calib.experiment_design import Experiment, Prediction, Prior, default_knowledge, information
+from deal_hw.calib.experiment_design import (
+    Experiment,
+    MakeBehaviour,
+    Prediction,
+    Prior,
+    default_knowledge,
+    information,
+)
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.residuals import Shooting
 from deal_hw.calib.trials import Scenario, TrialRunner
@@ -180,16 +188,14 @@ def test_trial_is_what_the_calibration_would_replay() -> None:
     assert np.max(np.abs(normal.residual[0])) < 1e-6
 
 
-def recording(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> list[Prediction]:
-    """Return a list that grows by every prediction on all members."""
-    seen: list[Prediction] = []
+def recording(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> list[MakeBehaviour]:
+    """Return a list that grows by every behaviour that is tried."""
+    seen: list[MakeBehaviour] = []
     plain = experiment.predict
 
-    def predict(make: object, draws: int | None = None) -> Prediction:
-        found = plain(make, draws)  # type: ignore[arg-type]
-        if draws is None:
-            seen.append(found)
-        return found
+    def predict(make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
+        seen.append(make)
+        return plain(make, bar)
 
     monkeypatch.setattr(experiment, "predict", predict)
     return seen
@@ -205,18 +211,20 @@ def test_optimum_is_at_least_as_good_as_all_candidates(
         servo, default_knowledge(space("mass", "damping", "effort_limit")), 1.0, 2, rng, threads=1
     )
     seen = recording(experiment, monkeypatch)
-    settings = SearchSettings(candidates=6, screening=1, finalists=3, rounds=8, criterion=criterion)  # type: ignore[arg-type]
+    settings = SearchSettings(candidates=6, finalists=3, rounds=8, criterion=criterion)  # type: ignore[arg-type]
     plain = make_plan(servo.description, ExcitationDesign(seconds=1.0, low_hz=1.0))
     found = search_excitation(
         experiment, rng, settings, references={"plain": lambda: ExcitationBehaviour(plain, servo.description)}
     )
-    assert len(seen) == found.tried - 6 + 1
-    assert score(found.prediction, settings) == max(score(p, settings) for p in seen[:-1])
-    assert found.references["plain"] is seen[-1]
+    assert len(seen) == found.tried + 1 == 3 + 6 + 8 + 1
+    # Nothing that was given up on the way would have been better.
+    every = [experiment.predict(make) for make in list(seen)[:-1]]
+    assert score(found.prediction, settings) == pytest.approx(max(score(p, settings) for p in every))
+    assert found.references["plain"].usable
     assert list(found.trace) == sorted(found.trace) and len(found.trace) == 1 + 8
     np.testing.assert_allclose(list(found.plan.predicted.values()), found.prediction.std)
     again = experiment.predict(lambda: ExcitationBehaviour(found.plan, servo.description))
-    assert again.gain == found.prediction.gain
+    assert again.gain == pytest.approx(found.prediction.gain)
 
 
 def test_candidates_that_trip_are_discarded_and_counted(servo: RobotModel) -> None:
@@ -226,7 +234,7 @@ def test_candidates_that_trip_are_discarded_and_counted(servo: RobotModel) -> No
     experiment = Experiment(
         tight, default_knowledge(space("mass")), 1.0, 1, np.random.default_rng(0), threads=1
     )
-    with pytest.raises(CalibrationError, match=r"none of 3 excitations keeps 'slide'.*slide left its range"):
+    with pytest.raises(CalibrationError, match=r"none of 6 excitations keeps 'slide'.*slide left its range"):
         search_excitation(experiment, np.random.default_rng(0), SearchSettings(candidates=3))
 
 

@@ -37,7 +37,7 @@ def optimal(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
     )  # fmt: skip
     assert report.optimum is not None
-    assert report.optimum.tried >= 4 + 1 + 2
+    assert report.optimum.tried >= 3 + 4 + 2
     assert set(report.optimum.references) == {"multisine", "chirp", "rich"}
     return path
 

@@ -1,0 +1,152 @@
+"""Inner folds and the robust loss, on recordings of the real device core with hidden truths."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.folds import at_estimate, choose, fold_masks, prediction_error
+from deal_hw.calib.judgement import Validation, unexplained
+from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.refine import Polished, polish, polish_windows
+from deal_hw.calib.residuals import Shooting
+from deal_hw.calib.robust import huber_weights, kurtosis, robust_polish
+from deal_hw.calib.statements import with_rows
+from deal_hw.calibration import (
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    ProgressCallback,
+    StateStore,
+)
+from deal_hw.cli.bench_tasks import Case, make_case
+from deal_hw.types import FloatArray
+
+
+class At(CalibrationMethod[Problem]):
+    """A search that ends where it is told."""
+
+    name = "at"
+
+    def __init__(self, theta: FloatArray, latency_s: float) -> None:
+        self._theta, self._latency_s = theta, latency_s
+        self.runs = 0
+
+    def run(
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
+        checkpoint: StateStore | None = None,
+    ) -> CalibrationResult:
+        """Return that place."""
+        self.runs += 1
+        interval = np.stack([problem.space.low, problem.space.high], axis=1)
+        return CalibrationResult(
+            method="at",
+            space=problem.space,
+            estimate=self._theta,
+            interval=interval,
+            latency_s=self._latency_s,
+        )
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
+    return make_case("cartpole", "sensor", 2, 5.0)
+
+
+@pytest.fixture(scope="module")
+def problem(case: Case) -> Problem:
+    """Its problem, the latency given."""
+    return Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
+
+
+@pytest.fixture(scope="module")
+def polished(case: Case, problem: Problem) -> Polished:
+    """Where the polish ends, in windows of 0.2 s."""
+    found = polish(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
+    return with_rows(found)
+
+
+def test_folds_are_disjoint_and_cover_everything(problem: Problem) -> None:
+    """Each sample is left out exactly once, and each fold leaves out two stretches."""
+    masks = fold_masks(problem, 2)
+    total = np.sum([m[0] for m in masks], axis=0)
+    assert np.all(total == 1)
+    assert np.count_nonzero(np.diff(masks[0][0].astype(int)) == 1) == 1
+    part = problem.part(masks[0])
+    assert part.episodes[0].usable.sum() == (problem.episodes[0].usable & masks[0][0]).sum()
+    assert part.starts is problem.starts and problem.episodes[0].usable.sum() > part.episodes[0].usable.sum()
+
+
+def test_folds_keep_the_polish_where_it_helps_and_drop_it_where_not(case: Case, problem: Problem) -> None:
+    """From 10 % off the polish predicts better in every fold; what costs too much is left out with a note."""
+    off = choose(problem, At(case.theta * 1.1, case.latency_s), Budget(), 0, 40, 0)
+    assert off.chosen == "polish"
+    assert all(p < s for p, s in zip(off.errors["polish"], off.errors["search"], strict=True))
+    assert set(off.to_json()) == {"chosen", "errors", "window_s", "steps"}
+    truth = prediction_error(problem, [(case.theta, case.latency_s), (case.theta * 1.1, case.latency_s)], 40)
+    assert truth[0] < truth[1]
+    dear = choose(problem, At(case.theta, case.latency_s), Budget(), 0, 40, 10**10)
+    assert dear.chosen == "polish" and "left out" in dear.note
+
+
+def test_a_search_that_is_kept_gets_start_states_and_intervals(case: Case, problem: Problem) -> None:
+    """At a search's estimate the start states settle to a lower cost, and the estimate stays."""
+    searched = At(case.theta, case.latency_s).run(problem, Budget(), np.random.default_rng(0))
+    shooting = Shooting(problem, 40)
+    smoothed = shooting.smoothed()
+    there = at_estimate(problem, searched, 40, smoothed)
+    assert there.theta == pytest.approx(case.theta)
+    assert there.normal.cost < shooting.costs([shooting.start(case.theta, case.latency_s, smoothed)])[0]
+    assert there.chi2 < 1.3 and not unexplained(there)
+
+
+def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> None:
+    """With a latency 10 ms off the model fails: folds are run, provenance says what was chosen and why."""
+    wrong = case.latency_s + 0.01
+    problem = Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=wrong)
+    search = At(case.theta, wrong)
+    result = PolishedMethod(search, settings=Validation(halves=False)).run(
+        problem, Budget(generations=16), np.random.default_rng(0)
+    )
+    assert search.runs >= 3
+    folds = result.provenance["folds"]
+    assert folds["chosen"] in ("search", "polish") and set(folds["errors"]) == {"search", "polish"}
+    assert "diagnosis" in result.provenance
+    assert any("does not explain" in words for words in result.alarms)
+
+
+def test_huber_weights_by_hand() -> None:
+    """Residuals within 1.345 weigh 1, one of 13.45 weighs a tenth; a large median widens the belt."""
+    weights = huber_weights(np.array([0.1, -1.0, 13.45, 0.2, 0.3]))
+    assert weights == pytest.approx([1.0, 1.0, 0.1, 1.0, 1.0])
+    assert huber_weights(np.full(5, 10.0)) == pytest.approx(np.ones(5))
+    assert kurtosis([np.array([1.0, -1.0])]) == 1.0
+
+
+def test_robust_polish_shrugs_off_wild_samples(case: Case, problem: Problem, polished: Polished) -> None:
+    """A cart sample in the middle of each window off by 5 mm: Huber's loss stays nearer to the clean fit."""
+    wild = case.fit.position.copy()
+    wild[20::40, 0] += 5e-3
+    spoilt = Problem(
+        case.robot, case.space, [dataclasses.replace(case.fit, position=wild)], threads=1,
+        fixed_latency_s=case.latency_s,
+    )  # fmt: skip
+    # The noise is that of the clean recording: an outlier is what noise does not make.
+    spoilt.noise, spoilt.starts = problem.noise, problem.starts
+    shooting = Shooting(spoilt, polished.shooting.length)
+    point = shooting.start(polished.theta, case.latency_s, polished.shooting.states(polished.point))
+    plain = polish_windows(shooting, point, 6, fixed_latency=True)
+    assert kurtosis(plain.normal.residual) > 6.0
+    robust = robust_polish(spoilt, plain, fixed_latency=True)
+    scaled = [spoilt.space.to_scale(p.theta) for p in (polished, plain, robust)]
+    assert np.linalg.norm(scaled[2] - scaled[0]) < 0.5 * np.linalg.norm(scaled[1] - scaled[0])
+    # What it leaves out of the loss it does not leave out of the verdict.
+    assert robust.chi2 > 1.3

@@ -1,0 +1,108 @@
+"""Agreement of halves and null directions of K11, on recordings of the real device core, truths hidden."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.halves import Halves, compare_halves, half_of, halves_rows, heed
+from deal_hw.calib.judgement import Validation, judge
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.refine import Polished, polish
+from deal_hw.calib.statements import statement, with_rows
+from deal_hw.cli.bench_tasks import Case, make_case
+from deal_hw.drivers.cartpole.description import parameter_space
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
+    return make_case("cartpole", "sensor", 2, 5.0)
+
+
+@pytest.fixture(scope="module")
+def problem(case: Case) -> Problem:
+    """Its problem, the latency given."""
+    return Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
+
+
+@pytest.fixture(scope="module")
+def polished(case: Case, problem: Problem) -> Polished:
+    """Where the polish ends, in windows of 0.2 s."""
+    found = polish(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
+    return with_rows(found)
+
+
+def test_halves_share_no_window_and_hold_all(problem: Problem, polished: Polished) -> None:
+    """Blocks of two windows go to either half in turn, with their start states."""
+    halves = [half_of(polished.shooting, polished.point, half, 2) for half in range(2)]
+    starts = [set(s.data[0].windows.start.tolist()) for s, _ in halves]
+    assert not starts[0] & starts[1]
+    assert starts[0] | starts[1] == set(polished.shooting.data[0].windows.start.tolist())
+    whole = polished.shooting.costs([polished.point])[0]
+    assert sum(s.costs([p])[0] for s, p in halves) == pytest.approx(whole)
+    first = halves[0][0].data[0]
+    assert len(first.measured) == len(first.windows) == len(halves[0][1].position[0])
+
+
+def test_halves_of_a_right_model_agree(problem: Problem, polished: Polished) -> None:
+    """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
+    known = statement(problem, polished, fixed_latency=True)
+    halves = compare_halves(problem, polished, known)
+    assert halves.flagged == () and halves.alarm == "" and halves.steps > 0
+    assert [r.name for r in halves.rows] == list(problem.space.names)
+    assert all(r.first[1] <= r.first[0] <= r.first[2] for r in halves.rows)
+    assert halves_rows({"halves": halves.to_json()}) == halves.rows
+    assert heed(problem, known, polished.theta, halves) is known
+
+
+def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
+    case: Case, problem: Problem, polished: Polished
+) -> None:
+    """A half whose stiffness lies ten standard deviations off: its interval is widened to it, and said."""
+    known = statement(problem, polished, fixed_latency=True)
+    k = problem.space.names.index("servo.stiffness")
+    std = np.sqrt(known.covariance[k, k])
+    far = problem.space.to_scale(polished.theta)
+    far = problem.space.from_scale(far + 10 * std * np.eye(len(problem.space))[k])[k]
+    reach = np.zeros(len(problem.space))
+    reach[k] = 10 * std
+    wide = heed(problem, known, polished.theta, Halves((), ("servo.stiffness",), reach))
+    assert wide.interval[k, 1] == pytest.approx(far)
+    assert wide.interval[0] == pytest.approx(known.interval[0])
+    assert any("disagree about servo.stiffness" in words for words in wide.alarms)
+
+
+def test_too_few_windows_are_not_halved(case: Case, problem: Problem, polished: Polished) -> None:
+    """Three windows: a note instead of rows."""
+    few = dataclasses.replace(case.fit, usable=np.arange(len(case.fit.sample)) < 130)
+    short = Problem(case.robot, case.space, [few], threads=1, fixed_latency_s=case.latency_s)
+    found = polish(short, case.theta, case.latency_s, (0.2,), iterations=1, fixed_latency=True)
+    halves = compare_halves(short, found, statement(short, found, fixed_latency=True))
+    assert halves.rows == () and "too few" in halves.note
+    assert halves_rows({"halves": halves.to_json()}) == ()
+
+
+def test_k11_gives_no_value_to_what_its_null_directions_move(case: Case) -> None:
+    """Two exact null directions are named, nearly all parameters have no value, their intervals the range."""
+    space = parameter_space().with_ratio(5.0)
+    assert case.truth is not None
+    theta = np.array([case.truth.parameters[name] for name in space.names])
+    problem = Problem(case.robot, space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
+    found = with_rows(polish(problem, theta, case.latency_s, (0.2, 0.4), iterations=4, fixed_latency=True))
+    known, _ = judge(problem, found, statement(problem, found, fixed_latency=True), Validation())
+    assert len(known.null_directions) == 2
+    named = [n for n in space.names if any(n in words for words in known.null_directions)]
+    without = [n for n, v in zip(space.names, known.verdicts, strict=True) if v == "not identifiable"]
+    assert {"cart.mass", "pole.mass", "pole.length", "servo.stiffness"} <= set(without)
+    assert set(without) <= set(named)
+    # Ratios of rates are told whatever the scale of forces is.
+    assert known.verdicts[space.names.index("servo.speed_limit")] == "identifiable"
+    for n in without:
+        k = space.names.index(n)
+        assert known.interval[k] == pytest.approx(
+            [space.unnormalize(np.full(len(space), u))[k] for u in (0.05, 0.95)]
+        )
+        assert known.interval[k, 0] <= theta[k] <= known.interval[k, 1]
