@@ -51,6 +51,9 @@ class Bench:
     polish_all: bool = False
     """Polish every method; by default only `default` is."""
 
+    demonstration: Literal["excite", "policy"] = "excite"
+    """How ant and Go2 are demonstrated: by motions that excite, or by their shipped policies."""
+
     population: int = 100
     """Members of a search."""
 
@@ -174,6 +177,7 @@ def _calibration_runs(config: Bench) -> tuple[tuple[str, ...], Runs]:
         parse_seeds(config.seeds),
         space=config.space,
         polish_all=config.polish_all,
+        demonstration=config.demonstration,
     )
 
     def make(cell: Cell) -> Callable[[], dict[str, Any]]:

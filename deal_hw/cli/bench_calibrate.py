@@ -20,7 +20,7 @@ from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["honest", "mismatch", "paper"]
 PAPER_NOTE = "centred target: a searcher that ignores the data scores 0 here"
-KEY = ("task", "space", "profile", "method", "polish", "xi", "seed")
+KEY = ("task", "space", "profile", "demonstration", "method", "polish", "xi", "seed")
 """What names a cell."""
 
 
@@ -33,6 +33,7 @@ class Cell:
         task: Name of the task.
         space: Name of the parameter set; "" for the task's default.
         profile: Profile of the robot.
+        demonstration: "excite" or "policy".
         method: Name of the method.
         polish: Whether the polish follows.
         xi: Ratio of the search range.
@@ -43,6 +44,7 @@ class Cell:
     task: str
     space: str
     profile: str
+    demonstration: str
     method: str
     polish: bool
     xi: float
@@ -64,6 +66,7 @@ def make_cells(
     *,
     space: str = "",
     polish_all: bool = False,
+    demonstration: str = "excite",
 ) -> list[Cell]:
     """Return the cells of a bench, seed by seed, so that a stopped bench has whole seeds.
 
@@ -79,8 +82,8 @@ def make_cells(
         check_method(method)
     return [
         Cell(
-            protocol=protocol, task=task, space=space, profile=profile, method=method,
-            polish=polish_all or method == "default", xi=xi, seed=seed,
+            protocol=protocol, task=task, space=space, profile=profile, demonstration=demonstration,
+            method=method, polish=polish_all or method == "default", xi=xi, seed=seed,
         )
         for task, xi, seed, method in itertools.product(tasks, xis, seeds, methods)
     ]  # fmt: skip
@@ -95,8 +98,9 @@ def run_cell(cell: Cell, *, population: int, generations: int, threads: int | No
     budget = Budget(population=population, generations=generations, polish=cell.polish)
     try:
         case = make_case(
-            cell.task, cell.profile, cell.seed, cell.xi, cell.space, centred=cell.protocol == "paper"
-        )
+            cell.task, cell.profile, cell.seed, cell.xi, cell.space,
+            centred=cell.protocol == "paper", by_policy=cell.demonstration == "policy",
+        )  # fmt: skip
         part, _ = calibration_row(case, cell.method, budget, threads)
         row |= part
     except DealHwError as err:

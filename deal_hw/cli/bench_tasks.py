@@ -12,6 +12,7 @@ import numpy as np
 
 from deal_hw.cli.run_plan import Profile, RunPlan, make_behaviour, shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
@@ -77,6 +78,7 @@ class _Ask:
     xi: float
     space: str
     centred: bool
+    by_policy: bool
 
     def ranges(self, table: Mapping[str, Callable[[], ParameterSpace]]) -> ParameterSpace:
         """Return the parameter set with its search ranges."""
@@ -89,7 +91,14 @@ class _Ask:
 
 
 def make_case(
-    task: str, profile: str, seed: int, xi: float, space: str = "", *, centred: bool = False
+    task: str,
+    profile: str,
+    seed: int,
+    xi: float,
+    space: str = "",
+    *,
+    centred: bool = False,
+    by_policy: bool = False,
 ) -> Case:
     """Draw a truth and record a demonstration and a held-out motion.
 
@@ -100,12 +109,14 @@ def make_case(
         xi: Ratio of the search range.
         space: Name of the parameter set; the task's default.
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
+        by_policy: Ant and Go2 are demonstrated by their shipped policies, as in the paper, instead of by
+            motions that excite more. The cart-pole's demonstration always begins with its policy.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
         CalibrationError: No drawn truth could demonstrate.
     """
-    return TASKS[task](_Ask(profile, seed, xi, space, centred))
+    return TASKS[task](_Ask(profile, seed, xi, space, centred, by_policy))
 
 
 def _cartpole(ask: _Ask) -> Case:
@@ -140,7 +151,8 @@ def _ant(ask: _Ask) -> Case:
     robot = load_model(ant.DESCRIPTION)
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
-        return flail(rng), flail(rng, (1.5, 4.0))
+        shown = _policy("ant", ant.DESCRIPTION) if ask.by_policy else flail(rng)
+        return shown, flail(rng, (1.5, 4.0))
 
     return _target("ant", robot, ask.ranges(ant.SPACES), ask, motions, None)
 
@@ -158,10 +170,23 @@ def _go2(ask: _Ask) -> Case:
     )  # fmt: skip
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
-        return sway(robot, rng, DEMONSTRATION_S), sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
+        fast = sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
+        if ask.by_policy:
+            return _policy("go2", go2.DESCRIPTION), fast
+        return sway(robot, rng, DEMONSTRATION_S), fast
 
     space = ask.ranges(go2.SPACES)
     return _target("go2", robot, space, ask, motions, None if ask.profile == "ideal" else sensing)
+
+
+FORWARD_M_S = 0.4
+"""Speed that a demonstration policy is asked for, where it observes one [m/s]."""
+
+
+def _policy(robot: str, description: RobotDescription) -> Behaviour:
+    from deal_hw.policies.demonstration import Demonstration, demonstration_policy
+
+    return Demonstration(demonstration_policy(robot), description, wanted=(FORWARD_M_S, 0.0, 0.0))
 
 
 def _target(
