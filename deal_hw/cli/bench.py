@@ -8,12 +8,14 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import tyro
 
+from deal_hw.calibration import Budget
+from deal_hw.cli.calibrate_model import Recordings
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
@@ -25,10 +27,22 @@ FORMAT = "deal_hw.bench/1"
 class Bench:
     """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
 
-    bench: tyro.conf.Positional[Literal["loop", "honest", "mismatch", "paper"]]
+    bench: tyro.conf.Positional[Literal["loop", "honest", "mismatch", "paper", "real"]]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
-    simulator here does. paper: DEAL's protocol, whose target is the centre of the range."""
+    simulator here does. paper: DEAL's protocol, whose target is the centre of the range. real: recordings
+    of a real robot (--model, --data), judged on held-out motion."""
+
+    recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
+
+    holdout: tuple[Path, ...] = ()
+    """real: recordings that only judge; by default the last part of each."""
+
+    heldout_window: float = 5.0
+    """real: held-out predictions restart this often [s]."""
+
+    residual_std: tuple[str, ...] = ()
+    """real: what a prediction may be off, as for `deal-hw calibrate`."""
 
     task: str = "cartpole"
     """Tasks, comma separated: cartpole, ant, go2 (loop: the cart-pole only)."""
@@ -112,7 +126,8 @@ def bench(config: Bench) -> int:
     """Run the cells that are not done yet, writing the files after each; return 1 if any cell failed."""
     out = config.out or Path(f"{config.bench}.json")
     rows = _load(out)
-    names, runs = _loop_runs(config, out) if config.bench == "loop" else _calibration_runs(config)
+    makers = {"loop": _loop_runs, "real": _real_runs}
+    names, runs = makers.get(config.bench, _calibration_runs)(config, out)
     done = {tuple(r.get(name, "") for name in names) for r in rows if not r["error"]}
     for number, (key, run) in enumerate(runs):
         if key in done:
@@ -161,7 +176,7 @@ def _loop_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
     ]
 
 
-def _calibration_runs(config: Bench) -> tuple[tuple[str, ...], Runs]:
+def _calibration_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
     try:
         from deal_hw.cli.bench_calibrate import KEY, Cell, Protocol, make_cells, run_cell
     except ModuleNotFoundError as err:
@@ -188,10 +203,45 @@ def _calibration_runs(config: Bench) -> tuple[tuple[str, ...], Runs]:
     return KEY, [(cell.key, make(cell)) for cell in cells]
 
 
+def _real_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
+    try:
+        from deal_hw.calib.methods import check_method
+        from deal_hw.cli.bench_real import KEY, prepare, run_cell
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "bench") from err
+
+    methods = _methods(config, ("nominal", "default"))
+    for method in methods:
+        check_method(method)
+    (ratio,) = parse_ratios(config.xi)[:1]
+    xi = None if config.recordings.parameters is not None else ratio
+    task = Path(config.recordings.model or "").stem
+    work = prepare(
+        config.recordings, config.holdout, xi, config.residual_std, threads=config.threads, quiet=config.quiet
+    )
+
+    def make(method: str, seed: int) -> Callable[[], dict[str, Any]]:
+        polish = method == "default" or config.polish_all
+        return lambda: run_cell(
+            work, task, method, seed, ratio, polish=polish, std=config.residual_std, threads=config.threads,
+            budget=lambda polish: Budget(
+                population=config.population, generations=config.generations, polish=polish
+            ),
+            window_s=config.heldout_window,
+        )  # fmt: skip
+
+    cells = [(method, seed) for seed in parse_seeds(config.seeds) for method in methods]
+    keys = [(task, m, m == "default" or config.polish_all, ratio, s) for m, s in cells]
+    return KEY, [(key, make(*cell)) for key, cell in zip(keys, cells, strict=True)]
+
+
 def _line(row: Mapping[str, Any]) -> str:
     head = f"{' '.join(_group(row))} seed {row['seed']}"
     if row["error"]:
         return f"{head}: {row['error']}"
+    if row["bench"] == "real":
+        errors = (f"{name} {row[f'heldout_rmse_{name}']:.4g}" for name in ("nominal", "calibrated"))
+        return f"{head}: held-out RMSE {', '.join(errors)}, {row['seconds']:.0f} s"
     text = f"{head}: error {row['error_percent']:.2f} %, log error x100 {row['log_error_x100']:.2f}"
     text += f", {row['seconds']:.0f} s"
     if "angle_error_retrained" in row:
@@ -239,7 +289,7 @@ def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    if not rows:
+    if not rows or rows[0]["bench"] == "real":
         return
     try:
         from matplotlib.figure import Figure
@@ -266,6 +316,29 @@ def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     figure.savefig(path, dpi=130)
 
 
+def _print_real(rows: Sequence[Mapping[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="held-out RMSE in rad or m: mean over joints, all samples pooled")
+    for name in ("robot", "method", "seed", "mean", "pooled", "nominal", "at a bound", "flagged", "seconds"):
+        table.add_column(name, justify="left" if name in ("robot", "method") else "right")
+    for row in rows:
+        numbers = (
+            row.get(f"heldout_{key}") for key in ("rmse_calibrated", "pooled_calibrated", "rmse_nominal")
+        )
+        table.add_row(
+            row["task"],
+            _group(row)[-1],
+            str(row["seed"]),
+            *("diverged" if value is None else f"{value:.4f}" for value in numbers),
+            str(len(row["at_bound"])),
+            str(int(row["flagged"])),
+            f"{row['seconds']:.0f}",
+        )
+    Console(width=120).print(table)
+
+
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a line of the summary stands for."""
     method = row["method"] + (" + polish" if row.get("polish") and row["method"] != "default" else "")
@@ -279,6 +352,9 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
     from rich.table import Table
 
     good = [row for row in rows if not row["error"]]
+    if good and good[0]["bench"] == "real":
+        _print_real(good)
+        return
     table = Table(title="median over seeds (worst)")
     for name in (
         "task", "profile", "xi", "method", "seeds", "error %", "log error x100", "coverage90", "width90",

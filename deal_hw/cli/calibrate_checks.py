@@ -11,6 +11,7 @@ from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
     from deal_hw.data.checks import Verdict
+    from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
     from deal_hw.sim.episode import Episode
     from deal_hw.sim.joint_facts import JointFacts
@@ -22,17 +23,30 @@ MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "
 """Checks that mean something where commands are efforts and not positions."""
 
 
-def refuse_floating(free: str | None) -> None:
-    """Refuse a model with a free joint: there is no reader for recordings of a base yet.
+def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Recording]) -> None:
+    """Check that a floating robot's recordings say how it floats.
 
     Raises:
-        ConfigurationError: There is one.
+        ConfigurationError: There is no IMU in a recording, or no feet are named, or the base is fixed.
+        UnknownNameError: A foot is no geom of the model.
     """
-    if free is not None:
+    from deal_hw.sim.fields import element_id
+
+    free = robot.description.floating_base
+    if free is None:
+        if feet:
+            raise ConfigurationError("--feet are for a model with a free joint; this one's base is fixed")
+        return
+    without = [r for r in recordings if r.orientation is None or r.gyro is None]
+    if without or not feet:
+        lacks = "recordings of the base (orientation and gyro in the column map)" if without else "--feet"
         raise ConfigurationError(
-            f"the model floats (free joint {free!r}); recordings of a floating robot are not read yet. Hold "
-            "the robot by its trunk, record that, and remove the free joint from a copy of the MJCF"
+            f"the model floats (free joint {free!r}); that needs {lacks}: the base is followed by its IMU "
+            "and by the feet that stand (sphere geoms, floor at height 0). Or hold the robot by its trunk, "
+            "record that, and remove the free joint from a copy of the MJCF"
         )
+    for name in feet:
+        element_id(robot.model, "geom", name)
 
 
 def examine_recording(

@@ -11,9 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 from deal_hw.cli.calibrate_checks import (
     examine_recording,
-    refuse_floating,
+    require_base,
     require_visible_parameters,
     warn_of_gravity,
+)
+from deal_hw.cli.calibrate_recordings import (
+    aligned,
+    common_rates,
+    divide,
+    on_grid,
+    read_tables,
+    seconds_of,
+    without,
 )
 from deal_hw.cli.calibrate_run import Narrowing, Work
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -21,17 +30,9 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.grid import Recording
-    from deal_hw.data.importing.table import Table
-    from deal_hw.sim.describe import Sampling
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.joint_facts import JointFacts
     from deal_hw.sim.model import RobotModel
 
 HELDOUT_PART = 0.25
-STRETCH_S = 2.5
-"""Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
-HELDOUT_STRETCH_S = 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,9 +55,16 @@ class Recordings:
     write_parameters: Path | None = None
     """Write such a file for --model, to edit, and do nothing else."""
 
+    feet: tuple[str, ...] = ()
+    """Of a floating robot: its feet's sphere geoms. Base height and velocity are estimated from those that
+    stand; recordings must hold the base's orientation and gyro."""
+
     holdout_part: float | None = None
     """Without --holdout this last share of each recording only judges the result; 0.25 by default, 0 for
     none."""
+
+    leave_out: tuple[tuple[str, float, float], ...] = ()
+    """Stretches that the model has no part for, such as a contact: FILE FROM TO [s from its start]."""
 
     fit_seconds: float = 60.0
     """Fit stretches that lie evenly over the recordings and add up to so many seconds; more is slower."""
@@ -119,7 +127,7 @@ def prepare_model(
     """
     try:
         from deal_hw.data.importing.columns import read_column_map
-        from deal_hw.sim.describe import compile_model, describe, sampling
+        from deal_hw.sim.describe import compile_model, describe
         from deal_hw.sim.joint_facts import joint_facts
         from deal_hw.sim.model import load_model
     except ModuleNotFoundError as err:
@@ -141,10 +149,9 @@ def prepare_model(
     space = _space(config, narrowing, model)
     facts = joint_facts(config.model)
     columns = None if config.columns is None else read_column_map(config.columns)
-    fitted, held = (_read(paths, columns, facts, say) for paths in (config.data, holdout))
-    rates = _rates(config, [*fitted, *held], model, sampling)
+    fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
+    rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
-    refuse_floating(description.floating_base)
     verdicts = {
         table.name: examine_recording(
             table, facts, config.force, servo=description.actuation == "position", say=say
@@ -152,10 +159,14 @@ def prepare_model(
         for table in (*fitted, *held)
     }
     robot = load_model(description, rates.step_s)
-    fit_recordings = [r for table in fitted for r in _on_grid(table, robot, rates)]
-    episodes = [_align(r, robot) for r in fit_recordings]
-    judge = [_align(r, robot) for table in held for r in _on_grid(table, robot, rates)]
-    episodes, judge = _divide(episodes, judge, share, config, say)
+    fitted, held = without(config.leave_out, fitted, held)
+    fit_recordings, held_recordings = (
+        [r for table in tables for r in on_grid(table, robot, rates)] for tables in (fitted, held)
+    )
+    require_base(robot, config.feet, [*fit_recordings, *held_recordings])
+    episodes = [aligned(r, robot, config.feet) for r in fit_recordings]
+    judge = [aligned(r, robot, config.feet) for r in held_recordings]
+    episodes, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
     warn_of_gravity(robot, space, episodes, say)
     require_visible_parameters(robot, space, episodes, std(robot), config.window, threads, say)
     return Work(
@@ -174,8 +185,9 @@ def prepare_model(
             "description_digest": description.digest(),
             "recordings": [dict(table.source) for table in fitted],
             "holdout": [dict(table.source) for table in held] or f"last {share:.0%} of each recording",
-            "fitted_s": round(sum(_seconds(e) for e in episodes), 3),
-            "heldout_s": round(sum(_seconds(e) for e in judge), 3),
+            "fitted_s": round(sum(seconds_of(e) for e in episodes), 3),
+            "left_out": [list(entry) for entry in config.leave_out],
+            "heldout_s": round(sum(seconds_of(e) for e in judge), 3),
             "sampling": dataclasses.asdict(rates),
         },
         advice="name recordings of other motion with --holdout",
@@ -207,83 +219,3 @@ def _space(config: Recordings, narrowing: Narrowing, model: Any) -> ParameterSpa
     space = narrowing.apply(space)
     check_space(model, space)
     return space
-
-
-def _read(paths: Sequence[Path], columns: Any, facts: JointFacts, say: Callable[[str], None]) -> list[Table]:
-    from deal_hw.data.importing.load import load_tables
-
-    return [table for path in paths for table in load_tables(path, columns, facts.names, say)]
-
-
-def _rates(
-    config: Recordings, tables: Sequence[Table], model: Any, fit: Callable[[float, float, float], Sampling]
-) -> Sampling:
-    """Check that the recordings belong together; return how they lie on the physics grid."""
-    from deal_hw.data.importing.grid import common_period
-    from deal_hw.data.plausibility import examine, require
-
-    first = tables[0]
-    for table in tables:
-        if (table.joint_names, table.actuated) != (first.joint_names, first.actuated):
-            raise ConfigurationError(
-                f"{table.name} has positions of {', '.join(table.joint_names)} and commands of "
-                f"{', '.join(table.actuated) or 'none'}, {first.name} of {', '.join(first.joint_names)} and "
-                f"{', '.join(first.actuated) or 'none'}; calibrate them apart"
-            )
-        # A clock that is no clock has no period; say that before anything else fails on it.
-        early = ("size", "finite", "clock", "rate", "commands")
-        require([v for v in examine(table) if v.name in early], table.name)
-    timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
-    return fit(common_period(tables), timestep, config.window)
-
-
-def _on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]:
-    """Put a recording on the grid, with the gains of the model and commands in the actuators' unit."""
-    from deal_hw.data.importing.grid import Gains, to_trajectories
-
-    description = robot.description
-    gains = Gains(
-        stiffness=description.stiffness,
-        damping=description.damping,
-        effort_limit=description.effort_limit,
-        speed_limit=description.speed_limit,
-    )
-    if description.actuation == "motor":
-        model, actuators = robot.model, list(robot.actuator)
-        full = model.actuator_gear[actuators, 0] * model.actuator_gainprm[actuators, 0]
-        table = dataclasses.replace(table, target=table.target / full)
-    return to_trajectories(table, gains, rates.period_s)
-
-
-def _align(recording: Recording, robot: RobotModel) -> Episode:
-    from deal_hw.sim.episode import align, fill_gaps
-
-    return fill_gaps(align(recording.trajectory, robot.description))
-
-
-def _divide(
-    episodes: Sequence[Episode],
-    judge: Sequence[Episode],
-    share: float,
-    config: Recordings,
-    say: Callable[[str], None],
-) -> tuple[list[Episode], list[Episode]]:
-    """Return stretches to fit and stretches to judge by."""
-    from deal_hw.sim.episode_parts import split_last, spread, stretches
-
-    fit, held = list(episodes), list(judge)
-    if share > 0:
-        pairs = [split_last(e, share) for e in episodes]
-        fit, held = [first for first, _ in pairs], [last for _, last in pairs]
-    parts = [p for e in fit for p in stretches(e, max(STRETCH_S, 3 * config.window))]
-    chosen = spread(parts, config.fit_seconds)
-    if len(chosen) < len(parts):
-        say(
-            f"fitting {sum(map(_seconds, chosen)):.0f} s of {sum(map(_seconds, parts)):.0f} s, in "
-            f"{len(chosen)} stretches that lie evenly over them (--fit-seconds)"
-        )
-    return chosen, [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
-
-
-def _seconds(episode: Episode) -> float:
-    return (len(episode.sample) - 1) * episode.period_s

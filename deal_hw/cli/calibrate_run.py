@@ -202,21 +202,24 @@ def residual_std(words: Sequence[str], robot: RobotModel) -> FloatArray | None:
     """
     if not words:
         return None
-    joints = robot.description.joint_names
-    pairs = [(name, words[0]) for name in joints] if len(words) == 1 else _pairs(words)
+    names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
+    single = len(words) == 1 and robot.base is None
     given: dict[str, float] = {}
-    for name, word in pairs:
-        if name not in joints:
-            raise UnknownNameError("joint", name, joints)
+    for name, word in [(name, words[0]) for name in names] if single else _pairs(words):
+        if name not in names:
+            raise UnknownNameError("joint", name, names)
         given[name] = _positive(word)
-    if (len(words) > 1 and len(words) % 2) or set(given) != set(joints):
+    if (len(words) % 2 and not single) or set(given) != set(names):
+        whole = "" if robot.base is not None else "one number, or "
         raise ConfigurationError(
-            f"--residual-std {' '.join(words)}: give one number, or a name and a number for each of "
-            f"{', '.join(joints)}"
+            f"--residual-std {' '.join(words)}: give {whole}a name and a number for each of "
+            f"{', '.join(names)}"
         )
     C = len(robot.coordinates)
     std = np.ones(2 * C)
-    std[:C][robot.joints] = [given[name] for name in joints]
+    std[:C][robot.joints] = [given[name] for name in robot.description.joint_names]
+    if robot.base is not None:
+        std[:C][robot.rotation], std[C:][robot.rotation] = given["orientation"], given["gyro"]
     return std
 
 

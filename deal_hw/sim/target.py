@@ -1,7 +1,8 @@
 """Sim-to-sim targets: a robot whose parameters are hidden, recorded as a sensor would see it.
 
 The stand-in for a real robot in benches of robots that have no emulator on a wire: it gives an
-:class:`~deal_hw.sim.episode.Episode` on the device's grid, as aligning a recording would, and the truth beside.
+:class:`~deal_hw.sim.episode.Episode` on the device's grid, as aligning a recording would, and the
+truth beside.
 """
 
 from __future__ import annotations
@@ -11,24 +12,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import CalibrationError, ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim import chart
 from deal_hw.sim.batch import ServoBatch
 from deal_hw.sim.episode import Episode
-from deal_hw.sim.leg_odometry import HEIGHT_STD, VELOCITY_STD, leg_odometry, smooth_orientation
+from deal_hw.sim.imu_base import base_states
 from deal_hw.sim.model import RobotModel
 from deal_hw.types import FloatArray
 
 Behaviour = Callable[[FloatArray, FloatArray, float], FloatArray]
 """Command of the next control period, (A,), from reported position (C,), velocity (C,) and time [s]."""
-
-ORIENTATION_SMOOTHER = (7, 3)
-"""Samples and order of the polynomial through reported orientations."""
-
-PLACE_STD = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,22 +204,9 @@ class _Sensor:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return position, velocity, reference and spread with the base as an IMU and the legs give it."""
         robot, sensing, rng = self._robot, self._sensing, self._rng
-        T, C = position.shape
+        T = len(position)
         reported = chart.to_quaternion(rng.standard_normal((T, 3)) * sensing.orientation_std, orientation)
         gyro = velocity[:, robot.rotation] + rng.standard_normal((T, 3)) * sensing.gyro_std
-        length, order = ORIENTATION_SMOOTHER
-        reference = smooth_orientation(reported, savgol_coeffs(length, order, use="dot"))
-        period_s = stride * robot.step_s
-        joints = position[:, robot.joints]
-        speed = np.gradient(joints, period_s, axis=0)
-        for j in range(joints.shape[1]):
-            slope = savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
-            speed[length // 2 : T - length // 2, j] = np.convolve(joints[:, j], slope[::-1], mode="valid")
-        legs = leg_odometry(robot, sensing.feet, reference, gyro, joints, speed)
-        position, velocity = position.copy(), velocity.copy()
-        position[:, :2], position[:, 2] = 0.0, legs.height
-        position[:, robot.rotation] = chart.to_vector(reported, reference)
-        velocity[:, :3], velocity[:, robot.rotation] = legs.velocity, gyro
-        spread = np.full(2 * C, np.inf)
-        spread[:2], spread[2], spread[C : C + 3] = PLACE_STD, HEIGHT_STD, VELOCITY_STD
-        return position, velocity, reference, spread
+        joints, speed = position[:, robot.joints], velocity[:, robot.joints]
+        found = base_states(robot, sensing.feet, reported, gyro, joints, speed, stride * robot.step_s)
+        return found.position, found.velocity, found.reference, found.estimate_std

@@ -9,6 +9,7 @@ from deal_hw.calib.excitation import check_excitation
 from deal_hw.calib.identifiability import correlation_time, intervals, uncertainty
 from deal_hw.calib.metrics import error_percent, interval_score, log_error_x100
 from deal_hw.calib.noise import noise_model, white_noise_std
+from deal_hw.calib.null_space import null_directions, null_space
 from deal_hw.calib.pipeline import LatencyScan, PolishedMethod
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import polish
@@ -155,15 +156,19 @@ def _two(low: float = 0.2, high: float = 5.0) -> ParameterSpace:
     )
 
 
+def _unseen(space: ParameterSpace, hessian: FloatArray) -> tuple[str, ...]:
+    return null_directions(space, null_space(space, hessian))
+
+
 def test_null_direction_names_the_common_factor() -> None:
     """Information on ln a - ln b alone leaves a common factor open; on ln a + ln b: one up, one down."""
-    (words,) = null_directions(_two(), 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
+    (words,) = _unseen(_two(), 1e6 * np.array([[1.0, -1.0], [-1.0, 1.0]]))
     assert "common factor" in words and "a" in words and "b" in words
-    (words,) = null_directions(_two(), 1e6 * np.array([[1.0, 1.0], [1.0, 1.0]]))
+    (words,) = _unseen(_two(), 1e6 * np.array([[1.0, 1.0], [1.0, 1.0]]))
     assert "raised while" in words
-    (words,) = null_directions(_two(), np.diag([1e6, 0.0]))
+    (words,) = _unseen(_two(), np.diag([1e6, 0.0]))
     assert words.startswith("b leaves no trace")
-    assert null_directions(_two(), np.diag([1e6, 1e6])) == ()
+    assert _unseen(_two(), np.diag([1e6, 1e6])) == ()
 
 
 def test_k11_names_its_null_directions_on_real_information(noisy: Demonstration) -> None:
@@ -173,14 +178,14 @@ def test_k11_names_its_null_directions_on_real_information(noisy: Demonstration)
     theta = np.array([noisy.truth.parameters[name] for name in space.names])
     shooting = Shooting(problem, 80)
     hessian = shooting.normal(shooting.start(theta, noisy.truth.latency_s, [noisy.fit_truth])).hessian
-    words = null_directions(space, hessian[:-1, :-1])
+    words = _unseen(space, hessian[:-1, :-1])
     assert len(words) == 2
     assert all("mass" in text for text in words)
     assert sum(any(name in text for text in words) for name in space.names) >= 9
     # Measured with ruler and scale, nothing of that is left.
     k9 = noisy.space
     kept = [space.names.index(name) for name in k9.names]
-    assert null_directions(k9, hessian[np.ix_(kept, kept)]) == ()
+    assert _unseen(k9, hessian[np.ix_(kept, kept)]) == ()
 
 
 def test_intervals_of_what_the_data_cannot_see_are_the_ranges() -> None:

@@ -126,6 +126,16 @@ def test_last_part_is_held_out_and_noise_can_be_said(folder: Path, tmp_path: Pat
     assert found["chi2"] < 0.1  # Ten times the noise that there is.
 
 
+def test_stretches_are_left_out(folder: Path, tmp_path: Path) -> None:
+    """Two of six seconds: 100 of 300 samples are gone, and the recording is in two parts."""
+    words = command(folder, "--leave-out", "rec", "2", "4", "--no-polish", "--no-report", "--quiet")
+    words += ["--generations", "1", "--holdout-part", "0"]
+    assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
+    provenance = json.loads((tmp_path / "calibration" / "result.json").read_text())["provenance"]
+    assert provenance["fitted_s"] == pytest.approx(3.96, abs=1e-3)
+    assert provenance["left_out"] == [["rec", 2.0, 4.0]]
+
+
 def test_parameters_are_written_and_read(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -223,6 +233,8 @@ def test_bad_recordings_are_refused(
         (["--physics-step", "0"], "physics step"),
         (["--window", "9"], "no window"),
         (["--heldout-window", "4"], "held-out recordings are too short"),
+        (["--leave-out", "nothing.csv", "0", "1"], "no such recording; they are rec.csv"),
+        (["--leave-out", "rec.csv", "0", "99"], "leaves nothing of rec.csv"),
         (["--space", "k9"], "--parameters"),
     ],
 )

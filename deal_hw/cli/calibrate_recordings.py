@@ -1,0 +1,179 @@
+"""From files to what a calibration fits and judges by: reading, leaving out, gridding, dividing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from deal_hw.data.importing.columns import ColumnMap
+    from deal_hw.data.importing.grid import Recording
+    from deal_hw.data.importing.table import Table
+    from deal_hw.sim.describe import Sampling
+    from deal_hw.sim.episode import Episode
+    from deal_hw.sim.model import RobotModel
+
+STRETCH_S = 2.5
+"""Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
+HELDOUT_STRETCH_S = 20.0
+
+
+def read_tables(
+    paths: Sequence[Path], columns: ColumnMap | None, joints: Sequence[str], say: Callable[[str], None]
+) -> list[Table]:
+    """Return the recordings in files, in SI units, on their own stamps."""
+    from deal_hw.data.importing.load import load_tables
+
+    return [table for path in paths for table in load_tables(path, columns, joints, say)]
+
+
+def common_rates(
+    tables: Sequence[Table], model: Any, physics_step_s: float | None, window_s: float
+) -> Sampling:
+    """Check that recordings belong together; return how they lie on the physics grid.
+
+    Args:
+        tables: All of them.
+        model: The MjModel.
+        physics_step_s: Wanted physics step; None for the model's [s].
+        window_s: Length of a search's longest windows [s].
+
+    Raises:
+        ConfigurationError: They have different joints, or a setting cannot be used.
+        DatasetError: A clock is no clock, or rates differ.
+    """
+    from deal_hw.data.importing.grid import common_period
+    from deal_hw.data.plausibility import examine, require
+    from deal_hw.sim.describe import sampling
+
+    first = tables[0]
+    for table in tables:
+        if (table.joint_names, table.actuated) != (first.joint_names, first.actuated):
+            raise ConfigurationError(
+                f"{table.name} has positions of {', '.join(table.joint_names)} and commands of "
+                f"{', '.join(table.actuated) or 'none'}, {first.name} of {', '.join(first.joint_names)} and "
+                f"{', '.join(first.actuated) or 'none'}; calibrate them apart"
+            )
+        # A clock that is no clock has no period; say that before anything else fails on it.
+        early = ("size", "finite", "clock", "rate", "commands")
+        require([v for v in examine(table) if v.name in early], table.name)
+    timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
+    return sampling(common_period(tables), timestep, window_s)
+
+
+def without(
+    left_out: Sequence[tuple[str, float, float]], *groups: Sequence[Table]
+) -> tuple[list[Table], ...]:
+    """Return the recordings without the samples of some stretches; what is left is split there.
+
+    Raises:
+        ConfigurationError: A file is not among them, or a stretch has no samples.
+    """
+    wanted = list(left_out)
+    found: list[list[Table]] = []
+    for tables in groups:
+        kept = []
+        for table in tables:
+            keep = np.ones(len(table.time_s), dtype=bool)
+            names = (table.source["file"], Path(table.source["file"]).stem)
+            for entry in [e for e in wanted if e[0] in names]:
+                keep &= (table.time_s < entry[1]) | (table.time_s >= entry[2])
+                wanted.remove(entry)
+            kept.append(table if keep.all() else _rows(table, keep))
+        found.append(kept)
+    if wanted:
+        known = ", ".join(table.source["file"] for tables in groups for table in tables)
+        raise ConfigurationError(f"--leave-out {wanted[0][0]}: no such recording; they are {known}")
+    return tuple(found)
+
+
+def _rows(table: Table, keep: Any) -> Table:
+    if not keep.any():
+        raise ConfigurationError(f"--leave-out leaves nothing of {table.name}; leave out the file instead")
+    optional = {
+        name: None if values is None else values[keep]
+        for name, values in (
+            ("velocity", table.velocity), ("effort", table.effort),
+            ("orientation", table.orientation), ("gyro", table.gyro),
+        )
+    }  # fmt: skip
+    return dataclasses.replace(
+        table,
+        time_s=table.time_s[keep],
+        position=table.position[keep],
+        **optional,  # type: ignore[arg-type]
+    )
+
+
+def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]:
+    """Put a recording on the grid, with the gains of the model and commands in the actuators' unit."""
+    from deal_hw.data.importing.grid import Gains, to_trajectories
+
+    description = robot.description
+    gains = Gains(
+        stiffness=description.stiffness,
+        damping=description.damping,
+        effort_limit=description.effort_limit,
+        speed_limit=description.speed_limit,
+    )
+    if description.actuation == "motor":
+        model, actuators = robot.model, list(robot.actuator)
+        full = model.actuator_gear[actuators, 0] * model.actuator_gainprm[actuators, 0]
+        table = dataclasses.replace(table, target=table.target / full)
+    return to_trajectories(table, gains, rates.period_s)
+
+
+def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...]) -> Episode:
+    """Return a recording on the physics grid, with the base where the robot floats."""
+    from deal_hw.sim.episode import align, fill_gaps
+    from deal_hw.sim.imu_base import with_base
+
+    episode = align(recording.trajectory, robot.description)
+    if recording.orientation is not None and recording.gyro is not None and robot.base is not None:
+        episode = with_base(episode, robot, feet, recording.orientation, recording.gyro)
+    return fill_gaps(episode)
+
+
+def divide(
+    episodes: Sequence[Episode],
+    judge: Sequence[Episode],
+    share: float,
+    fit_seconds: float,
+    window_s: float,
+    say: Callable[[str], None],
+) -> tuple[list[Episode], list[Episode]]:
+    """Return stretches to fit and stretches to judge by.
+
+    Args:
+        episodes: Recordings to fit.
+        judge: Recordings that only judge.
+        share: Share of each fitted recording, its last part, that only judges as well.
+        fit_seconds: How much to fit, spread evenly [s].
+        window_s: Length of a search's longest windows [s].
+        say: Told where not all is fitted.
+    """
+    from deal_hw.sim.episode_parts import split_last, spread, stretches
+
+    fit, held = list(episodes), list(judge)
+    if share > 0:
+        pairs = [split_last(e, share) for e in episodes]
+        fit, held = [first for first, _ in pairs], [last for _, last in pairs]
+    parts = [p for e in fit for p in stretches(e, max(STRETCH_S, 3 * window_s))]
+    chosen = spread(parts, fit_seconds)
+    if len(chosen) < len(parts):
+        say(
+            f"fitting {sum(map(seconds_of, chosen)):.0f} s of {sum(map(seconds_of, parts)):.0f} s, in "
+            f"{len(chosen)} stretches that lie evenly over them (--fit-seconds)"
+        )
+    return chosen, [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
+
+
+def seconds_of(episode: Episode) -> float:
+    """Return the length of an episode [s]."""
+    return (len(episode.sample) - 1) * episode.period_s
