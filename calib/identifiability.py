@@ -42,6 +42,9 @@ PRIOR_BLOCKS = 4.0
 
 MISMATCH_CHI2 = 1.3
 MISMATCH_TIME = 2.0
+NEGLIGIBLE_CHI2 = 0.5
+"""Residuals this far below the noise need no explanation, however they hang together."""
+
 _LAGS = 12
 
 
@@ -306,7 +309,7 @@ def _alarms(
             f"the model does not explain the recording: residuals are {np.sqrt(chi2):.1f} times the "
             "sensor noise (friction law, backlash, jittering delay, or a range that is too narrow)"
         )
-    if tau > MISMATCH_TIME:
+    if chi2 > NEGLIGIBLE_CHI2 and tau > MISMATCH_TIME:
         alarms.append(
             f"residuals hang together over {tau:.1f} samples where noise would not: something moves that "
             "the model does not have (friction law, backlash or a varying delay)"

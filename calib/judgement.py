@@ -10,7 +10,13 @@ import numpy as np
 
 from deal_hw.calib.diagnosis import Finding, diagnose, motions
 from deal_hw.calib.halves import compare_halves, heed
-from deal_hw.calib.identifiability import MISMATCH_CHI2, MISMATCH_TIME, Uncertainty, correlation_time
+from deal_hw.calib.identifiability import (
+    MISMATCH_CHI2,
+    MISMATCH_TIME,
+    NEGLIGIBLE_CHI2,
+    Uncertainty,
+    correlation_time,
+)
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import Polished
 
@@ -37,6 +43,8 @@ class Validation:
 
 def unexplained(polished: Polished) -> bool:
     """Return whether the residual is larger, or hangs together longer, than noise does."""
+    if polished.chi2 <= NEGLIGIBLE_CHI2:
+        return False
     return polished.chi2 > MISMATCH_CHI2 or correlation_time(polished.normal.residual) > MISMATCH_TIME
 
 

@@ -132,7 +132,7 @@ def _cartpole(ask: _Ask) -> Case:
         recordings.append(virtual.run(make_behaviour(plan, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
     # The truth is of K9; what else may be searched has its nominal value.
-    values = space.known | {p.name: p.nominal for p in space} | truth.parameters
+    values = space.known | {p.name: p.nominal for p in space} | dict(truth.parameters)
     return Case(
         task="cartpole", profile=profile, seed=seed, robot=load_model(DESCRIPTION), space=space,
         theta=np.array([values[name] for name in space.names]), latency_s=truth.latency_s, fit=fit,

@@ -16,7 +16,7 @@ IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def to_quaternion(rotation_vector: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return the orientations, (..., 4), that lie at rotation vectors, (..., 3), from references, (..., 4)."""
+    """Return the orientations, (..., 4), at rotation vectors, (..., 3), from references, (..., 4)."""
     shape = np.broadcast_shapes(rotation_vector.shape[:-1], reference.shape[:-1])
     step = _rotation(np.broadcast_to(rotation_vector, (*shape, 3)), vectors=True)
     whole = _rotation(np.broadcast_to(reference, (*shape, 4))) * step

@@ -167,6 +167,9 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
     def line(values: FloatArray) -> FloatArray:
         return np.stack([np.interp(regular, episode.sample, column) for column in values.T], axis=1)
 
+    def whole(std: FloatArray) -> FloatArray:
+        return np.broadcast_to(std, (len(episode.sample), 2 * episode.position.shape[1]))
+
     # A sample before a gap was marked as unusable for that alone; what counts now is whether the gap is
     # bridged.
     sound = both & ((episode.usable) | (np.diff(episode.sample, append=episode.sample[-1]) > stride))
@@ -178,9 +181,7 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
         usable=sound[before] & sound[after] & bridged,
         reported=reported,
         reference=None if episode.reference is None else episode.reference[after],
-        estimate_std=None
-        if episode.estimate_std is None
-        else np.broadcast_to(episode.estimate_std, (len(episode.sample), 2 * episode.position.shape[1]))[after],
+        estimate_std=None if episode.estimate_std is None else whole(episode.estimate_std)[after],
     )
 
 

@@ -65,8 +65,8 @@ def standing_targets(
             joints = joints + np.linalg.lstsq(np.concatenate(rows), error, rcond=None)[0]
         else:
             raise ConfigurationError(
-                f"no joint positions keep the feet where they are when the body moves by {shift[t].round(3)} m, "
-                f"{turn[t].round(3)} rad; move it less"
+                f"no joint positions keep the feet where they are when the body moves by {shift[t].round(3)} "
+                f"m, {turn[t].round(3)} rad; move it less"
             )
         found[t] = joints
     return found
