@@ -9,6 +9,8 @@ from deal_hw.errors import InsufficientDataError
 
 SHORTEST_S = 1.0
 LEAST_NOISE_RATIO = 20.0
+LEAST_CHOSEN_RATIO = 5.0
+"""The same where the noise was chosen: allowing for what the model lacks, it is far above the sensor's."""
 
 
 def check_excitation(problem: Problem) -> None:
@@ -27,10 +29,11 @@ def check_excitation(problem: Problem) -> None:
     joints = problem.robot.joints
     spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
+    least = LEAST_NOISE_RATIO if problem.known_std is None else LEAST_CHOSEN_RATIO
     still = [
         f"{name} moved {span:.2g} (noise {noise:.2g})"
         for name, span, noise in zip(names, spans, noises, strict=True)
-        if span < LEAST_NOISE_RATIO * noise
+        if span < least * noise
     ]
     if still:
         raise InsufficientDataError(f"the recording hardly moves: {'; '.join(still)}; {advice}")

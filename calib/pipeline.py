@@ -172,6 +172,9 @@ class PolishedMethod(CalibrationMethod[Problem]):
         """Return what inner folds say of the polish; None where it explains the recording."""
         if not self.settings.folds or not unexplained(polished):
             return None
+        if problem.robot.base is not None:
+            # A fold is a search and a polish; with contacts these take a minute each.
+            return None
         if progress is not None:
             progress(Progress("folds", 0, 1, "does the polish help on what it has not seen?"))
         robust = self.settings.robust and kurtosis(polished.normal.residual) > HEAVY_TAILS

@@ -31,6 +31,9 @@ SHAKES = (0.5, 0.25, 0.12)
 """Spreads of the start states that are drawn where the solver got stuck, in standard deviations."""
 
 SHAKE_COUNT = 60
+CONTACT_STAGES_S = (0.2, 0.4)
+"""Where feet touch the floor longer windows add more kinks than information."""
+
 
 EXACT_WINDOW_S = 0.1
 EXACT_ROUNDS = 8
@@ -74,7 +77,7 @@ def polish(
     problem: Problem,
     theta: FloatArray,
     latency_s: float,
-    stages_s: Sequence[float] = STAGES_S,
+    stages_s: Sequence[float] | None = None,
     iterations: int = 12,
     fixed_latency: bool = False,
     notify: Callable[[int, float], None] | None = None,
@@ -87,8 +90,8 @@ def polish(
         problem: The problem.
         theta: Start, (K,).
         latency_s: Start latency [s].
-        stages_s: Window lengths, in order [s].
-        iterations: Most iterations a stage.
+        stages_s: Window lengths, in order [s]; the usual ones by default.
+        iterations: Most iterations of the solver at a time.
         fixed_latency: Keep the latency.
         notify: Called with iterations done and chi2.
         states: Where the first stage's windows start; the smoothed states by default.
@@ -101,6 +104,8 @@ def polish(
     theta = np.clip(theta, space.low, space.high)
     if problem.exact:
         return _polish_exact(problem, theta, latency_s, EXACT_ROUNDS if shake else 1, notify)
+    contacts = problem.robot.base is not None
+    stages_s = stages_s or (CONTACT_STAGES_S if contacts else STAGES_S)
     result: Polished | None = None
     # Fixed: a polish is part of the data's analysis, not of the search's luck.
     rng = np.random.default_rng(0)

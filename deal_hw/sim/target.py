@@ -148,7 +148,7 @@ class _Sensor:
         return seen
 
     def _noisy(self, joints: FloatArray) -> FloatArray:
-        noisy = joints + self._rng.standard_normal(joints.shape) * self._sensing.joint_std
+        noisy = joints + self._rng.standard_normal(joints.shape) * np.array(self._sensing.joint_std)
         if self._sensing.joint_resolution:
             noisy = np.round(noisy / self._sensing.joint_resolution) * self._sensing.joint_resolution
         return np.asarray(noisy)
