@@ -35,6 +35,9 @@ _SUMMARY_ONLY = {
     Opcode.SUMMARY_OFFSET,
     Opcode.FOOTER,
 }
+_CHUNK_FIELDS = 8 + 8 + 8 + 4 + 4 + 8
+"""Bytes of a chunk beside its compression's name and its records."""
+
 _TYPES: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
@@ -135,6 +138,9 @@ def _parse(opcode: int, body: bytes, offset: int) -> Found | str | bool:
     try:
         record: McapRecord = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
         if isinstance(record, Chunk):
+            # A length that grew would swallow the chunks behind it, and the library reads only what it needs.
+            if len(body) != _CHUNK_FIELDS + len(record.compression.encode()) + len(record.data):
+                return "a chunk of a wrong length"
             return Found(offset, record, tuple(breakup_chunk(record, validate_crc=True)))
         builder = RecordBuilder()
         record.write(builder)

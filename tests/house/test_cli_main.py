@@ -246,7 +246,8 @@ def test_example_of_each_verb_parses(name: str) -> None:
 def commands_in_docs() -> list[str]:
     """Return every complete `deal-hw VERB ...` line in the code blocks of the README and the docs."""
     texts = [
-        path.read_text(encoding="utf-8")
+        # A backslash at its end continues a line.
+        re.sub(r"\\\n\s*", " ", path.read_text(encoding="utf-8"))
         for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
     ]
     lines = [
