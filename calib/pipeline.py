@@ -122,7 +122,8 @@ class PolishedMethod(CalibrationMethod[Problem]):
         if scan is not None and whole:
             known = _average(problem, scan, known)
         known, facts = judge(problem, polished, known, self.settings)
-        provenance = dict(searched.provenance) | {
+        # What the search says of its own interval does not hold for these.
+        provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
             "search": searched.method,
             "search_seconds": searched.seconds,
             "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
