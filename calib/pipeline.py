@@ -224,7 +224,16 @@ def polish_from(problem: Problem, searched: CalibrationResult, progress: Progres
         if progress is not None:
             progress(Progress("polish", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
 
-    return polish(problem, searched.estimate, latency, fixed_latency=fixed, notify=notify)
+    def run(settle: bool) -> Polished:
+        return polish(problem, searched.estimate, latency, fixed_latency=fixed, notify=notify, settle=settle)
+
+    settled = run(True)
+    if problem.exact or problem.robot.base is not None:
+        return settled
+    # Kinks make several minima (a speed limit for a latency); the two ways to move start states end in
+    # different ones often enough to be worth a second polish, which is cheap beside the search.
+    free = run(False)
+    return free if _better(free, settled) else settled
 
 
 def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallback | None) -> LatencyScan:

@@ -83,6 +83,7 @@ def polish(
     notify: Callable[[int, float], None] | None = None,
     states: States | None = None,
     shake: bool = True,
+    settle: bool = True,
 ) -> Polished:
     """Polish parameters from a start.
 
@@ -96,6 +97,7 @@ def polish(
         notify: Called with iterations done and chi2.
         states: Where the first stage's windows start; the smoothed states by default.
         shake: Search other start states where contacts leave the solver stuck.
+        settle: Move start states only where that helps their window.
 
     Raises:
         InsufficientDataError: Not even the shortest window fits.
@@ -117,6 +119,7 @@ def polish(
             if result is None:
                 raise
             break
+        shooting.settle = settle
         start = shooting.start(theta, latency_s, states)
         free = len(space) + (0 if fixed_latency else 1)
         spreads = SHAKES if shake else ()

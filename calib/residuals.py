@@ -106,6 +106,8 @@ class Shooting:
         self, problem: Problem, length: int, offset: int = 0, data: Sequence[WindowData] | None = None
     ) -> None:
         self.problem = problem
+        self.settle = True
+        """Whether start states only move where that helps their window; see :meth:`settled`."""
         self.data: Sequence[WindowData] = problem.windows(length, offset=offset) if data is None else data
         self.length = length
         mean, std = problem.space.prior
@@ -245,7 +247,7 @@ class Shooting:
         """
         # Where feet touch the floor nearly all windows have kinks; parameters that step without their start
         # states end in another basin (17 % off in damping on one tuning seed). There states are drawn anew.
-        if self.problem.exact or self.problem.robot.base is not None:
+        if self.problem.exact or self.problem.robot.base is not None or not self.settle:
             return normal
         C, values, back = self.problem.coordinates, np.repeat(point.value[None], 2, axis=0), []
         for e, (gain, shift) in enumerate(normal.back):
