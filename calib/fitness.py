@@ -144,6 +144,10 @@ class Stateless:
     ) -> None:
         self._problem, self._settings = problem, settings
         self.values: dict[str, float] = {}
+        self._prepare(policy, rng)
+
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        """Make what scoring needs."""
 
     def save(self) -> dict[str, Any]:
         """Return nothing."""
@@ -156,14 +160,7 @@ class Stateless:
 class FlatFitness(Stateless):
     """The same number for every member: a search that cannot see the data."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: FitnessSettings,
-        policy: PopulationPolicy | None,
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(problem, settings, policy, rng)
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
         # The critic's seed, which nobody reads: search and null row then see the same random numbers.
         rng.integers(2**62)
 
@@ -180,16 +177,9 @@ class TrajectoryFitness(Stateless):
     generations, or scores would not compare.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: FitnessSettings,
-        policy: PopulationPolicy | None,
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(problem, settings, policy, rng)
-        self._windows = cut(problem, settings.horizon_ticks)
-        coordinates = Coordinates(problem)
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        self._windows = cut(self._problem, self._settings.horizon_ticks)
+        coordinates = Coordinates(self._problem)
         self._centre = coordinates.members(np.full((1, coordinates.count), 0.5))
         # Made on first use and kept: a small population's call costs less than its metric.
         self._whitenings: list[Whitening] | None = None
@@ -237,15 +227,8 @@ class RolloutView:
 class EnergyFitness(Stateless):
     """Minus the energy distance between the recording's transitions and the member's own."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: FitnessSettings,
-        policy: PopulationPolicy | None,
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(problem, settings, policy, rng)
-        self._view = RolloutView(problem, settings.ticks, policy)
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        self._view = RolloutView(self._problem, self._settings.ticks, policy)
         self._real = self._view.real.astype(np.float64)
 
     def score(self, members: Members) -> FloatArray:
@@ -263,15 +246,9 @@ class EnergyFitness(Stateless):
 class KernelFitness(EnergyFitness):
     """Minus the squared maximum mean discrepancy (Gaussian kernel) between the same transitions."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        settings: FitnessSettings,
-        policy: PopulationPolicy | None,
-        rng: np.random.Generator,
-    ) -> None:
-        super().__init__(problem, settings, policy, rng)
-        self._bandwidth = settings.bandwidth or float(np.median(pdist(self._real)))
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        super()._prepare(policy, rng)
+        self._bandwidth = self._settings.bandwidth or float(np.median(pdist(self._real)))
 
     def _distance(self, samples: FloatArray) -> float:
         return squared_mmd(self._real, samples, self._bandwidth)

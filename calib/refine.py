@@ -114,12 +114,11 @@ def polish(
     done = 0
     for seconds in stages_s:
         try:
-            shooting = Shooting(problem, samples_in(problem, seconds))
+            shooting = Shooting(problem, samples_in(problem, seconds), settle=settle)
         except InsufficientDataError:
             if result is None:
                 raise
             break
-        shooting.settle = settle
         start = shooting.start(theta, latency_s, states)
         free = len(space) + (0 if fixed_latency else 1)
         spreads = SHAKES if shake else ()

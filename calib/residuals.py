@@ -100,14 +100,19 @@ class Shooting:
         length: Samples a window predicts.
         offset: First sample that may start a window.
         data: The windows, where they are not all that the recordings hold.
+        settle: Move start states only where that helps their window; see :meth:`settled`.
     """
 
     def __init__(
-        self, problem: Problem, length: int, offset: int = 0, data: Sequence[WindowData] | None = None
+        self,
+        problem: Problem,
+        length: int,
+        offset: int = 0,
+        data: Sequence[WindowData] | None = None,
+        settle: bool = True,
     ) -> None:
         self.problem = problem
-        self.settle = True
-        """Whether start states only move where that helps their window; see :meth:`settled`."""
+        self._settle = settle and problem.robot.base is None and not problem.exact
         self.data: Sequence[WindowData] = problem.windows(length, offset=offset) if data is None else data
         self.length = length
         mean, std = problem.space.prior
@@ -247,7 +252,7 @@ class Shooting:
         """
         # Where feet touch the floor nearly all windows have kinks; parameters that step without their start
         # states end in another basin (17 % off in damping on one tuning seed). There states are drawn anew.
-        if self.problem.exact or self.problem.robot.base is not None or not self.settle:
+        if not self._settle:
             return normal
         C, values, back = self.problem.coordinates, np.repeat(point.value[None], 2, axis=0), []
         for e, (gain, shift) in enumerate(normal.back):

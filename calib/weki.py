@@ -71,8 +71,7 @@ class _Weki(KalmanStepper):
         super().__init__(run, rng, settings.step_clip)
         self._settings = settings
         problem = run.problem
-        noisy = is_noisy(problem) and not problem.exact
-        self._lengths = settings.noisy_ticks if noisy else settings.clean_ticks
+        self._lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
         self._brief = settings.before_polish and (problem.robot.base is not None or problem.exact)
         if self._brief:
             self._lengths = self._lengths[:1]

@@ -50,9 +50,16 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
 
 
 def examine_recording(
-    table: Table, facts: JointFacts, force: bool, *, servo: bool, say: Callable[[str], None]
+    table: Table, facts: JointFacts | None, force: bool, *, servo: bool = True, say: Callable[[str], None]
 ) -> list[Verdict]:
     """Check a recording and tell what is wrong; return what is worth keeping.
+
+    Args:
+        table: The recording.
+        facts: The model's joints, for their limits; None without a model.
+        force: Go on although a check failed.
+        servo: Commands are positions; efforts are not compared with positions.
+        say: Takes each finding in words.
 
     Raises:
         DatasetError: A check failed, and that is not to be overlooked.
@@ -61,7 +68,9 @@ def examine_recording(
     from deal_hw.data.plausibility import examine, require
     from deal_hw.errors import DatasetError
 
-    limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
+    limits = None
+    if facts is not None:
+        limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
     found = [v for v in examine(table, limits) if v.severity is not Severity.OK]
     if not servo:
         found = [v for v in found if v.name in MOTOR_CHECKS]

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from deal_hw.data.checks import Severity
-from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.cli.calibrate_checks import examine_recording
+from deal_hw.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from deal_hw.data.importing.table import Table
     from deal_hw.sim.joint_facts import JointFacts
 
 
@@ -78,7 +77,10 @@ def import_recordings(config: Import) -> int:
     given = None if config.description is None else _description(config.description)
     joints = given["joint_names"] if given is not None else None if facts is None else facts.names
     tables = [table for path in config.paths for table in load_tables(path, columns, joints, _say)]
-    problems = {table.name: _examine(table, facts, config.force) for table in tables}
+    problems = {
+        table.name: [v.to_json() for v in examine_recording(table, facts, config.force, say=_say)]
+        for table in tables
+    }
     period = common_period(tables)
     recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
     for part in recordings:
@@ -160,25 +162,3 @@ def _description(path: Path) -> dict[str, Any]:
             f"description {path} lacks {', '.join(missing)}; see `description` in a dataset.json"
         )
     return values
-
-
-def _examine(table: Table, facts: JointFacts | None, force: bool) -> list[dict[str, Any]]:
-    """Check a recording and tell what is wrong; return what is worth keeping.
-
-    Raises:
-        DatasetError: A check failed, and that is not to be overlooked.
-    """
-    from deal_hw.data.plausibility import examine, require
-
-    limits = None
-    if facts is not None:
-        limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    verdicts = [verdict for verdict in examine(table, limits) if verdict.severity is not Severity.OK]
-    for verdict in verdicts:
-        _say(f"{table.name}: {verdict.severity} {verdict.name}: {verdict.message}")
-    if not force:
-        try:
-            require(verdicts, table.name)
-        except DatasetError as error:
-            raise DatasetError(f"{error}. Correct the column map, or overrule with --force") from error
-    return [verdict.to_json() for verdict in verdicts]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,19 @@ class Segment:
                 raise ConfigurationError(
                     f"segment factor {name} is {getattr(self, name)!r}; it must be above 0"
                 )
+
+
+def segment_command(
+    description: RobotDescription, segments: Sequence[Segment], target: FloatArray, fraction: float
+) -> JointCommand:
+    """Return the command for a target, with the factors of the first segment that holds here."""
+    for part in segments:
+        if part.start <= fraction < part.stop:
+            return position_command(
+                description, target, stiffness=part.stiffness, damping=part.damping,
+                effort_limit=part.effort_limit, speed_limit=part.speed_limit,
+            )  # fmt: skip
+    return position_command(description, target)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,14 +122,9 @@ class RichBehaviour:
         return self._scaled(self._target, time_s)
 
     def _scaled(self, target: FloatArray, time_s: float) -> JointCommand:
-        fraction = time_s / self._config.duration_s
-        for part in self._config.segments:
-            if part.start <= fraction < part.stop:
-                return position_command(
-                    self._description, target, stiffness=part.stiffness, damping=part.damping,
-                    effort_limit=part.effort_limit, speed_limit=part.speed_limit,
-                )  # fmt: skip
-        return position_command(self._description, target)
+        return segment_command(
+            self._description, self._config.segments, target, time_s / self._config.duration_s
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,8 +15,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from deal_hw.control.behaviours import Behaviour, position_command
-from deal_hw.control.excitation import Segment
+from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.excitation import Segment, segment_command
 from deal_hw.control.excitation_limits import centre, fit_to_limits, room
 from deal_hw.control.waveforms import (
     Arrangement,
@@ -331,11 +331,4 @@ class ExcitationBehaviour:
         return 1.0 - float(ease(np.array([since]), float("inf"), self._plan.ease_s)[0])
 
     def _scaled(self, target: FloatArray, time_s: float) -> JointCommand:
-        fraction = time_s / self._plan.seconds
-        for part in self._plan.segments:
-            if part.start <= fraction < part.stop:
-                return position_command(
-                    self._description, target, stiffness=part.stiffness, damping=part.damping,
-                    effort_limit=part.effort_limit, speed_limit=part.speed_limit,
-                )  # fmt: skip
-        return position_command(self._description, target)
+        return segment_command(self._description, self._plan.segments, target, time_s / self._plan.seconds)
