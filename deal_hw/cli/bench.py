@@ -295,24 +295,29 @@ def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         from matplotlib.figure import Figure
     except ModuleNotFoundError as err:
         raise MissingExtraError("matplotlib", "bench") from err
+    trained = [row for row in rows if "angle_error_retrained" in row]
     figure = Figure(figsize=(7.5, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    for i, method in enumerate(methods):
+    panels = figure.subplots(1, 1 + bool(trained), width_ratios=(3, 2)[: 1 + bool(trained)], squeeze=False)[0]
+    left = panels[0]
+    groups = list(dict.fromkeys(_group(row) for row in rows))
+    # Only what tells the groups apart is worth a label's room.
+    told = [i for i, column in enumerate(zip(*groups, strict=True)) if len(set(column)) > 1] or [-1]
+    for i, group in enumerate(groups):
         # An exact result has no place on a log scale.
-        values = [max(row["log_error_x100"], 1e-3) for row in rows if row["method"] == method]
+        values = [max(row["log_error_x100"], 1e-3) for row in rows if _group(row) == group]
         left.plot([i] * len(values), values, "o", alpha=0.6, color=f"C{i}")
-    left.set_xticks(range(len(methods)), methods, rotation=30, ha="right")
+    labels = [" ".join(group[i] for i in told) for group in groups]
+    left.set_xticks(range(len(groups)), labels, rotation=30, ha="right")
     left.set_yscale("log")
     left.set_ylabel("100 mean |ln(p / p*)|")
-    left.set_title("parameter error, one point a seed", fontsize=10)
-    trained = [row for row in rows if "angle_error_retrained" in row]
+    left.set_title("parameter error, one point a seed (below 1e-3: drawn at 1e-3)", fontsize=10)
     for row in trained:
+        right = panels[1]
         values = [row[f"angle_error_{name}"] for name in ("udr", "retrained", "oracle")]
         right.plot(range(3), values, "o-", alpha=0.5, color="C0", linewidth=0.8)
-    right.set_xticks(range(3), ["UDR", "retrained", "oracle"])
-    right.set_yscale("log")
-    right.set_title("pole-angle error [rad]" if trained else "no policies trained", fontsize=10)
+        right.set_xticks(range(3), ["UDR", "retrained", "oracle"])
+        right.set_yscale("log")
+        right.set_title("pole-angle error [rad]", fontsize=10)
     figure.savefig(path, dpi=130)
 
 
