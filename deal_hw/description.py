@@ -39,6 +39,44 @@ class SensorModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LegLimits:
+    """What the safety module enforces on a robot with legs, beyond :class:`SafetyLimits`.
+
+    Attributes:
+        effort: Largest predicted P-D effort of a command, (A,) [N·m]; targets are moved to keep it.
+        tilt: Leaning further than this trips, angle between the base's z axis and the vertical [rad]; infinite
+            for a robot whose base is held.
+        tumble: Turning faster than this trips, any axis of the base [rad/s].
+        free_fall: A specific force below this [m/s²] for ``free_fall_s`` is a fall.
+        free_fall_s: See there [s].
+        flail_velocity: A joint that is faster than this for ``flail_s`` without a break flails, (J,) [rad/s].
+        flail_s: See there [s].
+        temperature: A hotter motor trips [°C].
+        lost_rate: A motor that misses more commands a second than this trips [1/s].
+        battery: A lower state of charge refuses to arm [0..1].
+        battery_low: A lower one trips [0..1].
+        voltage: A lower supply voltage trips [V].
+        arm_voltage: A lower one refuses to arm [V]; 0: the same as ``voltage``.
+        command_age_s: The robot must have been sent a command within this time [s].
+    """
+
+    effort: tuple[float, ...]
+    tilt: float
+    tumble: float
+    free_fall: float
+    free_fall_s: float
+    flail_velocity: tuple[float, ...]
+    flail_s: float
+    temperature: float
+    lost_rate: float
+    battery: float
+    battery_low: float
+    voltage: float
+    command_age_s: float
+    arm_voltage: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
     """What the safety filter enforces, arrays as tuples in the order of the actuated joints (A) unless said.
 
@@ -55,6 +93,9 @@ class SafetyLimits:
         state_age_s: Older states trip [s].
         action_age_s: A policy that is later than this trips [s].
         ease_in_s: Time over which control is handed to the policy [s].
+        silence_s: A control process without a heartbeat for this long is stalled, and the supervisor kills it
+            [s].
+        legs: For a robot with legs; None for others.
     """
 
     target: tuple[tuple[float, float], ...]
@@ -69,6 +110,8 @@ class SafetyLimits:
     state_age_s: float
     action_age_s: float
     ease_in_s: float
+    silence_s: float = 0.3
+    legs: LegLimits | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +131,7 @@ class RobotDescription:
         control_rate_hz: Rate of commands.
         device_rate_hz: Rate of the P-D loop inside the device.
         state_rate_hz: Rate of state samples.
+        repeat_rate_hz: Rate at which the driver sends the command in force again; 0: each is sent once.
         limits: What the safety filter enforces.
         sensor: The nominal sensor model.
         mjcf: The robot's MuJoCo model.
@@ -95,6 +139,9 @@ class RobotDescription:
             ``effort_limit``, and stiffness and damping are 0.
         floating_base: Name of the free joint that carries the robot; None for a fixed base. It is not among
             ``joint_names``.
+        passive_damping: kd of the passive command, (A,) [N·m·s/rad], for robots whose passive state is damping;
+            empty: the motors are off.
+        rest_position: The pose in which a robot with legs lies and may go limp, (J,); empty: none.
         sources: Where each number comes from, by attribute name.
     """
 
@@ -115,6 +162,9 @@ class RobotDescription:
     mjcf: Path
     actuation: str = "position"
     floating_base: str | None = None
+    repeat_rate_hz: float = 0.0
+    passive_damping: tuple[float, ...] = ()
+    rest_position: tuple[float, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -160,9 +210,15 @@ class RobotDescription:
         values["mjcf"] = hashlib.sha256(self.mjcf.read_bytes()).hexdigest()
         values["sources"] = dict(self.sources)
         # A default stays out: a description written before the field existed keeps its digest.
-        for name, default in (("actuation", "position"), ("floating_base", None)):
+        for name, default in (
+            ("actuation", "position"), ("floating_base", None), ("repeat_rate_hz", 0.0),
+            ("passive_damping", ()), ("rest_position", ()),
+        ):  # fmt: skip
             if values[name] == default:
                 del values[name]
+        for name, default in (("silence_s", 0.3), ("legs", None)):
+            if values["limits"][name] == default:
+                del values["limits"][name]
         return values
 
     def digest(self) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -280,6 +281,15 @@ def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray
     along = np.sum(axis * vector, axis=-1, keepdims=True)
     turned = np.cos(angle) * vector - np.sin(angle) * np.cross(axis, vector)
     return np.asarray(turned + (1.0 - np.cos(angle)) * along * axis)
+
+
+def rotation_vector(quaternion: FloatArray) -> FloatArray:
+    """Return the rotation vector, (3,) [rad], of an orientation, (4,), a unit quaternion wxyz."""
+    w, v = float(quaternion[0]), quaternion[1:]
+    sine = float(np.linalg.norm(v))
+    # Of the two quaternions of a rotation, the one with the smaller angle.
+    angle = 2.0 * math.atan2(sine, abs(w))
+    return np.asarray(v * (math.copysign(1.0, w) * (angle / sine if sine > 0 else 2.0)))
 
 
 def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -67,9 +67,29 @@ class Robot(abc.ABC):
     def send_command(self, command: JointCommand) -> JointCommand:
         """Send PD targets and return what was really sent (rounded to the wire's resolution)."""
 
+    def repeat(self) -> None:  # noqa: B027
+        """Send the command in force again, as ``description.repeat_rate_hz`` asks for. Never waits."""
+
+    def hand_back(self, timeout_s: float) -> None:  # noqa: B027
+        """Return the robot to the controller that it came with, after ``passive``; does nothing by default.
+
+        Raises:
+            TransportTimeoutError: The robot does not confirm in time.
+        """
+
     @abc.abstractmethod
     def passive(self) -> None:
         """Send the least harmful command that this robot has (motor off, or damping). Never blocks."""
+
+    @property
+    def operator_stop(self) -> str:
+        """Why the operator asked to stop through the robot itself, as by its remote; "": nobody did."""
+        return ""
+
+    @property
+    def fault(self) -> str:
+        """What the driver saw that forbids going on, such as another program's commands; "" for nothing."""
+        return ""
 
     @property
     @abc.abstractmethod
@@ -83,7 +103,7 @@ class Robot(abc.ABC):
 
     @abc.abstractmethod
     def fileno(self) -> int:
-        """A file descriptor that becomes readable when state may have arrived (for ``select``)."""
+        """The descriptor of the open port, which a child process can inherit; -1: it opens its own path."""
 
     @abc.abstractmethod
     def take_wire(self) -> list[Message]:

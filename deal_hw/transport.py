@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Self
+
+from deal_hw.errors import ConfigurationError
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +72,65 @@ class Transport(abc.ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireOptions:
+    """How a topic transport reaches its peers, beyond the port.
+
+    Attributes:
+        domain: Number of the DDS domain.
+        listen: Whether to wait for peers at the port (Zenoh) instead of going to them.
+        mode: Zenoh session mode, "peer" or "client" (of a router).
+        insecure: Whether plain TCP to another machine is allowed.
+        ca: Certificate authority that peers are checked against (PEM).
+        certificate: Our own certificate (PEM), which the peer checks.
+        key: Its private key (PEM).
+    """
+
+    domain: int = 0
+    listen: bool = False
+    mode: str = "peer"
+    insecure: bool = False
+    ca: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("peer", "client"):
+            raise ConfigurationError(f"wire mode {self.mode!r}: peer or client")
+        if not 0 <= self.domain <= 232:
+            raise ConfigurationError(f"DDS domain {self.domain}: 0 to 232")
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigurationError(
+                "a certificate and its private key belong together: give both or neither"
+            )
+
+
+class TopicTransport(Transport):
+    """A transport of messages with topics: publish and subscribe, no peer in particular.
+
+    Topics are named as on the wire of DDS, without a leading slash (``rt/lowstate``); payloads are whole CDR
+    messages with their 4-byte header. ``receive`` returns the messages of all subscribed topics in order of
+    arrival, never our own; ``send`` accepts declared topics only. Nobody listening is no error.
+
+    Args:
+        port: Where: an endpoint or a network interface.
+        clock: Gives the stamps.
+        options: How.
+    """
+
+    @abc.abstractmethod
+    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
+        """Say which topics will be used; takes effect with ``open``, so call it before.
+
+        Raises:
+            UnknownNameError: The transport does not know the topic's type.
+        """
+
+    @abc.abstractmethod
+    def writers(self, topic: str) -> tuple[str, ...]:
+        """Return a description of each other participant that is known to write a subscribed topic.
+
+        A transport that cannot know (Zenoh) returns nothing: whoever must be sure listens as well.
+        """

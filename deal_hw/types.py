@@ -39,6 +39,37 @@ class Status(enum.IntFlag):
 
 
 @dataclass(frozen=True, slots=True)
+class BodyState:
+    """What a legged robot senses besides its joints' motion, at the same moment.
+
+    Attributes:
+        orientation: Unit quaternion wxyz, base in the world, (4,).
+        angular_velocity: In the base's frame, (3,) [rad/s].
+        acceleration: Specific force in the base's frame, (3,) [m/s²]: +9.81 upwards at rest.
+        foot_force: The feet's sensors in the robot's own units and the description's order of legs, (F,).
+        temperature: Of each motor, (J,) [°C].
+        lost: Commands that each motor missed so far, as the robot counts them, (J,).
+        battery: State of charge, 0 to 1; NaN where unknown.
+        voltage: Of the supply [V].
+        current: Drawn from the supply [A].
+        sticks: The operator's remote: left x, left y, right x, right y, each -1 to 1, (4,).
+        buttons: The remote's buttons, a bit each, as the driver names them; -1: no remote is heard.
+    """
+
+    orientation: FloatArray
+    angular_velocity: FloatArray
+    acceleration: FloatArray
+    foot_force: FloatArray
+    temperature: FloatArray
+    lost: IntArray
+    battery: float
+    voltage: float
+    current: float
+    sticks: FloatArray
+    buttons: int
+
+
+@dataclass(frozen=True, slots=True)
 class RobotState:
     """One sample of a robot's state.
 
@@ -52,6 +83,7 @@ class RobotState:
         command_sequence: Number of the command in force; -1 before the first.
         command_age_ns: Device time since that command was received [ns]; -1 before the first.
         status: What the robot says of itself.
+        body: What a legged robot senses besides; None for other robots.
     """
 
     position: FloatArray
@@ -63,6 +95,7 @@ class RobotState:
     command_sequence: int
     command_age_ns: int
     status: Status
+    body: BodyState | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +139,37 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
+class BodyTrajectory:
+    """:class:`BodyState` at the T samples of a recording; rows of samples without one are NaN.
+
+    Attributes:
+        orientation: (T, 4).
+        angular_velocity: (T, 3) [rad/s].
+        acceleration: (T, 3) [m/s²].
+        foot_force: (T, F).
+        temperature: (T, J) [°C].
+        lost: (T, J).
+        battery: (T,), 0 to 1.
+        voltage: (T,) [V].
+        current: (T,) [A].
+        sticks: (T, 4).
+        buttons: (T,), -1 where no remote was heard.
+    """
+
+    orientation: FloatArray
+    angular_velocity: FloatArray
+    acceleration: FloatArray
+    foot_force: FloatArray
+    temperature: FloatArray
+    lost: FloatArray
+    battery: FloatArray
+    voltage: FloatArray
+    current: FloatArray
+    sticks: FloatArray
+    buttons: IntArray
+
+
+@dataclass(frozen=True, slots=True)
 class Trajectory:
     """One recording: T state samples and C commands.
 
@@ -130,6 +194,7 @@ class Trajectory:
         speed_limit: (C, A).
         events: What happened.
         metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
+        body: What a legged robot sensed besides; None for other robots.
     """
 
     joint_names: tuple[str, ...]
@@ -152,6 +217,7 @@ class Trajectory:
     speed_limit: FloatArray
     events: Sequence[Event] = ()
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    body: BodyTrajectory | None = None
 
     @property
     def duration_s(self) -> float:

@@ -14,9 +14,12 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
+from deal_hw.transport import WireOptions
 
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
+    "go2": "deal_hw.drivers.go2.robot:Go2Robot",
+    "go2_hung": "deal_hw.drivers.go2.robot:Go2HungRobot",
 }
 DESCRIPTIONS: Final = {
     "ant": "deal_hw.drivers.ant.description:DESCRIPTION",
@@ -35,29 +38,59 @@ SPACES: Final = {
 """Tables of parameter sets, name -> function; the first of each is the default."""
 TRANSPORTS: Final = {
     "serial": "deal_hw.drivers.transports.serial_transport:SerialTransport",
+    "dds": "deal_hw.drivers.transports.dds_transport:DdsTransport",
+    "zenoh": "deal_hw.drivers.transports.zenoh_transport:ZenohTransport",
 }
+TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
+"""Transports without a descriptor to inherit: each process opens its own."""
+REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
+    "cartpole": ("serial",),
+    "go2": TOPIC_TRANSPORTS,
+    "go2_hung": TOPIC_TRANSPORTS,
+}
+"""Transports that reach each robot; the first is the default."""
 
 __all__ = [
     "DESCRIPTIONS",
+    "REACHED_BY",
     "ROBOTS",
     "SPACES",
+    "TOPIC_TRANSPORTS",
     "TRANSPORTS",
     "adopt_robot",
+    "default_transport",
+    "driver_description",
     "make_robot",
     "parameter_spaces",
     "robot_description",
 ]
 
 
-def make_robot(name: str, transport_name: str, port: str, clock: Clock) -> Robot:
+def make_robot(
+    name: str, transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
+) -> Robot:
     """Return a robot that will be reached over a port; nothing is opened yet.
+
+    Args:
+        name: The robot.
+        transport_name: How it is reached.
+        port: Where: a serial port, a network interface, an endpoint.
+        clock: Gives the stamps.
+        options: More about a transport of topics.
 
     Raises:
         UnknownNameError: There is no such robot or transport.
-        ConfigurationError: The robot has a description, but no driver.
+        ConfigurationError: The robot has a description but no driver, or it is not reached that way.
     """
     robot, transport = _driver(name), _find("transport", TRANSPORTS, transport_name)
-    made: Robot = robot(transport(port, clock=clock), clock)
+    _check_reach(name, transport_name)
+    if transport_name in TOPIC_TRANSPORTS:
+        link = transport(port, clock, options)
+    elif options is not None and options != WireOptions():
+        raise ConfigurationError(f"transport {transport_name!r} knows none of the network's options")
+    else:
+        link = transport(port, clock=clock)
+    made: Robot = robot(link, clock)
     return made
 
 
@@ -69,8 +102,20 @@ def adopt_robot(name: str, transport_name: str, fd: int, clock: Clock) -> Robot:
         ConfigurationError: The robot has a description, but no driver.
     """
     robot, transport = _driver(name), _find("transport", TRANSPORTS, transport_name)
+    _check_reach(name, transport_name)
     made: Robot = robot(transport.from_fd(fd, clock=clock), clock)
     return made
+
+
+def driver_description(name: str) -> RobotDescription:
+    """Return the facts about a robot as its driver has them, with the rates of its real wire.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    found: RobotDescription = _driver(name).description
+    return found
 
 
 def robot_description(name: str) -> RobotDescription:
@@ -100,8 +145,27 @@ def parameter_spaces(name: str) -> Mapping[str, Callable[[], ParameterSpace]]:
     return found
 
 
+def default_transport(name: str) -> str:
+    """Return the transport that usually reaches a robot.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    _driver(name)
+    return REACHED_BY[name][0]
+
+
+def _check_reach(name: str, transport_name: str) -> None:
+    if transport_name not in REACHED_BY[name]:
+        raise ConfigurationError(
+            f"robot {name!r} is not reached by transport {transport_name!r}; "
+            f"choose --transport {' or '.join(REACHED_BY[name])}"
+        )
+
+
 def _driver(name: str) -> Any:
-    if name in DESCRIPTIONS:
+    if name in DESCRIPTIONS and name not in ROBOTS:
         raise ConfigurationError(
             f"robot {name!r} can be simulated and calibrated from recordings, but has no driver yet; "
             f"robots that can be driven: {', '.join(ROBOTS)}"

@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
@@ -25,10 +26,14 @@ class Collect:
     """The robot, such as cartpole."""
 
     port: str
-    """Where the robot is, such as /dev/ttyUSB0."""
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
+    as tcp/127.0.0.1:7447 (zenoh)."""
 
-    transport: str = "serial"
-    """How the robot is reached."""
+    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
+    """How the robot is reached, beyond the port."""
+
+    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
+    """What a robot with legs needs to be told."""
 
     out: Path | None = None
     """Run folder; the episodes go to OUT/dataset."""
@@ -72,8 +77,7 @@ def collect(config: Collect) -> RunReport:
     policy = config.policy or shipped_policy(config.robot)
     excite, seconds = _excitation(config)
     plan = RunPlan(
-        robot=config.robot,
-        transport=config.transport,
+        **plan_options(config.robot, config.link, config.legs),
         profile="excite" if excite else config.profile,
         policy=str(policy or ""),
         seconds=seconds,

@@ -83,17 +83,32 @@ def _run(
     from deal_hw.cli.run_plan import RunPlan, make_behaviour
     from deal_hw.control.loop import ControlLoop, LoopConfig
     from deal_hw.control.safety import Safety
-    from deal_hw.drivers import adopt_robot
+    from deal_hw.control.velocity import KeyboardVelocity
+    from deal_hw.drivers import adopt_robot, make_robot
 
     plan = RunPlan.from_json(orders)
-    robot = adopt_robot(plan.robot, plan.transport, orders["port_fd"], clock)
-    behaviour = make_behaviour(plan, robot.description)
+    if orders["port_fd"] is None:
+        robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire)
+    else:
+        robot = adopt_robot(plan.robot, plan.transport, orders["port_fd"], clock)
+    source = plan.velocity_source()
+    behaviour = make_behaviour(plan, robot.description, source)
     sink = RecordSender(socket.socket(fileno=orders["record_fd"])) if "record_fd" in orders else _discard
+
+    def progress(phase: str, silence_s: float) -> None:
+        status.beat(clock.now_ns(), phase, silence_s)
+        if isinstance(source, KeyboardVelocity):
+            for key in status.heard():
+                source.press(key)
+
     granted = become_realtime() if plan.realtime else Granted("default", ())
     loop = ControlLoop(
         robot, behaviour, Safety(robot.description), clock, sink,
-        LoopConfig(duration_s=plan.seconds, dry_run=plan.dry_run, home=plan.home),
-        progress=lambda phase, silence_s: status.beat(clock.now_ns(), phase, silence_s),
+        LoopConfig(
+            duration_s=plan.total_s, dry_run=plan.dry_run, home=plan.home, record_wire=plan.record_wire,
+            hand_back=plan.hand_back,
+        ),
+        progress=progress,
         scheduling=granted.scheduling,
     )  # fmt: skip
     for warning in granted.warnings:

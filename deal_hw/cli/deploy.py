@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
 
+from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 
@@ -19,10 +20,14 @@ class Deploy:
     """The robot, such as cartpole."""
 
     port: str
-    """Where the robot is, such as /dev/ttyUSB0."""
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
+    as tcp/127.0.0.1:7447 (zenoh)."""
 
-    transport: str = "serial"
-    """How the robot is reached."""
+    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
+    """How the robot is reached, beyond the port."""
+
+    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
+    """What a robot with legs needs to be told."""
 
     policy: Path | None = None
     """The policy (.onnx); by default the one shipped for the robot."""
@@ -61,8 +66,7 @@ def deploy(config: Deploy) -> RunReport:
     """
     policy = config.policy or shipped_policy(config.robot)
     plan = RunPlan(
-        robot=config.robot,
-        transport=config.transport,
+        **plan_options(config.robot, config.link, config.legs),
         profile="balance",
         policy=str(policy or ""),
         seconds=config.seconds,

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
 
+from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 from deal_hw.control.behaviours import ReplayBehaviour
 from deal_hw.data.reader import read_trajectory
-from deal_hw.drivers import robot_description
+from deal_hw.drivers import driver_description
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,10 +23,14 @@ class Replay:
     """The recording (.mcap)."""
 
     port: str
-    """Where the robot is, such as /dev/ttyUSB0."""
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
+    as tcp/127.0.0.1:7447 (zenoh)."""
 
-    transport: str = "serial"
-    """How the robot is reached."""
+    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
+    """How the robot is reached, beyond the port."""
+
+    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
+    """What a robot with legs needs to be told."""
 
     out: Path | None = None
     """Run folder; the episode goes to OUT/dataset. Without OUT and DATASET nothing is recorded."""
@@ -49,10 +54,9 @@ def replay(config: Replay) -> RunReport:
     """
     trajectory = read_trajectory(config.episode)
     robot = config.robot or str(trajectory.metadata.get("robot", ""))
-    behaviour = ReplayBehaviour(trajectory, robot_description(robot))
+    behaviour = ReplayBehaviour(trajectory, driver_description(robot))
     plan = RunPlan(
-        robot=robot,
-        transport=config.transport,
+        **plan_options(robot, config.link, config.legs),
         profile="replay",
         recording=str(config.episode.resolve()),
         seconds=behaviour.duration_s,

@@ -21,8 +21,11 @@ from deal_hw.control.excitation_plan import (
     make_plan,
     read_plan,
 )
+from deal_hw.control.posture import PostureBehaviour, PostureConfig
+from deal_hw.control.velocity import VelocitySource, make_source
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
+from deal_hw.transport import WireOptions
 
 Profile = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
 """What a run does; `balance` runs the policy all the time."""
@@ -44,6 +47,14 @@ class RunPlan:
         home: Whether to bring the robot to its start pose first.
         rich: Settings of the profile `rich`; its length is ``seconds``.
         excite: What the profile `excite` plays: `chirp`, `multisine`, or a file of `deal-hw excite`.
+        port: Where the robot is, for transports without a descriptor to inherit.
+        wire: More about a transport of topics.
+        velocity: Where a walking policy's wanted velocity comes from; see
+            :func:`deal_hw.control.velocity.make_source`.
+        stand: Whether to stand up first and to lie down at the end; not counted in ``seconds``.
+        posture: How long that takes.
+        hand_back: Whether to return the robot to its own controller at the end.
+        record_wire: Whether to record the raw bytes, too.
         realtime: Whether to ask for SCHED_FIFO and locked memory.
     """
 
@@ -58,6 +69,13 @@ class RunPlan:
     home: bool = True
     rich: RichConfig = field(default_factory=RichConfig)
     excite: str = ""
+    port: str = ""
+    wire: WireOptions = field(default_factory=WireOptions)
+    velocity: str = "0,0,0"
+    stand: bool = False
+    posture: PostureConfig = field(default_factory=PostureConfig)
+    hand_back: bool = False
+    record_wire: bool = True
     realtime: bool = True
 
     def __post_init__(self) -> None:
@@ -70,7 +88,22 @@ class RunPlan:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return dataclasses.asdict(self)
+        values = dataclasses.asdict(self)
+        values["wire"] = {key: str(v) if isinstance(v, Path) else v for key, v in values["wire"].items()}
+        return values
+
+    @property
+    def total_s(self) -> float:
+        """Length of the run with standing up and lying down [s]."""
+        return self.seconds + (self.posture.before_s + self.posture.lie_s if self.stand else 0.0)
+
+    def velocity_source(self) -> VelocitySource:
+        """Return where the wanted velocity comes from.
+
+        Raises:
+            ConfigurationError: ``velocity`` names no source.
+        """
+        return make_source(self.velocity)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> RunPlan:
@@ -79,7 +112,18 @@ class RunPlan:
         rich = dict(known["rich"])
         rich["hold_s"] = tuple(rich["hold_s"])
         rich["segments"] = tuple(Segment(**part) for part in rich["segments"])
-        return cls(**{**known, "rich": RichConfig(**rich)})
+        wire = {
+            key: Path(value) if value is not None and key in ("ca", "certificate", "key") else value
+            for key, value in known["wire"].items()
+        }
+        return cls(
+            **{
+                **known,
+                "rich": RichConfig(**rich),
+                "wire": WireOptions(**wire),
+                "posture": PostureConfig(**known["posture"]),
+            }
+        )
 
 
 def shipped_policy(robot: str) -> Path | None:
@@ -88,14 +132,26 @@ def shipped_policy(robot: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def make_behaviour(plan: RunPlan, description: RobotDescription) -> Behaviour:
+def make_behaviour(
+    plan: RunPlan, description: RobotDescription, source: VelocitySource | None = None
+) -> Behaviour:
     """Return what the plan asks of the robot.
+
+    Args:
+        plan: The plan.
+        description: The robot.
+        source: The wanted velocity of a policy that walks; by default made from the plan.
 
     Raises:
         PolicyError: The policy is missing or cannot run.
         PolicyMismatchError: It was made for another robot.
         DatasetError: The recording cannot be replayed.
     """
+    inner = _inner_behaviour(plan, description, source or plan.velocity_source())
+    return PostureBehaviour(inner, description, plan.seconds, plan.posture) if plan.stand else inner
+
+
+def _inner_behaviour(plan: RunPlan, description: RobotDescription, source: VelocitySource) -> Behaviour:
     if plan.profile == "hold":
         return HoldBehaviour(description)
     if plan.profile == "chirp":
@@ -112,7 +168,7 @@ def make_behaviour(plan: RunPlan, description: RobotDescription) -> Behaviour:
         config = dataclasses.replace(plan.rich, duration_s=plan.seconds)
         balance = _policy(plan, description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)
-    return _policy(plan, description)
+    return _policy(plan, description, source)
 
 
 def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:
@@ -142,7 +198,7 @@ def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationP
     return found
 
 
-def _policy(plan: RunPlan, description: RobotDescription) -> Behaviour:
+def _policy(plan: RunPlan, description: RobotDescription, source: VelocitySource | None = None) -> Behaviour:
     if not plan.policy:
         raise PolicyError(
             f"profile {plan.profile!r} needs a policy, and none is shipped for robot {plan.robot!r}; "
@@ -150,4 +206,4 @@ def _policy(plan: RunPlan, description: RobotDescription) -> Behaviour:
         )
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 
-    return PolicyBehaviour(OnnxPolicy(plan.policy), description)
+    return PolicyBehaviour(OnnxPolicy(plan.policy), description, source)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw import __version__, errors
+from deal_hw.cli.keyboard import keys
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.cadence import CadenceReport
@@ -22,7 +23,7 @@ from deal_hw.control.passive import make_passive
 from deal_hw.control.supervisor import OPERATOR, ChildEnd, Supervisor
 from deal_hw.data.recorder_launch import start_recorder
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import make_robot, robot_description
+from deal_hw.drivers import make_robot
 from deal_hw.robot import Robot
 
 if TYPE_CHECKING:
@@ -159,20 +160,21 @@ def run_episodes(
     """
     if episodes < 1:
         raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
-    description = robot_description(plan.robot)
+    plan = dataclasses.replace(plan, port=port)
+    robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire)
     # Whatever is wrong with policy or recording should be said before anybody touches the robot.
-    make_behaviour(plan, description)
-    robot = make_robot(plan.robot, plan.transport, port, MonotonicClock())
+    make_behaviour(plan, robot.description)
     reports: list[EpisodeReport] = []
     # The supervisor greets the robot itself, so that a wrong port is known before any process is started.
     # From then on it only keeps the port, until the control process is dead.
     with robot, _open_dataset(dataset, robot.description) as store:
         for number in range(episodes):
-            run = _Episode(
-                dataclasses.replace(plan, seed=plan.seed + number), robot, port, store, purpose, task
-            )
+            # The robot's own controller gets it back after the last episode only.
+            last = number == episodes - 1
+            episode = dataclasses.replace(plan, seed=plan.seed + number, hand_back=plan.hand_back and last)
+            run = _Episode(episode, robot, port, store, purpose, task)
             title = f"{purpose} {plan.robot} {number + 1}/{episodes}"
-            with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.seconds) as show:
+            with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.total_s) as show:
                 reports.append(run.run(_both(show, on_beat)))
             if not quiet:
                 print_report(reports[-1])
@@ -214,6 +216,8 @@ class _Episode:
             "seed": plan.seed,
             "seconds": plan.seconds,
             "dry_run": plan.dry_run,
+            "velocity": plan.velocity,
+            "stand": plan.stand,
             "deal_hw": __version__,
         }
 
@@ -228,14 +232,21 @@ class _Episode:
                 recorder.finish()
                 raise
         port_fd = self._robot.fileno()
-        end = Supervisor(
+        supervisor = Supervisor(
             module="deal_hw.cli.control_process",
             plan=self._plan.to_json(),
-            port_fd=port_fd,
+            port_fd=port_fd if port_fd >= 0 else None,
             passive=lambda: make_passive(self._robot, MonotonicClock()),
             recorder=recorder,
             on_beat=on_beat,
-        ).run()
+        )
+        listening = (
+            keys(supervisor.tell, lambda: supervisor.stop(OPERATOR))
+            if self._plan.velocity == "keyboard"
+            else contextlib.nullcontext()
+        )
+        with listening:
+            end = supervisor.run()
         report = account(end, self._path)
         # The control process knows the port only as the descriptor that it inherited.
         reason = report.reason.replace(f"inherited descriptor {port_fd}", self._port)

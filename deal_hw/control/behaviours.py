@@ -7,9 +7,10 @@ from typing import Protocol
 
 import numpy as np
 
+from deal_hw.control.velocity import FixedVelocity, VelocitySource
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, DatasetError, PolicyError
-from deal_hw.policy import ObservationBuilder, Policy
+from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
+from deal_hw.policy import ObservationBuilder, Policy, rotation_vector
 from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
 
 
@@ -62,14 +63,29 @@ class PolicyBehaviour:
 
     Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on.
 
+    Args:
+        policy: The policy.
+        description: The robot that it will run on.
+        source: The wanted velocity of the base, for a policy that observes it; by default standing still.
+
     Raises:
-        PolicyMismatchError: The policy was made for another robot.
+        PolicyMismatchError: The policy was made for another robot, or observes what this one cannot sense.
         PolicyError: It returns an action of another shape.
     """
 
-    def __init__(self, policy: Policy, description: RobotDescription) -> None:
+    def __init__(
+        self, policy: Policy, description: RobotDescription, source: VelocitySource | None = None
+    ) -> None:
         spec = policy.spec
         spec.check_fits(description)
+        unseen = sorted({term.quantity for term in spec.observation} & {"linear_velocity", "height"})
+        if unseen:
+            raise PolicyMismatchError(
+                f"the policy observes {' and '.join(unseen)} of the base, which no sensor of "
+                f"{description.name!r} reports; train one that does without"
+            )
+        self._source = source or FixedVelocity()
+        self._observes_base = spec.observes_base
         self._policy = policy
         self._observations = ObservationBuilder(spec)
         self._scale = np.array(spec.action_scale)
@@ -89,7 +105,8 @@ class PolicyBehaviour:
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
         """Return the policy's command."""
-        observation = self._observations.build(state.position, state.velocity)
+        self._observations.command = self._source.velocity(state, time_s)
+        observation = self._observations.build(*self._coordinates(state))
         action = np.asarray(self._policy.act(observation), dtype=float)
         if action.shape != self._scale.shape:
             raise PolicyError(
@@ -98,6 +115,21 @@ class PolicyBehaviour:
         self.action = np.clip(action, -1.0, 1.0)
         self._observations.record_action(self.action)
         return dataclasses.replace(self._template, position_target=self._default + self._scale * self.action)
+
+    def _coordinates(self, state: RobotState) -> tuple[FloatArray, FloatArray]:
+        """Return positions and velocities as the policy knows them, the base's first where it needs it."""
+        if not self._observes_base:
+            return state.position, state.velocity
+        if state.body is None:
+            raise PolicyError(
+                "the policy observes the base's orientation, and this robot's states carry none"
+            )
+        # Where the base is and how fast it moves along is not sensed, and was checked not to be observed.
+        unknown = np.zeros(3)
+        return (
+            np.concatenate([unknown, rotation_vector(state.body.orientation), state.position]),
+            np.concatenate([unknown, state.body.angular_velocity, state.velocity]),
+        )
 
 
 class HoldBehaviour:

@@ -6,6 +6,7 @@ peer does not take at once is refused and counted.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import struct
@@ -20,6 +21,7 @@ BUFFER_BYTES = 1 << 20
 default."""
 _MOST_REFUSED = 50
 """So many refusals in a row (one second at 50 Hz) mean that nobody records: the run ends."""
+_MOST_WORD = 256
 _BEAT = struct.Struct("<cqdI")
 
 
@@ -101,6 +103,16 @@ class StatusSender:
         except OSError:
             return
 
+    def heard(self) -> list[str]:
+        """Return what the supervisor told since the last call; never waits."""
+        words: list[str] = []
+        try:
+            while word := self._socket.recv(_MOST_WORD, socket.MSG_DONTWAIT):
+                words.append(word.decode("utf-8", "replace"))
+        except OSError:
+            pass
+        return words
+
     def result(self, values: dict[str, Any]) -> None:
         """Send the run's result as JSON; may wait a second, for the robot is passive by then."""
         self._socket.settimeout(1.0)
@@ -127,6 +139,11 @@ class StatusReceiver:
         """Close this end."""
         self.open = False
         self._socket.close()
+
+    def tell(self, text: str) -> None:
+        """Send a word to the control process; what it does not take at once is lost."""
+        with contextlib.suppress(OSError):
+            self._socket.send(text.encode()[:_MOST_WORD], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
     def receive(self) -> Beat | dict[str, Any] | None:
         """Return the next heartbeat or result; None when there is none at hand."""

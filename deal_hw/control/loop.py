@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.cadence import Cadence, CadenceReport
 from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
 from deal_hw.control.passive import make_passive
+from deal_hw.control.repeater import Repeater
 from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
 from deal_hw.data.record import CycleFlag, CycleRecord
 from deal_hw.errors import DealHwError, TransportError, TransportTimeoutError
 from deal_hw.robot import Robot
+from deal_hw.transport import Message
 from deal_hw.types import Event, JointCommand, RobotState
 
 __all__ = ["RUNNING", "ControlLoop", "LoopConfig", "LoopReport", "OperatorStop", "Outcome", "Sink"]
@@ -27,12 +30,9 @@ again."""
 
 RUNNING = "running"
 """Name of the phase in which cycles run."""
-RUNNING_SILENCE_S = 0.3
-"""A loop without a heartbeat for this long is stalled: the cart-pole's own watchdog has stopped its motor by
-then [s]."""
 
-_MOST_WIRE = 512
-"""Raw messages in one record; a cycle has about 5."""
+_MOST_WIRE_BYTES = 48_000
+"""Raw bytes in one record: a datagram holds no more beside the rest; a cycle of a Go2 has 13 000."""
 
 
 class OperatorStop(BaseException):
@@ -69,6 +69,7 @@ class ControlLoop:
         self._clock, self._sink, self._config, self._progress = clock, sink, config, progress
         self._scheduling = scheduling
         self._cadence = Cadence(clock, robot.description.control_rate_hz)
+        self._repeater = Repeater(robot, clock)
         self._stop_reason = ""
         self._raise_on_stop = self._connected = False
         self._state: RobotState | None = None
@@ -107,6 +108,8 @@ class ControlLoop:
             # First of all, and before anything that might fail: the robot.
             self._raise_on_stop = False
             confirmed = self._make_passive()
+            if confirmed and self._config.hand_back and outcome in (Outcome.FINISHED, Outcome.STOPPED):
+                self._hand_back()
             self._close(reason)
         return LoopReport(
             outcome=outcome, reason=reason, passive_confirmed=confirmed, cadence=self._report(),
@@ -149,7 +152,7 @@ class ControlLoop:
             if self._cadence.next_index >= count:
                 break
             index, deadline_ns = self._cadence.begin()
-            self._phase(RUNNING, RUNNING_SILENCE_S)
+            self._phase(RUNNING, self._robot.description.limits.silence_s)
             verdict = self._cycle(index, deadline_ns)
             if verdict.state is SafetyState.PASSIVE:
                 stopped = verdict.flags[:1] == ("operator_stop",)
@@ -187,9 +190,12 @@ class ControlLoop:
             with self._cadence.section("send"):
                 sent_ns = self._clock.now_ns()
                 sent = self._robot.send_command(verdict.command)
+                self._repeater.note_sent(sent_ns)
                 self._sent += 1
-        elif verdict.state is SafetyState.PASSIVE:
-            self._robot.passive()
+        else:
+            self._repeater.stop()
+            if verdict.state is SafetyState.PASSIVE:
+                self._robot.passive()
         with self._cadence.section("record"):
             self._hand_over(
                 index,
@@ -235,8 +241,7 @@ class ControlLoop:
         state_age_ns: int = -1,
         flags: CycleFlag = CycleFlag.NONE,
     ) -> None:
-        # Homing may take long: what does not fit a datagram is the oldest.
-        wire = tuple(self._robot.take_wire()[-_MOST_WIRE:])
+        wire = _newest(self._robot.take_wire()) if self._config.record_wire else ()
         record = CycleRecord(
             cycle=index,
             deadline_ns=deadline_ns,
@@ -251,7 +256,7 @@ class ControlLoop:
             safety_state=self._safety.state.value,
             flags=int(flags),
             events=tuple(self._events),
-            wire=wire if self._config.record_wire else (),
+            wire=wire,
             lost=self._losses,
         )
         self._pending, self._events = [], []
@@ -259,12 +264,12 @@ class ControlLoop:
             self._losses += 1
 
     def _collect_until(self, deadline_ns: int) -> None:
-        """Take states as they arrive, so that each carries its own receive stamp."""
-        while (left_ns := deadline_ns - self._clock.now_ns()) > 0:
-            try:
+        """Take states as they arrive, so that each carries its own receive stamp; repeat the command."""
+        while (now_ns := self._clock.now_ns()) < deadline_ns:
+            left_ns = max(self._repeater.wake_ns(deadline_ns) - now_ns, 0)
+            with contextlib.suppress(TransportTimeoutError):
                 self._receive(self._robot.read_state(left_ns * 1e-9))
-            except TransportTimeoutError:
-                break
+            self._repeater.repeat_if_due()
         self._drain()
 
     def _drain(self) -> None:
@@ -282,7 +287,7 @@ class ControlLoop:
     def _input(self, action_age_ns: int = 0) -> CycleInput:
         return CycleInput(
             now_ns=self._clock.now_ns(), state=self._state, action_age_ns=action_age_ns,
-            link_errors=self._robot.link_errors, stop_reason=self._stop_reason,
+            link_errors=self._robot.link_errors, stop_reason=self._stop_reason or self._robot.operator_stop,
         )  # fmt: skip
 
     def _make_passive(self) -> bool:
@@ -296,6 +301,15 @@ class ControlLoop:
         return make_passive(
             self._robot, self._clock, self._config.passive_attempts, self._config.passive_confirm_s
         )
+
+    def _hand_back(self) -> None:
+        timeout_s = self._config.hand_back_timeout_s
+        self._phase("handing back", timeout_s + 2.0)
+        try:
+            self._robot.hand_back(timeout_s)
+            self.note("handed back", "the robot's own controller has the robot again")
+        except (DealHwError, OSError) as err:
+            self.note("warning", f"the robot was not handed back: {err}")
 
     def _close(self, reason: str) -> None:
         """Hand over what is left, then disconnect."""
@@ -316,3 +330,13 @@ class ControlLoop:
             states=self._states, cycles_without_state=self._blind, losses=self._losses,
             link_errors=self._robot.link_errors, scheduling=self._scheduling,
         )  # fmt: skip
+
+
+def _newest(wire: Sequence[Message]) -> tuple[Message, ...]:
+    """Return what fits a record: setting up a robot may take long, and what does not fit is the oldest."""
+    left = _MOST_WIRE_BYTES
+    for count, message in enumerate(reversed(wire)):
+        left -= len(message.payload) + len(message.channel) + 16
+        if left < 0:
+            return tuple(wire[len(wire) - count :])
+    return tuple(wire)

@@ -43,6 +43,9 @@ class LoopConfig:
     """How long to wait for the confirmation of each [s]."""
     record_wire: bool = True
     """Hand the raw bytes to the recorder, too."""
+    hand_back: bool = False
+    """At the end, return the robot to the controller that it came with."""
+    hand_back_timeout_s: float = 10.0
 
     def __post_init__(self) -> None:
         if not self.duration_s > 0:

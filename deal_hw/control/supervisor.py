@@ -60,7 +60,7 @@ class Supervisor:
     Args:
         module: The control process's module, run with ``python -m``.
         plan: Its orders, as plain JSON values; it reads them from its standard input.
-        port_fd: The open port, which it inherits.
+        port_fd: The open port, which it inherits; None where each process opens its own path.
         passive: Sends the passive command through the port and returns whether the robot confirmed it. Called
             only once the control process is dead.
         recorder: The recorder, ready; None to record nothing.
@@ -73,7 +73,7 @@ class Supervisor:
         *,
         module: str,
         plan: Mapping[str, Any],
-        port_fd: int,
+        port_fd: int | None,
         passive: Callable[[], bool],
         recorder: RecorderHandle | None = None,
         on_beat: Callable[[Beat], None] = lambda beat: None,
@@ -82,6 +82,7 @@ class Supervisor:
         self._module, self._plan, self._port_fd, self._passive = module, plan, port_fd, passive
         self._recorder, self._on_beat, self._clock = recorder, on_beat, clock or MonotonicClock()
         self._child: subprocess.Popen[bytes] | None = None
+        self._status: StatusReceiver | None = None
         self._result: dict[str, Any] | None = None
         self._killed = self._stop_cause = ""
         self._stale_ns = 0
@@ -90,7 +91,7 @@ class Supervisor:
     def run(self) -> ChildEnd:
         """Start the control process, watch it to its end, see to the robot and to the recording."""
         with self._operator_stops():
-            status = self._start()
+            status = self._status = self._start()
             try:
                 self._watch(status)
             except BaseException:
@@ -114,9 +115,14 @@ class Supervisor:
         elif cause == OPERATOR:
             self._kill("the operator asked twice")
 
+    def tell(self, text: str) -> None:
+        """Pass a word of the operator on to the control process, such as a key; safe from another thread."""
+        if self._status is not None:
+            self._status.tell(text)
+
     def _start(self) -> StatusReceiver:
         sender, receiver = socket_pair()
-        inherited = [self._port_fd, sender.fileno()]
+        inherited = [sender.fileno(), *([] if self._port_fd is None else [self._port_fd])]
         plan = {
             **self._plan,
             "port_fd": self._port_fd,

@@ -18,7 +18,7 @@ from deal_hw.data.recorder import METADATA_NAME
 from deal_hw.data.schemas import CHANNELS, message_type
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
 from deal_hw.transport import Message
-from deal_hw.types import Event, FloatArray, IntArray, Trajectory
+from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,6 +203,7 @@ def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tu
             Event(stamp, kind, text, json.loads(data)) for stamp, kind, text, data in rows["/events"]
         ),
         metadata={**metadata, **facts},
+        body=_body(rows["/body"], receive_ns, numbers),
         **_commands(rows, start_ns, len(description["actuated"])),
     )
     return Episode(
@@ -210,6 +211,24 @@ def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tu
         anchor_ns=int(preamble["host_ns"]), start_ns=start_ns, device_start_ns=device_start_ns,
         sequence=numbers, trajectory=trajectory, cycles=cycles,
     )  # fmt: skip
+
+
+def _body(
+    table: Sequence[tuple[Any, ...]], receive_ns: Sequence[int], sequence: IntArray
+) -> BodyTrajectory | None:
+    """Return what was sensed of the body at each state sample, found by stamp and number."""
+    if not table:
+        return None
+    row_of = {(row[0], row[1]): row for row in table}
+    found = [row_of.get((stamp, int(number))) for stamp, number in zip(receive_ns, sequence, strict=True)]
+    columns = []
+    for i in range(2, len(table[0])):
+        absent = np.full(np.shape(table[0][i]), np.nan)
+        columns.append(
+            np.stack([absent if row is None else np.asarray(row[i], float) for row in found])
+        )
+    buttons = np.where(np.isfinite(columns[-1]), columns[-1], -1).astype(np.int64)
+    return BodyTrajectory(*columns[:-1], buttons)
 
 
 def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:

@@ -9,7 +9,8 @@ part    content
 ======  ==========================================================================================
 head    magic, version, counts, the scalars of :class:`CycleRecord`
 states  each: six int64 (receive_ns, device_ns, sequence, command_sequence, command_age_ns, status),
-        then position, velocity, effort as J float64 each
+        then position, velocity, effort as J float64 each; of a robot with legs also its body (see
+        ``_BODY``)
 arrays  action (K float64), asked and sent (7 x A float64 each), where present
 texts   safety state, events (stamp, kind, message, JSON), wire (stamp, channel, payload)
 tail    CRC-32 of all bytes before it
@@ -28,15 +29,18 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError, ProtocolError, VersionMismatchError
 from deal_hw.transport import Message
-from deal_hw.types import Event, FloatArray, JointCommand, RobotState, Status
+from deal_hw.types import BodyState, Event, FloatArray, IntArray, JointCommand, RobotState, Status
 
 MAGIC = b"DHCR"
-VERSION = 1
+VERSION = 2
 MAX_DATAGRAM_BYTES = 128 * 1024
 """A sender refuses more; Linux carries up to about 200 kB at its default socket buffer."""
 
-_HEAD = struct.Struct("<4sHHHHHHiBxHI7q")
+_HEAD = struct.Struct("<4sHHHHHHiBxHI7qi")
 _STATE = struct.Struct("<6q")
+_BODY = struct.Struct("<3dq")
+"""battery, voltage, current, buttons; before it orientation, angular velocity, acceleration, sticks, foot
+forces and temperatures as float64, behind it the J counters of lost commands as int64."""
 _EVENT = struct.Struct("<qHII")
 _WIRE = struct.Struct("<qHI")
 _CRC = struct.Struct("<I")
@@ -125,6 +129,10 @@ def encode(record: CycleRecord) -> bytes:
 
 def _encode_body(record: CycleRecord) -> bytes:
     joints = record.states[0].position.size if record.states else 0
+    bodies = [state.body for state in record.states if state.body is not None]
+    if bodies and len(bodies) != len(record.states):
+        raise ConfigurationError(f"cycle {record.cycle}: some states have a body, others none")
+    feet = bodies[0].foot_force.size if bodies else -1
     commands = [command for command in (record.asked, record.sent) if command is not None]
     actuated = commands[0].position_target.size if commands else 0
     present = _HAS_ASKED * (record.asked is not None) | _HAS_SENT * (record.sent is not None)
@@ -134,10 +142,10 @@ def _encode_body(record: CycleRecord) -> bytes:
         _HEAD.pack(
             MAGIC, VERSION, joints, len(record.states), actuated, len(record.events), len(record.wire),
             action_size, present, len(safety_state), record.flags, record.cycle, record.deadline_ns,
-            record.start_ns, record.sent_sequence, record.sent_ns, record.state_age_ns, record.lost,
+            record.start_ns, record.sent_sequence, record.sent_ns, record.state_age_ns, record.lost, feet,
         )
     ]  # fmt: skip
-    parts.extend(_encode_state(state, joints) for state in record.states)
+    parts.extend(_encode_state(state, joints, feet) for state in record.states)
     if record.action is not None:
         parts.append(_floats(record.action, action_size, "action"))
     for command in commands:
@@ -176,10 +184,10 @@ def decode(datagram: bytes) -> CycleRecord:
 def _decode_body(body: bytes) -> CycleRecord:
     (
         _, _, joints, state_count, actuated, event_count, wire_count, action_size, present, text_size, flags,
-        cycle, deadline_ns, start_ns, sent_sequence, sent_ns, state_age_ns, lost,
+        cycle, deadline_ns, start_ns, sent_sequence, sent_ns, state_age_ns, lost, feet,
     ) = _HEAD.unpack_from(body)  # fmt: skip
     cursor = _Cursor(body, _HEAD.size)
-    states = tuple(_decode_state(cursor, joints) for _ in range(state_count))
+    states = tuple(_decode_state(cursor, joints, feet) for _ in range(state_count))
     action = cursor.floats(action_size) if action_size >= 0 else None
     asked = _decode_command(cursor, actuated) if present & _HAS_ASKED else None
     sent = _decode_command(cursor, actuated) if present & _HAS_SENT else None
@@ -215,6 +223,9 @@ class _Cursor:
     def floats(self, count: int) -> FloatArray:
         return np.frombuffer(self.take(8 * count), dtype="<f8")
 
+    def integers(self, count: int) -> IntArray:
+        return np.frombuffer(self.take(8 * count), dtype="<i8")
+
     def text(self, size: int) -> str:
         return self.take(size).decode()
 
@@ -233,7 +244,8 @@ def _text(value: str) -> bytes:
     return value.encode("utf-8", "backslashreplace")
 
 
-def _encode_state(state: RobotState, joints: int) -> bytes:
+def _encode_state(state: RobotState, joints: int, feet: int) -> bytes:
+    body = b"" if state.body is None else _encode_body_state(state.body, joints, feet)
     return b"".join(
         (
             _STATE.pack(
@@ -243,17 +255,43 @@ def _encode_state(state: RobotState, joints: int) -> bytes:
             _floats(state.position, joints, "position"),
             _floats(state.velocity, joints, "velocity"),
             _floats(state.effort, joints, "effort"),
+            body,
         )
     )  # fmt: skip
 
 
-def _decode_state(cursor: _Cursor, joints: int) -> RobotState:
+def _body_sizes(joints: int, feet: int) -> dict[str, int]:
+    return {
+        "orientation": 4, "angular_velocity": 3, "acceleration": 3, "sticks": 4, "foot_force": feet,
+        "temperature": joints,
+    }  # fmt: skip
+
+
+def _encode_body_state(body: BodyState, joints: int, feet: int) -> bytes:
+    parts = [_floats(getattr(body, name), size, name) for name, size in _body_sizes(joints, feet).items()]
+    parts.append(_BODY.pack(body.battery, body.voltage, body.current, body.buttons))
+    if body.lost.shape != (joints,):
+        raise ConfigurationError(f"lost has shape {body.lost.shape}, the robot has {joints} joints")
+    parts.append(np.asarray(body.lost, dtype="<i8").tobytes())
+    return b"".join(parts)
+
+
+def _decode_body_state(cursor: _Cursor, joints: int, feet: int) -> BodyState:
+    arrays = {name: cursor.floats(size) for name, size in _body_sizes(joints, feet).items()}
+    battery, voltage, current, buttons = cursor.unpack(_BODY)
+    return BodyState(
+        **arrays, lost=cursor.integers(joints), battery=battery, voltage=voltage, current=current,
+        buttons=buttons,
+    )  # fmt: skip
+
+
+def _decode_state(cursor: _Cursor, joints: int, feet: int) -> RobotState:
     receive_ns, device_ns, sequence, command_sequence, command_age_ns, status = cursor.unpack(_STATE)
     position, velocity, effort = (cursor.floats(joints) for _ in range(3))
     return RobotState(
         position=position, velocity=velocity, effort=effort, receive_ns=receive_ns, device_ns=device_ns,
         sequence=sequence, command_sequence=command_sequence, command_age_ns=command_age_ns,
-        status=Status(status),
+        status=Status(status), body=_decode_body_state(cursor, joints, feet) if feet >= 0 else None,
     )  # fmt: skip
 
 

@@ -21,9 +21,9 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 import deal_hw
 from deal_hw.clock import Clock
 from deal_hw.data.record import CycleRecord
-from deal_hw.data.schemas import CHANNELS, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE, message_type
+from deal_hw.data.schemas import BODY, CHANNELS, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE, message_type
 from deal_hw.errors import DatasetError
-from deal_hw.types import JointCommand
+from deal_hw.types import JointCommand, RobotState
 
 FLUSH_INTERVAL_S = 0.05
 """Longest time a record waits for its chunk to be closed: half the loss that is allowed, so that a busy
@@ -106,6 +106,7 @@ class EpisodeRecorder:
                 state.command_age_ns, int(state.status), state.position, state.velocity, state.effort,
             )  # fmt: skip
             self._add("/state", state.receive_ns, data, state.sequence)
+            self._add_body(state)
         self._add_command("/command/asked", record, record.asked)
         self._add_command("/command", record, record.sent)
         for event in record.events:
@@ -199,6 +200,17 @@ class EpisodeRecorder:
                 schemas[kind.name] = self._writer.register_schema(kind.name, "ros2msg", definition)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schemas[kind.name])
         self._schemas = schemas
+
+    def _add_body(self, state: RobotState) -> None:
+        body = state.body
+        if body is None:
+            return
+        data = BODY.encode(
+            state.receive_ns, state.sequence, body.orientation, body.angular_velocity, body.acceleration,
+            body.foot_force, body.temperature, body.lost, body.battery, body.voltage, body.current,
+            body.sticks, body.buttons,
+        )  # fmt: skip
+        self._add("/body", state.receive_ns, data, state.sequence)
 
     def _add_command(self, topic: str, record: CycleRecord, command: JointCommand | None) -> None:
         if command is None:

@@ -18,7 +18,10 @@ from deal_hw.errors import ProtocolError, UnknownNameError
 
 _HEADER = b"\x00\x01\x00\x00"
 """CDR encapsulation, little-endian; alignment counts from its end."""
-_SCALARS = {"int64": struct.Struct("<q"), "uint32": struct.Struct("<I"), "bool": struct.Struct("<?")}
+_SCALARS = {
+    "int64": struct.Struct("<q"), "uint32": struct.Struct("<I"), "bool": struct.Struct("<?"),
+    "float64": struct.Struct("<d"),
+}  # fmt: skip
 _LENGTH = _SCALARS["uint32"]
 
 
@@ -28,7 +31,8 @@ class MessageType:
 
     Attributes:
         name: ROS 2 name.
-        fields: Pairs of ros2msg type (int64, uint32, bool, string, string[], uint8[], float64[]) and name.
+        fields: Pairs of ros2msg type (int64, uint32, bool, float64, string, string[], uint8[], float64[]) and
+            name.
     """
 
     name: str
@@ -165,6 +169,15 @@ EVENT = MessageType(
     "deal_hw_msgs/msg/Event",
     (("int64", "stamp_ns"), ("string", "kind"), ("string", "message"), ("string", "data_json")),
 )
+BODY = MessageType(
+    "deal_hw_msgs/msg/Body",
+    (
+        ("int64", "receive_ns"), ("int64", "sequence"), ("float64[]", "orientation"),
+        ("float64[]", "angular_velocity"), ("float64[]", "acceleration"), ("float64[]", "foot_force"),
+        ("float64[]", "temperature"), ("float64[]", "lost"), ("float64", "battery"), ("float64", "voltage"),
+        ("float64", "current"), ("float64[]", "sticks"), ("int64", "buttons"),
+    ),
+)  # fmt: skip
 WIRE = MessageType("deal_hw_msgs/msg/Wire", (("int64", "stamp_ns"), ("uint8[]", "payload")))
 
 CHANNELS: Mapping[str, MessageType] = {
@@ -176,6 +189,7 @@ CHANNELS: Mapping[str, MessageType] = {
     "/events": EVENT,
     "/wire/rx": WIRE,
     "/wire/tx": WIRE,
+    "/body": BODY,
 }
 """Topic -> type, in the order in which a recorder registers them: the n-th has channel id n, from 1.
 

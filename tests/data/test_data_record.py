@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from deal_hw.data.record import MAX_DATAGRAM_BYTES, CycleRecord, decode, encode
 from deal_hw.errors import ConfigurationError, ProtocolError, VersionMismatchError
 from deal_hw.transport import Message
-from deal_hw.types import Event, JointCommand, RobotState, Status
+from deal_hw.types import BodyState, Event, JointCommand, RobotState, Status
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
@@ -29,11 +29,25 @@ def arrays(size: int) -> st.SearchStrategy[np.ndarray]:
     return st.lists(st.floats(), min_size=size, max_size=size).map(lambda v: np.array(v, dtype=np.float64))
 
 
+def bodies(joints: int, feet: int) -> st.SearchStrategy[BodyState]:
+    """Bodies of a robot with so many joints and feet."""
+    lost = st.lists(INT64, min_size=joints, max_size=joints).map(lambda v: np.array(v, dtype=np.int64))
+    sizes = (4, 3, 3, feet, joints)
+    return st.builds(
+        BodyState, *map(arrays, sizes), lost, st.floats(), st.floats(), st.floats(), arrays(4), INT64
+    )
+
+
 @st.composite
 def records(draw: st.DrawFn) -> CycleRecord:
     joints, actuated = draw(st.integers(0, 5)), draw(st.integers(1, 3))
+    body = st.just(None) if draw(st.booleans()) else bodies(joints, draw(st.integers(0, 4)))
     state = st.builds(
-        RobotState, *[arrays(joints)] * 3, INT64, INT64, INT64, INT64, INT64, st.integers(0, 255).map(Status)
+        RobotState,
+        *[arrays(joints)] * 3,
+        *[INT64] * 5,
+        st.integers(0, 255).map(Status),
+        body,
     )
     command = st.builds(JointCommand, *[arrays(actuated)] * len(fields(JointCommand)))
     return CycleRecord(
@@ -65,7 +79,9 @@ def plain(value: object) -> object:
         return value.dtype.str, value.tobytes()
     if isinstance(value, tuple):
         return tuple(plain(item) for item in value)
-    if isinstance(value, RobotState | JointCommand):
+    if isinstance(value, float):
+        return np.float64(value).tobytes()
+    if isinstance(value, RobotState | JointCommand | BodyState):
         return tuple(plain(getattr(value, field.name)) for field in fields(value))
     return value
 
@@ -104,14 +120,14 @@ def test_another_version_is_named(make_cycle: Callable[[int], CycleRecord]) -> N
     """A sender of another version gets a message with both versions."""
     datagram = bytearray(encode(make_cycle(0)))
     datagram[4] = 9
-    with pytest.raises(VersionMismatchError, match="version 9; this recorder reads 1"):
+    with pytest.raises(VersionMismatchError, match="version 9; this recorder reads 2"):
         decode(bytes(datagram))
 
 
 def test_layout_of_the_head(make_cycle: Callable[[int], CycleRecord]) -> None:
-    """The first bytes are the magic, version 1, J=2, 4 states, A=1, no event, 2 raw messages, K=1."""
+    """The first bytes are the magic, version 2, J=2, 4 states, A=1, no event, 2 raw messages, K=1."""
     head = encode(make_cycle(0))[:20]
-    assert head == b"DHCR" + bytes([1, 0, 2, 0, 4, 0, 1, 0, 0, 0, 2, 0, 1, 0, 0, 0])
+    assert head == b"DHCR" + bytes([2, 0, 2, 0, 4, 0, 1, 0, 0, 0, 2, 0, 1, 0, 0, 0])
 
 
 def test_mixed_shapes_are_refused(make_cycle: Callable[[int], CycleRecord]) -> None:

@@ -1,0 +1,68 @@
+"""Options of collect, deploy and replay: how the robot is reached, and what a robot with legs needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import tyro
+
+from deal_hw.control.posture import PostureConfig
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import default_transport, driver_description
+from deal_hw.transport import WireOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class LegOptions:
+    """What a robot with legs needs to be told."""
+
+    stand: bool | None = None
+    """Stand up first and lie down at the end; by default where the robot has a rest pose."""
+
+    velocity: str = "0,0,0"
+    """Wanted velocity of a walking policy: ahead, left, turn as 0.3,0,0 [m/s, m/s, rad/s], or remote (the
+    robot's own), keyboard, or a CSV file with the columns time_s,x,y,yaw."""
+
+    hand_back: bool = False
+    """Give the robot back to its own controller at the end (Go2: the sport service)."""
+
+    posture: PostureConfig = field(default_factory=PostureConfig)
+    """How long standing up and lying down take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkOptions:
+    """How the robot is reached, beyond the port."""
+
+    transport: str = ""
+    """How the robot is reached: serial, dds or zenoh; by default the robot's usual way."""
+
+    record_wire: bool = True
+    """Record the raw bytes, too."""
+
+    wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
+    """More about a network."""
+
+
+def plan_options(robot: str, link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
+    """Return the fields of a :class:`~deal_hw.cli.run_plan.RunPlan` that follow from the options.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: It has a description, but no driver.
+    """
+    return {
+        "robot": robot,
+        "transport": link.transport or default_transport(robot),
+        "wire": link.wire,
+        "record_wire": link.record_wire,
+        "stand": _stands(driver_description(robot)) if legs.stand is None else legs.stand,
+        "velocity": legs.velocity,
+        "hand_back": legs.hand_back,
+        "posture": legs.posture,
+    }
+
+
+def _stands(description: RobotDescription) -> bool:
+    return bool(description.rest_position) and description.floating_base is not None

@@ -1,0 +1,167 @@
+"""Where a walking policy gets its wanted velocity from: fixed, a script, the robot's remote, a keyboard."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray, RobotState
+
+AXES = ("x", "y", "yaw")
+LARGEST = (1.0, 0.5, 1.0)
+"""Fastest velocity that may be asked for: ahead, to the left [m/s], turning left [rad/s]."""
+KEY_LIFE_S = 0.6
+"""A key that is not pressed again counts for this long [s]: longer than the first pause of a key repeat."""
+KEYS = {
+    "w": (0.5, 0.0, 0.0), "s": (-0.5, 0.0, 0.0), "a": (0.0, 0.3, 0.0), "d": (0.0, -0.3, 0.0),
+    "q": (0.0, 0.0, 0.6), "e": (0.0, 0.0, -0.6), " ": (0.0, 0.0, 0.0),
+}  # fmt: skip
+"""Keys and the velocities that they ask for while they are held."""
+_DEAD_ZONE = 0.05
+
+
+class VelocitySource(Protocol):
+    """Says how fast the base shall move."""
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return the wanted velocity of the base in its own frame: ahead, left [m/s], turn [rad/s], (3,)."""
+        ...
+
+
+class FixedVelocity:
+    """One velocity all the time.
+
+    Raises:
+        ConfigurationError: It is not finite or too fast.
+    """
+
+    def __init__(self, velocity: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        self._velocity = _checked(velocity, "the velocity")
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return the velocity."""
+        return self._velocity
+
+
+class ScriptVelocity:
+    """Velocities from a CSV file with the columns time_s, x, y, yaw; each holds until the next line's time.
+
+    Raises:
+        ConfigurationError: The file cannot be read, or a line is wrong; the message names the line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        rows = _read_script(path)
+        self._time_s = np.array([row[0] for row in rows])
+        self._velocity = np.stack([_checked(row[1:], f"{path}: line {i + 2}") for i, row in enumerate(rows)])
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return the velocity of the last line whose time has come; zero before the first."""
+        row = int(np.searchsorted(self._time_s, time_s, side="right")) - 1
+        return self._velocity[row] if row >= 0 else np.zeros(3)
+
+
+class RemoteVelocity:
+    """The sticks of the robot's own remote: left for ahead and sideways, right for turning.
+
+    Without a remote the robot is asked to stand still.
+    """
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return what the sticks ask for."""
+        body = state.body
+        if body is None or body.buttons < 0 or not np.isfinite(body.sticks).all():
+            return np.zeros(3)
+        left_x, left_y, right_x, _ = np.clip(body.sticks, -1.0, 1.0)
+        wish = np.array([left_y, -left_x, -right_x])
+        return np.asarray(np.where(np.abs(wish) < _DEAD_ZONE, 0.0, wish) * LARGEST)
+
+
+@dataclass(slots=True)
+class KeyboardVelocity:
+    """Keys held on the operator's terminal; a key that is let go of counts for :data:`KEY_LIFE_S`.
+
+    The terminal belongs to another process, which passes keys on: :meth:`press`.
+    """
+
+    _wish: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    _since_s: float = -math.inf
+    _now_s: float = 0.0
+
+    def press(self, key: str) -> None:
+        """A key was pressed, or repeats because it is held; keys without a meaning are ignored."""
+        if key in KEYS:
+            self._wish, self._since_s = KEYS[key], self._now_s
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return what the last key asks for while it counts."""
+        self._now_s = time_s
+        return np.array(self._wish if time_s - self._since_s <= KEY_LIFE_S else (0.0, 0.0, 0.0))
+
+
+def make_source(text: str) -> VelocitySource:
+    """Return the source that a command line names.
+
+    Args:
+        text: "remote", "keyboard", three numbers "x,y,yaw", or the path of a script (.csv).
+
+    Raises:
+        ConfigurationError: It is none of these.
+    """
+    if text == "remote":
+        return RemoteVelocity()
+    if text == "keyboard":
+        return KeyboardVelocity()
+    if text.endswith(".csv"):
+        return ScriptVelocity(Path(text))
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != len(AXES):
+        raise ConfigurationError(
+            f"--velocity {text!r}: give x,y,yaw [m/s, m/s, rad/s] such as 0.3,0,0, or remote, keyboard, or a "
+            "CSV file with the columns time_s,x,y,yaw"
+        )
+    return FixedVelocity(numbers)
+
+
+def _checked(values: Sequence[float], where: str) -> FloatArray:
+    for axis, value, most in zip(AXES, values, LARGEST, strict=True):
+        if not abs(value) <= most:
+            raise ConfigurationError(f"{where}: {axis} is {value!r}, allowed: -{most:g} to {most:g}")
+    return np.array(values, dtype=float)
+
+
+def _read_script(path: Path) -> list[list[float]]:
+    names = ["time_s", *AXES]
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.reader(file)
+            head = next(reader, [])
+            lines = [line for line in reader if line]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigurationError(f"the script {path} cannot be read: {error}") from error
+    if [name.strip() for name in head] != names:
+        raise ConfigurationError(f"{path}: its first line is {','.join(head)!r}, expected {','.join(names)}")
+    rows = []
+    for number, line in enumerate(lines, start=2):
+        try:
+            row = [float(part) for part in line]
+        except ValueError:
+            row = []
+        if len(row) != len(names) or not math.isfinite(row[0]) or (rows and row[0] <= rows[-1][0]):
+            raise ConfigurationError(
+                f"{path}: line {number} is {','.join(line)!r}; expected four numbers, times growing"
+            )
+        rows.append(row)
+    if not rows:
+        raise ConfigurationError(f"{path} holds no line but its head")
+    return rows
