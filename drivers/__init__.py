@@ -14,7 +14,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
-from deal_hw.transport import WireOptions
+from deal_hw.transport import Transport, WireOptions
 
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
@@ -27,7 +27,7 @@ DESCRIPTIONS: Final = {
     "go2_suspended": "deal_hw.drivers.go2.suspended:DESCRIPTION",
     "so101": "deal_hw.drivers.so101.description:DESCRIPTION",
 }
-"""Robots that can be simulated and calibrated from recordings, but have no driver."""
+"""Robots as they are simulated and calibrated, where that is not the driver's own description."""
 SPACES: Final = {
     "ant": "deal_hw.drivers.ant.description:SPACES",
     "cartpole": "deal_hw.drivers.cartpole.description:SPACES",
@@ -61,7 +61,9 @@ __all__ = [
     "default_transport",
     "driver_description",
     "make_robot",
+    "make_transport",
     "parameter_spaces",
+    "recorded_description",
     "robot_description",
 ]
 
@@ -82,16 +84,25 @@ def make_robot(
         UnknownNameError: There is no such robot or transport.
         ConfigurationError: The robot has a description but no driver, or it is not reached that way.
     """
-    robot, transport = _driver(name), _find("transport", TRANSPORTS, transport_name)
+    robot = _driver(name)
+    link = make_transport(transport_name, port, clock, options)
     _check_reach(name, transport_name)
+    made: Robot = robot(link, clock)
+    return made
+
+
+def make_transport(
+    transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
+) -> Transport:
+    """Return a transport; nothing is opened yet. Arguments and errors as :func:`make_robot`."""
+    transport = _find("transport", TRANSPORTS, transport_name)
     if transport_name in TOPIC_TRANSPORTS:
-        link = transport(port, clock, options)
+        link: Transport = transport(port, clock, options)
     elif options is not None and options != WireOptions():
         raise ConfigurationError(f"transport {transport_name!r} knows none of the network's options")
     else:
         link = transport(port, clock=clock)
-    made: Robot = robot(link, clock)
-    return made
+    return link
 
 
 def adopt_robot(name: str, transport_name: str, fd: int, clock: Clock) -> Robot:
@@ -99,10 +110,15 @@ def adopt_robot(name: str, transport_name: str, fd: int, clock: Clock) -> Robot:
 
     Raises:
         UnknownNameError: There is no such robot or transport.
-        ConfigurationError: The robot has a description, but no driver.
+        ConfigurationError: The robot has a description, but no driver, or the transport has no descriptor.
     """
     robot, transport = _driver(name), _find("transport", TRANSPORTS, transport_name)
     _check_reach(name, transport_name)
+    if transport_name in TOPIC_TRANSPORTS:
+        raise ConfigurationError(
+            f"transport {transport_name!r} has no descriptor to inherit: each process opens its own, "
+            "make_robot() does"
+        )
     made: Robot = robot(transport.from_fd(fd, clock=clock), clock)
     return made
 
@@ -118,6 +134,15 @@ def driver_description(name: str) -> RobotDescription:
     return found
 
 
+def recorded_description(name: str) -> RobotDescription:
+    """Return the facts under which a robot's recordings were made: its driver's, where it has one.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    return driver_description(name) if name in ROBOTS else robot_description(name)
+
+
 def robot_description(name: str) -> RobotDescription:
     """Return the facts about a robot, whether it has a driver or not.
 
@@ -131,7 +156,7 @@ def robot_description(name: str) -> RobotDescription:
     elif name in ROBOTS:
         found = _find("robot", ROBOTS, name).description
     else:
-        raise UnknownNameError("robot", name, (*ROBOTS, *DESCRIPTIONS))
+        raise UnknownNameError("robot", name, dict.fromkeys((*ROBOTS, *DESCRIPTIONS)))
     return found
 
 

@@ -22,6 +22,7 @@ Keep the licence text of the source beside the converted file when you pass it o
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from pathlib import Path
 
@@ -41,12 +42,13 @@ joints:
 """
 
 
-def convert(source: Path, out: Path) -> Path:
-    """Write the NPZ file and the column map and return the path of the former.
+def convert(source: Path, out: Path, parts: int = 1) -> list[Path]:
+    """Write the NPZ files and the column map and return the paths of the former.
 
     Args:
         source: The torch file.
         out: Folder to write to.
+        parts: Write the recording in so many parts of equal length, so that any of them can be held out.
 
     Raises:
         SystemExit: The file is not what its source says it is.
@@ -61,11 +63,15 @@ def convert(source: Path, out: Path) -> Path:
     if shapes != {"time": (count,), "dof_pos": (count, 12), "des_dof_pos": (count, 12)}:
         raise SystemExit(f"{source} has the shapes {shapes}, expected (T,), (T, 12), (T, 12)")
     out.mkdir(parents=True, exist_ok=True)
-    path = out / f"{source.stem}.npz"
-    np.savez_compressed(path, joint_names=np.array(JOINTS), **arrays)
+    edges = np.linspace(0, count, parts + 1).round().astype(int)
+    paths = []
+    for number, (first, last) in enumerate(itertools.pairwise(edges), start=1):
+        paths.append(out / (f"{source.stem}_part{number}.npz" if parts > 1 else f"{source.stem}.npz"))
+        rows = {key: values[first:last] for key, values in arrays.items()}
+        np.savez_compressed(paths[-1], joint_names=np.array(JOINTS), **rows)
     lines = "".join(f"  - {joint}\n" for joint in JOINTS)
     (out / "columns.yaml").write_text(COLUMNS + lines, encoding="utf-8")
-    return path
+    return paths
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -74,8 +80,12 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("source", type=Path, help="datasets/go2/traj_0.pt of the source project")
     parser.add_argument("--out", type=Path, required=True, help="folder for traj_0.npz and columns.yaml")
+    parser.add_argument("--parts", type=int, default=1, help="write so many parts, to hold one of them out")
     options = parser.parse_args(arguments)
-    print(convert(options.source, options.out))
+    if options.parts < 1:
+        parser.error(f"--parts must be at least 1, got {options.parts}")
+    for path in convert(options.source, options.out, options.parts):
+        print(path)
     return 0
 
 

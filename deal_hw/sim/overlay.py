@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import align
+from deal_hw.sim.episode import Episode, align
 from deal_hw.sim.model import load_model
+from deal_hw.sim.standing import chart_base, with_sensed_base
 from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
@@ -39,6 +40,7 @@ class Prediction:
         window_rmse: Root mean square position error of each window, (W, J).
         position_nrmse: Root mean square position error over the range of the signal, (J,).
         velocity_nrmse: The same of velocities, (J,).
+        base: Poses of a floating base, position and quaternion wxyz, (W, H + 1, 7); None for a fixed one.
     """
 
     theta: FloatArray
@@ -48,6 +50,7 @@ class Prediction:
     window_rmse: FloatArray
     position_nrmse: FloatArray
     velocity_nrmse: FloatArray
+    base: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,21 +133,31 @@ def compute_overlay(
     """
     length = _window_samples(window_s, description)
     _check(space, sets, latency_s, smoothing_s)
+    robot = load_model(description)
     episode = align(trajectory, description)
+    if robot.base is not None:
+        if trajectory.body is None or not description.feet:
+            raise InsufficientDataError(
+                "the recording says nothing of the floating base; predictions need its IMU and names of feet"
+            )
+        episode = with_sensed_base(episode, robot, trajectory.body)
     windows = cut_windows(episode, length)
     row = _first_row(trajectory) + np.concatenate([windows.start[:, None], windows.samples()], axis=1)
     smooth = _smoothed_starts(trajectory, row[:, 0], smoothing_s)
     velocity_window_s = reported_velocity_window(trajectory, description)
 
-    batch = ServoBatch(load_model(description), space, len(sets), threads=1)
+    batch = ServoBatch(robot, space, len(sets), threads=1)
     batch.set_parameters(np.array([np.asarray(theta, dtype=float) for theta in sets.values()]))
     path = setpoints(batch, episode, np.full(len(sets), latency_s))
-    x, v = predict_windows(batch, episode, windows, smooth[:, 0], smooth[:, 1], path)
+    # Of a floating robot, the base starts where the episode's estimate has it.
+    start_x, start_v = episode.position[windows.start].copy(), episode.velocity[windows.start].copy()
+    start_x[:, robot.joints], start_v[:, robot.joints] = smooth[:, 0], smooth[:, 1]
+    x, v = predict_windows(batch, episode, windows, start_x, start_v, path)
     measured = trajectory.position[row], trajectory.velocity[row]
     predictions = {}
     for n, (name, theta) in enumerate(sets.items()):
-        position = np.concatenate([smooth[:, :1], x[n]], axis=1)
-        velocity = np.concatenate([smooth[:, 1:2], v[n]], axis=1)
+        position = np.concatenate([smooth[:, :1], x[n][..., robot.joints]], axis=1)
+        velocity = np.concatenate([smooth[:, 1:2], v[n][..., robot.joints]], axis=1)
         if velocity_window_s:
             velocity = _as_reported(position, smooth, windows, episode.step_s, velocity_window_s)
         error = position - measured[0]
@@ -156,6 +169,7 @@ def compute_overlay(
             window_rmse=np.sqrt(np.mean(np.square(error[:, 1:]), axis=1)),
             position_nrmse=_nrmse(error, measured[0]),
             velocity_nrmse=_nrmse(velocity - measured[1], measured[1]),
+            base=_base(episode, windows, start_x, x[n]),
         )
     return Overlay(
         joint_names=trajectory.joint_names,
@@ -167,6 +181,14 @@ def compute_overlay(
         window_s=length * windows.stride * episode.step_s,
         predictions=predictions,
     )
+
+
+def _base(episode: Episode, windows: Windows, start: FloatArray, x: FloatArray) -> FloatArray | None:
+    """Return the base's poses at the points of windows, (W, H + 1, 7); None for a fixed base."""
+    if episode.reference is None:
+        return None
+    points = np.concatenate([windows.start[:, None], windows.samples()], axis=1)
+    return chart_base(np.concatenate([start[:, None], x], axis=1), episode.reference[points])
 
 
 def reported_velocity_window(trajectory: Trajectory, description: RobotDescription) -> float:

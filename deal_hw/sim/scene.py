@@ -100,12 +100,16 @@ def read_scene(robot: RobotModel) -> Scene:
     return Scene(bodies=tuple(name or f"body_{b}" for b, name in enumerate(bodies)), shapes=tuple(shapes))
 
 
-def body_poses(robot: RobotModel, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+def body_poses(
+    robot: RobotModel, position: FloatArray, base: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return where the bodies are at each of T joint positions.
 
     Args:
         robot: The robot's model.
         position: Joint positions, (T, J) [m or rad].
+        base: Position and quaternion wxyz of a floating base in the world, (T, 7); None: where the model has
+            it.
 
     Returns:
         Positions (T, B, 3) [m] and quaternions w x y z (T, B, 4) of the B bodies in the world; NaN where a
@@ -115,7 +119,12 @@ def body_poses(robot: RobotModel, position: FloatArray) -> tuple[FloatArray, Flo
     data = mujoco.MjData(model)
     where = np.full((len(position), model.nbody, 3), np.nan)
     turned = np.full((len(position), model.nbody, 4), np.nan)
-    for t in np.flatnonzero(np.isfinite(position).all(axis=1)):
+    known = np.isfinite(position).all(axis=1)
+    if base is not None and robot.base is not None:
+        known &= np.isfinite(base).all(axis=1)
+    for t in np.flatnonzero(known):
+        if base is not None and robot.base is not None:
+            data.qpos[robot.base[0] : robot.base[0] + 7] = base[t]
         data.qpos[list(robot.qpos)] = position[t]
         mujoco.mj_kinematics(model, data)
         where[t], turned[t] = data.xpos, data.xquat

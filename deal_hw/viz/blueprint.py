@@ -11,6 +11,8 @@ from deal_hw.types import Trajectory
 from deal_hw.viz.backend import rrb
 from deal_hw.viz.columns import DEVICE_TIMELINE
 
+_STANDING_M = 0.2
+"""What is looked at of a robot that stands on the floor [m]."""
 _STACKED_JOINTS = 3
 """Robots with more joints get a grid of small plots instead of a stack."""
 
@@ -23,13 +25,15 @@ def inspect_blueprint(trajectory: Trajectory, description: RobotDescription, set
         description: The robot.
         sets: Names of the parameter sets that are shown beside it.
     """
-    right = rrb.Tabs(
+    tabs = [
         _motion(trajectory, description, sets),
         _velocities(trajectory, description, sets),
         _commands(trajectory, description),
         _plot("/cadence", "Cadence [ms]"),
-        active_tab=0,
-    )
+    ]
+    if trajectory.body is not None:
+        tabs.insert(0, _body(trajectory))
+    right = rrb.Tabs(*tabs, active_tab=0)
     left = rrb.Vertical(
         _robot(trajectory, description),
         rrb.TextDocumentView(origin="/summary", name="Summary"),
@@ -94,6 +98,30 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
     return _stack("Commands", plots, len(trajectory.actuated))
 
 
+def _body(trajectory: Trajectory) -> Any:
+    legs = [
+        _plot("/", f"{leg}: measured positions [rad]", [f"/joints/{joint}/position/**" for joint in joints])
+        for leg, joints in _legs(trajectory.joint_names).items()
+    ]
+    plots = [
+        _plot("/body/tilt", "Roll, pitch [deg]"),
+        _plot("/body/gyro", "Angular velocity [rad/s]"),
+        _plot("/body/acceleration", "Specific force [m/s²]"),
+        _plot("/body/feet", "Foot force [robot's units]"),
+        _plot("/body/battery", "Battery"),
+        _plot("/body/temperature", "Motor temperature [°C]"),
+    ]
+    return rrb.Grid(*legs, *plots, grid_columns=2, name="Body")
+
+
+def _legs(joints: tuple[str, ...]) -> dict[str, list[str]]:
+    """Return joints by what their names begin with."""
+    found: dict[str, list[str]] = {}
+    for joint in joints:
+        found.setdefault(joint.split("_")[0], []).append(joint)
+    return found
+
+
 def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
     """Return the 3D view, looking along +y from far enough to see what sliding joints cover."""
     slides = [
@@ -102,16 +130,18 @@ def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
         if unit == "m" and np.isfinite(high)
     ]
     reach = max([0.4, *slides])
+    height = _STANDING_M if description.floating_base is not None else 0.04 * reach
     eye = rrb.EyeControls3D(
         kind=rrb.components.Eye3DKind.Orbital,
         position=(0.12 * reach, -2.1 * reach, 0.5 * reach),
-        look_target=(0.0, 0.0, 0.04 * reach),
+        look_target=(0.0, 0.0, height),
         eye_up=(0.0, 0.0, 1.0),
     )
     return rrb.Spatial3DView(
         origin="/world",
         name="Robot: real solid, predictions as ghosts",
         eye_controls=eye,
-        line_grid=rrb.LineGrid3D(visible=False),
+        # A robot on the floor needs one to stand on.
+        line_grid=rrb.LineGrid3D(visible=description.floating_base is not None, spacing=0.25),
         background=rrb.Background(kind=rrb.components.BackgroundKind.SolidColor, color=(24, 26, 30)),
     )

@@ -11,6 +11,8 @@ Entities, J joints and any number of parameter sets (``nominal``, ``calibrated``
     /status/safety                             state of the safety filter
     /cadence/{command_period,state_period,state_age,lateness}    ms
     /events                                    text log
+    /body/{tilt,gyro,acceleration}/...         IMU, for robots with legs; also
+    /body/{feet,temperature,battery}/...
     /summary                                   markdown
     /world/{surroundings,real,<set>}/...       3D
 
@@ -29,10 +31,12 @@ from deal_hw.description import RobotDescription
 from deal_hw.sim.model import load_model
 from deal_hw.sim.overlay import Overlay
 from deal_hw.sim.scene import body_poses, read_scene
+from deal_hw.sim.standing import sensed_base
 from deal_hw.types import FloatArray, Status, Trajectory
 from deal_hw.viz import palette
 from deal_hw.viz.backend import rr
 from deal_hw.viz.blueprint import inspect_blueprint
+from deal_hw.viz.body_log import log_body
 from deal_hw.viz.columns import Log, command_device_times, host_to_device
 from deal_hw.viz.robot_view import log_robot, log_surroundings
 from deal_hw.viz.summary import summary_markdown
@@ -79,6 +83,8 @@ def write_episode(
         if cycles is not None:
             log_cycles(log, trajectory, cycles)
         log_status(log, trajectory)
+        if trajectory.body is not None:
+            log_body(log, trajectory, trajectory.body, description)
         log_events(log, trajectory)
         if overlay is not None:
             log_overlay(log, trajectory, overlay)
@@ -219,19 +225,31 @@ def log_scene(
     scene = read_scene(robot)
     clocks = trajectory.device_s, trajectory.receive_s
     log_surroundings(log, scene)
-    log_robot(log, scene, "real", palette.REAL, body_poses(robot, trajectory.position), clocks, ghost=False)
+    base = sensed_base(robot, trajectory)
+    poses = body_poses(robot, trajectory.position, base)
+    log_robot(log, scene, "real", palette.REAL, poses, clocks, ghost=False)
     if overlay is None:
         return
-    for name in overlay.predictions:
+    for name, prediction in overlay.predictions.items():
         color = palette.color_of(name, list(overlay.predictions))
-        poses = body_poses(robot, _at_samples(overlay, name, trajectory.position))
+        position = _at_samples(overlay, prediction.position, trajectory.position)
+        at = None
+        if base is not None and prediction.base is not None:
+            at = _at_samples(overlay, _beside(prediction.base, base[overlay.sample[:, 0]]), base)
+        poses = body_poses(robot, position, at)
         log_robot(log, scene, name, color, poses, clocks, ghost=True)
 
 
-def _at_samples(overlay: Overlay, name: str, measured: FloatArray) -> FloatArray:
-    """Return a prediction at the samples, (T, J): at a seam the end of a window; measured outside windows."""
+def _beside(predicted: FloatArray, start: FloatArray) -> FloatArray:
+    """Shift predicted base poses, (W, H + 1, 7), so that each window starts where the real one is drawn."""
+    moved = predicted.copy()
+    moved[..., :3] += (start[:, :3] - predicted[:, 0, :3])[:, None]
+    return moved
+
+
+def _at_samples(overlay: Overlay, position: FloatArray, measured: FloatArray) -> FloatArray:
+    """Return a prediction at the samples, (T, ...): at a seam a window's end; measured outside windows."""
     out = measured.copy()
-    position = overlay.predictions[name].position
     out[overlay.sample[:, 0]] = position[:, 0]
     out[overlay.sample[:, 1:]] = position[:, 1:]
     return out

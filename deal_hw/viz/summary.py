@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.description import RobotDescription
-from deal_hw.sim.overlay import Overlay
+from deal_hw.sim.overlay import Overlay, Prediction
 from deal_hw.types import Trajectory
+
+_WIDE = 3
+"""Robots with more joints get a row for each instead of a column."""
 
 
 def summary_markdown(
@@ -44,22 +47,44 @@ def _recording(trajectory: Trajectory, description: RobotDescription) -> str:
 
 
 def _errors(overlay: Overlay, description: RobotDescription) -> str:
+    title = f"**Open-loop prediction, restarted every {overlay.window_s:.2f} s.** RMSE (share of the range):"
+    if len(overlay.joint_names) > _WIDE:
+        return "\n".join([title, "", *_by_joint(overlay, description)])
     lines = [
-        f"**Open-loop prediction, restarted every {overlay.window_s:.2f} s.** RMSE (share of the range):",
+        title,
         "",
         "| set | " + " | ".join(overlay.joint_names) + " | latency |",
         "|---" * (len(overlay.joint_names) + 2) + "|",
     ]
     for name, prediction in overlay.predictions.items():
-        rmse = (prediction.window_rmse**2).mean(axis=0) ** 0.5
-        cells = [
-            f"{1e3 * value:.3g} m{unit} ({100 * share:.2g} %)"
-            for value, unit, share in zip(
-                rmse, description.position_units, prediction.position_nrmse, strict=True
-            )
-        ]
+        cells = _cells(prediction, description)
         lines.append(f"| {name} | " + " | ".join(cells) + f" | {1e3 * prediction.latency_s:.1f} ms |")
     return "\n".join(lines)
+
+
+def _by_joint(overlay: Overlay, description: RobotDescription) -> list[str]:
+    """Return the table's lines with a row for each joint."""
+    sets = {name: _cells(prediction, description) for name, prediction in overlay.predictions.items()}
+    latencies = [f"{1e3 * p.latency_s:.1f} ms" for p in overlay.predictions.values()]
+    return [
+        "| joint | " + " | ".join(sets) + " |",
+        "|---" * (len(sets) + 1) + "|",
+        *(
+            f"| {joint} | " + " | ".join(cells) + " |"
+            for joint, *cells in zip(overlay.joint_names, *sets.values(), strict=True)
+        ),
+        "| latency | " + " | ".join(latencies) + " |",
+    ]
+
+
+def _cells(prediction: Prediction, description: RobotDescription) -> list[str]:
+    rmse = (prediction.window_rmse**2).mean(axis=0) ** 0.5
+    return [
+        f"{1e3 * value:.3g} m{unit} ({100 * share:.2g} %)"
+        for value, unit, share in zip(
+            rmse, description.position_units, prediction.position_nrmse, strict=True
+        )
+    ]
 
 
 def _parameters(result: CalibrationResult) -> str:

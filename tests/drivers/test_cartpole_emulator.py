@@ -169,7 +169,7 @@ def test_a_link_is_made_replaced_and_removed(tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     """Unknown names list the table, negative times and impossible rates are refused."""
     with pytest.raises(UnknownNameError, match="known: cartpole"):
-        Emulate(robot="go2")
+        Emulate(robot="spot")
     with pytest.raises(UnknownNameError, match="known: serial"):
         Emulate(transport="smoke")
     with pytest.raises(ConfigurationError, match="vanish_after_s"):
@@ -229,8 +229,8 @@ def test_a_process_that_loses_its_parent_ends() -> None:
 
 def test_a_process_that_cannot_start_says_why() -> None:
     """The emulator's own error reaches whoever started it."""
-    with pytest.raises(TransportError, match="go2"):
-        EmulatorProcess("go2").start()
+    with pytest.raises(TransportError, match="spot"):
+        EmulatorProcess("spot").start()
 
 
 def drive(robot: object) -> None:

@@ -6,29 +6,60 @@ import sys
 import pytest
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import ROBOTS, TRANSPORTS, adopt_robot, make_robot, robot_description
-from deal_hw.errors import PortNotFoundError, UnknownNameError
+from deal_hw.drivers import (
+    REACHED_BY,
+    ROBOTS,
+    TOPIC_TRANSPORTS,
+    TRANSPORTS,
+    adopt_robot,
+    default_transport,
+    driver_description,
+    make_robot,
+    robot_description,
+)
+from deal_hw.errors import ConfigurationError, PortNotFoundError, UnknownNameError
 from deal_hw.robot import Robot
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_is_described_under_its_name(name: str) -> None:
     """The description's name is the table's, its model is there, its digest is stable."""
-    description = robot_description(name)
+    description = driver_description(name)
     assert description.name == name
     assert description.mjcf.is_file()
-    assert description.digest() == robot_description(name).digest()
+    assert description.digest() == driver_description(name).digest()
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
-@pytest.mark.parametrize("name", ROBOTS)
+NOWHERE = {"serial": "/dev/ttyNOPE", "dds": "nope0", "zenoh": "tcp/127.0.0.1:1"}
+PAIRS = [(name, transport) for name in ROBOTS for transport in REACHED_BY[name]]
+
+
+@pytest.mark.parametrize(("name", "transport"), PAIRS)
 def test_every_pair_can_be_made_without_touching_the_port(name: str, transport: str) -> None:
     """Constructors do no I/O: a port that does not exist is noticed at connect."""
-    robot = make_robot(name, transport, "/dev/ttyNOPE", MonotonicClock())
+    robot = make_robot(name, transport, NOWHERE[transport], MonotonicClock())
     assert isinstance(robot, Robot)
-    assert isinstance(adopt_robot(name, transport, 999, MonotonicClock()), Robot)
     with pytest.raises(PortNotFoundError):
         robot.connect()
+
+
+@pytest.mark.parametrize(("name", "transport"), PAIRS)
+def test_descriptors_are_inherited_where_there_are_any(name: str, transport: str) -> None:
+    """A serial port is adopted; a transport of topics says that each process opens its own."""
+    if transport in TOPIC_TRANSPORTS:
+        with pytest.raises(ConfigurationError, match="make_robot"):
+            adopt_robot(name, transport, 999, MonotonicClock())
+    else:
+        assert isinstance(adopt_robot(name, transport, 999, MonotonicClock()), Robot)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robot_says_how_it_is_reached(name: str) -> None:
+    """The first of its transports is the default, and others are refused with the choice."""
+    assert default_transport(name) == REACHED_BY[name][0]
+    for transport in set(TRANSPORTS) - set(REACHED_BY[name]):
+        with pytest.raises(ConfigurationError, match=REACHED_BY[name][0]):
+            make_robot(name, transport, NOWHERE[transport], MonotonicClock())
 
 
 def test_unknown_names_list_the_tables() -> None:

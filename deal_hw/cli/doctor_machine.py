@@ -1,0 +1,129 @@
+"""What `deal-hw doctor` looks at on this computer, without any robot."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from deal_hw.control.realtime import FIFO_PRIORITY
+from deal_hw.findings import Finding, Level
+
+PACKAGES: Final = (
+    ("eclipse-zenoh", "zenoh", ""), ("cyclonedds", "cyclonedds", "dds"), ("mujoco", "mujoco", "sim"),
+    ("torch", "torch", "calib"), ("rerun-sdk", "rerun", "viz"), ("onnxruntime", "onnxruntime", ""),
+)  # fmt: skip
+"""Distribution, module, extra that installs it ("": the base install)."""
+_LEAST_LOCK_BYTES: Final = 512 << 20
+_COARSE_S: Final = 1e-5
+_LEAST_RECEIVE_BYTES: Final = 200_000
+
+
+def examine_machine() -> Iterator[Finding]:
+    """Yield what was found."""
+    yield _system()
+    yield from _packages()
+    yield _scheduling()
+    yield _memory()
+    yield from _clock()
+    yield _receive_buffer()
+
+
+def _system() -> Finding:
+    text = f"Python {platform.python_version()} on {platform.system()} {platform.release()}, "
+    text += f"{platform.machine()}, {os.cpu_count()} processors"
+    if sys.platform != "linux":
+        return Finding("system", Level.FAIL, text, "deal-hw drives robots from Linux only")
+    return Finding("system", Level.OK, text)
+
+
+def _packages() -> Iterator[Finding]:
+    for name, module, extra in PACKAGES:
+        if importlib.util.find_spec(module) is not None:
+            yield Finding("packages", Level.OK, f"{name} {importlib.metadata.version(name)}")
+        elif extra:
+            hint = f"pip install 'deal-hw[{extra}]', if this computer needs it"
+            yield Finding("packages", Level.NOTE, f"{name} is not installed", hint)
+        else:
+            yield Finding("packages", Level.FAIL, f"{name} is not installed", "pip install deal-hw")
+
+
+def _scheduling() -> Finding:
+    allowed = _may_use_fifo()
+    if allowed:
+        return Finding("scheduling", Level.OK, f"SCHED_FIFO with priority {FIFO_PRIORITY} is permitted")
+    return Finding(
+        "scheduling",
+        Level.WARN,
+        "SCHED_FIFO is refused: cycles will be late when the computer is busy",
+        f"a line `{_user()} - rtprio {FIFO_PRIORITY + 20}` in /etc/security/limits.conf and a new login, or "
+        "CAP_SYS_NICE for the Python interpreter",
+    )
+
+
+def _may_use_fifo() -> bool:
+    """Try it in a child process: this one keeps its scheduling."""
+    child = os.fork()
+    if child == 0:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        except OSError:
+            os._exit(1)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def _memory() -> Finding:
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if os.geteuid() == 0 or soft == resource.RLIM_INFINITY or soft >= _LEAST_LOCK_BYTES:
+        return Finding("memory", Level.OK, "memory can be locked")
+    return Finding(
+        "memory",
+        Level.WARN,
+        f"only {soft >> 20} MiB of memory can be locked: a page fault may delay a cycle",
+        f"a line `{_user()} - memlock unlimited` in /etc/security/limits.conf and a new login",
+    )
+
+
+def _clock() -> Iterator[Finding]:
+    resolution_s = time.get_clock_info("monotonic").resolution
+    source = _read("/sys/devices/system/clocksource/clocksource0/current_clocksource") or "unknown"
+    text = f"the monotonic clock has {resolution_s * 1e9:.0f} ns resolution, source {source}"
+    if resolution_s > _COARSE_S or source in ("jiffies", "acpi_pm"):
+        yield Finding("clock", Level.WARN, text, "stamps will be coarse; choose the clock source tsc or hpet")
+    else:
+        yield Finding("clock", Level.OK, text)
+    governor = _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if governor and governor != "performance":
+        yield Finding(
+            "clock",
+            Level.NOTE,
+            f"the processor's frequency governor is {governor}",
+            "`cpupower frequency-set -g performance` wakes it up faster",
+        )
+
+
+def _receive_buffer() -> Finding:
+    most = int(_read("/proc/sys/net/core/rmem_max") or 0)
+    text = f"sockets may buffer {most // 1000} kB of received data"
+    if most >= _LEAST_RECEIVE_BYTES:
+        return Finding("network", Level.OK, text)
+    return Finding("network", Level.WARN, text, "sysctl -w net.core.rmem_max=2097152")
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def _user() -> str:
+    return os.environ.get("USER") or f"#{os.getuid()}"

@@ -1,0 +1,274 @@
+"""What can be told of a Go2 and the link to it by listening, and by asking who moves it; no motor command.
+
+Works over every transport of topics; over DDS it also reads the domain's discovery.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.remote import decode_remote
+from deal_hw.drivers.go2.rpc import Request, decode_response, encode_request
+from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
+from deal_hw.findings import Finding, Level
+from deal_hw.transport import Message, Transport
+
+SERVICE: Final = "motion_switcher"
+CHECK_MODE: Final = 1001
+ROUND_TRIPS: Final = 20
+_STATE_HZ: Final = 500.0
+_SLOW_ROUND_TRIP_S: Final = 0.02
+_ANSWER_S: Final = 1.0
+_LATE_S: Final = 0.01
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What came while listening."""
+
+    stamps: list[int] = field(default_factory=list)
+    ticks: list[int] = field(default_factory=list)
+    last: LowStateFrame | None = None
+    bad: dict[str, int] = field(default_factory=dict)
+    commands: int = 0
+
+
+class Checkup:
+    """Listens to a Go2 and asks its motion switcher.
+
+    Args:
+        link: A transport of topics, not opened.
+        clock: The clock of its stamps.
+        seconds: How long to listen [s].
+    """
+
+    def __init__(self, link: Transport, clock: Clock, seconds: float) -> None:
+        self._link, self._clock, self._seconds = link, clock, seconds
+
+    def run(self) -> Iterator[Finding]:
+        """Yield what was found; the transport is closed at the end.
+
+        Raises:
+            TransportError: It cannot be opened.
+        """
+        declare = getattr(self._link, "declare", None)
+        if declare is None:
+            raise TransportError(f"{type(self._link).__name__} carries no topics")
+        declare(
+            publish=[topics.request(SERVICE)],
+            subscribe=[topics.LOW_STATE, topics.LOW_COMMAND, topics.response(SERVICE)],
+        )
+        with self._link:
+            yield Finding("link", Level.OK, "the transport is open")
+            heard = self._listen()
+            yield from self._discovery()
+            yield from _judge_states(heard, self._seconds)
+            mode = yield from self._ask_mode()
+            yield from _judge_commands(heard, self._writers(), mode or "")
+            if heard.last is not None:
+                yield from _judge_robot(heard.last)
+
+    def _listen(self) -> _Heard:
+        heard = _Heard()
+        end_ns = self._clock.now_ns() + round(self._seconds * 1e9)
+        while (left_ns := end_ns - self._clock.now_ns()) > 0:
+            try:
+                _take(heard, self._link.receive(left_ns * 1e-9))
+            except TransportTimeoutError:
+                break
+        return heard
+
+    def _writers(self) -> tuple[str, ...]:
+        writers = getattr(self._link, "writers", None)
+        return tuple(writers(topics.LOW_COMMAND)) if writers is not None else ()
+
+    def _discovery(self) -> Iterator[Finding]:
+        survey = getattr(self._link, "survey", None)
+        if survey is None:
+            return
+        seen = survey()
+        if not seen.peers:
+            yield Finding(
+                "dds", Level.FAIL, "no other participant is on the domain",
+                "is the robot on, is this its network (192.168.123.x), is the domain 0, does a firewall "
+                "block UDP 7400 to 7500?",
+            )  # fmt: skip
+        for peer in seen.peers:
+            yield Finding("dds", Level.OK, str(peer))
+        for complaint in seen.complaints:
+            yield Finding("dds", Level.FAIL, complaint, "see docs/go2-dds.md")
+        typed = {end.topic: end.type_hash for end in seen.endpoints if end.topic in topics.TYPES}
+        for topic, type_hash in sorted(typed.items()):
+            yield Finding("dds", Level.OK, f"{topic}: type hash {type_hash or 'not told'}")
+
+    def _ask_mode(self) -> Generator[Finding, None, str | None]:
+        """Yield what the motion switcher tells; return the active mode's name, None without an answer."""
+        times: list[float] = []
+        answer = None
+        for number in range(ROUND_TRIPS):
+            begun = self._clock.now_ns()
+            identity = begun + number
+            payload = encode_request(Request(identity=identity, api=CHECK_MODE))
+            self._link.send(Message(topics.request(SERVICE), payload, begun))
+            found = self._answer(identity)
+            if found is None:
+                break
+            answer = found[0]
+            times.append((found[1] - begun) * 1e-9)
+        if answer is None:
+            yield Finding(
+                "services", Level.WARN, f"the service {SERVICE} does not answer",
+                "older firmware has the service robot_state instead; deal-hw tries that one, too",
+            )  # fmt: skip
+            return None
+        p50, most = float(np.median(times)), max(times)
+        text = (
+            f"round trip of a request: {p50 * 1e3:.2f} ms median, {most * 1e3:.2f} ms longest of {len(times)}"
+        )
+        slow = p50 > _SLOW_ROUND_TRIP_S
+        yield Finding(
+            "link", Level.WARN if slow else Level.OK, text,
+            "a cable instead of wireless; stop what else loads network and computer" if slow else "",
+        )  # fmt: skip
+        yield _judge_mode(answer)
+        return answer
+
+    def _answer(self, identity: int) -> tuple[str, int] | None:
+        """Return the active mode's name and the answer's stamp [ns]; None: no answer."""
+        until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
+        while (left_ns := until_ns - self._clock.now_ns()) > 0:
+            try:
+                message = self._link.receive(left_ns * 1e-9)
+            except TransportTimeoutError:
+                return None
+            if message.channel != topics.response(SERVICE):
+                continue
+            try:
+                response = decode_response(message.payload)
+                if response.identity == identity:
+                    return str(response.json().get("name", "")), message.stamp_ns
+            except FrameError:
+                continue
+        return None
+
+
+def _take(heard: _Heard, message: Message) -> None:
+    if message.channel == topics.LOW_COMMAND:
+        heard.commands += 1
+    if message.channel != topics.LOW_STATE:
+        return
+    try:
+        frame = decode_low_state(message.payload)
+    except FrameError as error:
+        text = str(error)
+        heard.bad[text] = heard.bad.get(text, 0) + 1
+        return
+    heard.stamps.append(message.stamp_ns)
+    heard.ticks.append(frame.tick_ms)
+    heard.last = frame
+
+
+def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
+    for text, count in heard.bad.items():
+        yield Finding(
+            "states", Level.FAIL, f"{count} messages on {topics.LOW_STATE} are no Go2 states: {text}",
+            "is it another robot, or a firmware with another layout?",
+        )  # fmt: skip
+    if len(heard.stamps) < 2:
+        yield Finding(
+            "states", Level.FAIL, f"no states came on {topics.LOW_STATE} within {seconds:g} s",
+            "is the robot on and started up (one minute), is this the right interface or endpoint, does a "
+            "firewall stand between?",
+        )  # fmt: skip
+        return
+    gaps = np.diff(heard.stamps) * 1e-9
+    rate = (len(heard.stamps) - 1) / ((heard.stamps[-1] - heard.stamps[0]) * 1e-9)
+    text = (
+        f"{rate:.0f} states a second; time between two: {np.median(gaps) * 1e3:.2f} ms median, "
+        f"{np.percentile(gaps, 99) * 1e3:.2f} ms p99, {gaps.max() * 1e3:.2f} ms longest"
+    )
+    sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
+    remedy = "a cable instead of wireless, a faster or less busy computer" if sparse or late else ""
+    yield Finding("states", Level.WARN if remedy else Level.OK, text, remedy)
+    ticks = np.diff(np.array(heard.ticks, dtype=np.int64).astype(np.uint32))
+    steps = ticks.astype(np.int32)
+    if (steps == 0).all():
+        yield Finding("states", Level.FAIL, "the robot's clock (tick) stands still", "restart the robot")
+        return
+    missing = int(np.sum(np.maximum(steps // 2 - 1, 0)))
+    back = int(np.sum(steps <= 0))
+    if missing or back:
+        yield Finding(
+            "states", Level.NOTE,
+            f"{missing} states lost and {back} repeated or out of order of {len(heard.ticks)}",
+        )  # fmt: skip
+    drift = (sum(steps.tolist()) * 1e-3) / ((heard.stamps[-1] - heard.stamps[0]) * 1e-9) - 1.0
+    yield Finding("states", Level.OK, f"robot's clock against ours: {drift * 100:+.2f} %")
+
+
+def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str) -> Iterator[Finding]:
+    if heard.commands and mode:
+        yield Finding(
+            "commands", Level.NOTE,
+            f"{heard.commands} motor commands came while sport mode {mode!r} is active, probably its own",
+            "run doctor again after the release: nobody may command the motors then",
+        )  # fmt: skip
+    elif heard.commands:
+        who = f" ({'; '.join(writers)})" if writers else ""
+        yield Finding(
+            "commands", Level.FAIL, f"somebody else commands the motors: {heard.commands} messages{who}",
+            "stop that program",
+        )  # fmt: skip
+    elif writers:
+        yield Finding(
+            "commands", Level.WARN, f"silent writers of {topics.LOW_COMMAND}: {'; '.join(writers)}",
+            "stop them if they are not deal-hw's own",
+        )  # fmt: skip
+    else:
+        yield Finding("commands", Level.OK, "nobody else commands the motors")
+
+
+def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
+    charge = frame.battery_percent
+    text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
+    low = charge < 20
+    yield Finding("robot", Level.WARN if low else Level.OK, text, "charge it" if low else "")
+    hottest = int(np.max(frame.temperature))
+    hot = hottest > 70
+    yield Finding(
+        "robot", Level.WARN if hot else Level.OK, f"hottest motor {hottest} °C",
+        "let it cool down" if hot else "",
+    )  # fmt: skip
+    w, x, y, z = (float(value) for value in frame.orientation)
+    upright = 1.0 - 2.0 * (x * x + y * y)
+    lean = math.degrees(math.acos(max(-1.0, min(1.0, upright))))
+    tilted = not lean < 30.0 or not abs(w * w + x * x + y * y + z * z - 1.0) < 0.01
+    yield Finding(
+        "robot", Level.WARN if tilted else Level.OK, f"the body leans by {lean:.0f} degrees",
+        "set it down level" if tilted else "",
+    )  # fmt: skip
+    remote = decode_remote(frame.remote)
+    if remote is None:
+        yield Finding(
+            "robot", Level.NOTE, "no remote is heard: L2+B cannot stop the robot",
+            "switch the remote on and pair it before you arm",
+        )  # fmt: skip
+    else:
+        yield Finding("robot", Level.OK, "the remote is heard: L2+B makes the robot passive")
+
+
+def _judge_mode(name: str) -> Finding:
+    if not name:
+        return Finding("services", Level.OK, "no sport mode is active: the low level is free")
+    return Finding(
+        "services", Level.NOTE, f"sport mode {name!r} is active",
+        "deal-hw releases it when it arms, after the robot has lain down; keep the robot on the floor",
+    )  # fmt: skip

@@ -1,0 +1,36 @@
+"""The real Go2 with its base held in the air: targets at 50 Hz, states at 500 Hz, no floor.
+
+The stand must hold the base still: the model's base does not move. The 200 Hz recording of iit-DLSLab is
+``go2_suspended``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2 import suspended
+from deal_hw.drivers.go2.description import DESCRIPTION as FLOOR
+from deal_hw.drivers.go2.driven import DRIVEN, WIRE_HZ, driven_limits, hung_legs
+
+DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
+    DRIVEN,
+    name="go2_hung",
+    stiffness=suspended.DESCRIPTION.stiffness,
+    damping=suspended.DESCRIPTION.damping,
+    device_rate_hz=WIRE_HZ,
+    limits=driven_limits(FLOOR.limits, hung_legs()),
+    mjcf=suspended.DESCRIPTION.mjcf,
+    floating_base=None,
+    sources={
+        **DRIVEN.sources,
+        "stiffness": suspended.DESCRIPTION.sources["stiffness"],
+        "damping": suspended.DESCRIPTION.sources["damping"],
+        "legs.tilt": "no limit: the base is held",
+        "legs.free_fall": "no limit: the base is held",
+    },
+)
+
+SPACES: Final = suspended.SPACES
+"""Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

@@ -1,0 +1,401 @@
+"""The Go2 over topics: DDS or Zenoh carries the same bytes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2 import hung, topics
+from deal_hw.drivers.go2.body import body_state, is_damped
+from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, LowStateFrame
+from deal_hw.drivers.go2.remote import decode_remote, parse_combination
+from deal_hw.drivers.go2.state_stream import CommandEcho, StateStream
+from deal_hw.drivers.go2.takeover import Takeover
+from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
+from deal_hw.robot import Robot
+from deal_hw.transport import Message, TopicTransport
+from deal_hw.types import FloatArray, JointCommand, RobotState, Status
+
+CONNECT_TIMEOUT_S: Final = 5.0
+STOP_BUTTONS: Final = "L2+B"
+PASSIVE_DELAY_NS: Final = 10_000_000
+"""States that were sensed sooner after the passive command say nothing about it [ns]."""
+PASSIVE_COPIES: Final = 3
+"""Messages get lost, and the last command must not: it is held for ever."""
+PUBLISHED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES))
+SUBSCRIBED: Final = (
+    topics.LOW_STATE,
+    topics.LOW_COMMAND,
+    *(topics.response(name) for name in topics.SERVICES),
+)
+_QUEUE: Final = 4096
+_ENOUGH: Final = 3
+"""Sound states with a running clock that make a Go2."""
+_TOO_MANY: Final = 20
+"""Messages that are no states, without one that is: then it is no Go2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Go2Info:
+    """What the robot says of itself.
+
+    Attributes:
+        battery: State of charge, 0 to 1.
+        voltage: Of the supply [V].
+        serial: Serial number, two words.
+        version: Version of its firmware, two words.
+    """
+
+    battery: float
+    voltage: float
+    serial: tuple[int, int]
+    version: tuple[int, int]
+
+
+class Go2Robot(Robot):
+    """A Unitree Go2 at its motors' own level.
+
+    The robot does what the last command says, for ever: it has no arming and no watchdog, and without torque
+    it falls. Passive therefore means damping, and being armed is this driver's own knowledge: before ``arm``
+    it sends nothing, and after ``passive`` nothing but damping.
+
+    ``home`` releases the robot's own controller (sport mode) and makes sure that nobody else commands the
+    motors; ``hand_back`` returns the robot to that controller. Whoever waits here keeps reading.
+
+    Attributes:
+        info: What the robot said of itself; None before ``connect``.
+
+    Args:
+        transport: Topics of the robot, or of a bridge to it.
+        clock: The clock of the transport's stamps.
+        stop_buttons: Buttons of the remote that stop a run while held together; "" for none.
+        check_crc: Whether states with a wrong checksum are dropped.
+    """
+
+    description: ClassVar[RobotDescription] = DRIVEN
+
+    def __init__(
+        self,
+        transport: TopicTransport,
+        clock: Clock,
+        *,
+        stop_buttons: str = STOP_BUTTONS,
+        check_crc: bool = True,
+    ) -> None:
+        self._transport, self._clock = transport, clock
+        self._stop_text, self._stop_mask = stop_buttons, parse_combination(stop_buttons)
+        self._stream, self._echo = StateStream(check_crc), CommandEcho()
+        self._encoder = LowCommandEncoder()
+        self._damping = np.array(self.description.passive_damping)
+        self._effort_limit = np.array(self.description.effort_limit)
+        self._speed_limit = np.array(self.description.speed_limit)
+        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
+        self._wire: deque[Message] = deque(maxlen=_QUEUE)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Be as new; an open transport still serves to make the robot passive."""
+        self.info: Go2Info | None = None
+        self._stream.reset()
+        self._echo.reset()
+        self._states.clear()
+        self._takeover = Takeover(
+            self._transport, self._clock, self._publish, self._pump, self._motion,
+            None if self.description.floating_base is None else np.array(self.description.rest_position),
+        )  # fmt: skip
+        self._frame: LowStateFrame | None = None
+        self._armed = self._homed = self._in_charge = False
+        self._in_force = b""
+        self._passive_ns: int | None = None
+        self._sequence = -1
+        self._fault = self._operator_stop = ""
+
+    def connect(self) -> None:
+        """Open the transport and wait for states of a Go2 whose clock runs; sends nothing."""
+        if self.info is not None:
+            return
+        self._transport.declare(publish=PUBLISHED, subscribe=SUBSCRIBED)
+        self._transport.open()
+        try:
+            self._forget()
+            self._wire.clear()
+            self.info = self._await_robot()
+        except BaseException:
+            self._transport.close()
+            raise
+
+    def disconnect(self) -> None:
+        """Close the transport."""
+        self._transport.close()
+        self._forget()
+
+    def home(self, timeout_s: float) -> None:
+        """Release the robot's own controller, lying, and make sure that nobody else commands the motors.
+
+        Raises:
+            TransportTimeoutError: The robot's services do not answer, or do not let go in time.
+            SafetyError: The robot does not lie down, a service refuses, or another program commands the
+                motors; the text names it.
+        """
+        self._check_connected()
+        self._in_charge, self._homed, self._operator_stop = True, False, ""
+        self._takeover.run(timeout_s)
+        self._homed = True
+        self._states.clear()
+
+    def hand_back(self, timeout_s: float) -> None:
+        """Return the robot to the mode that ``home`` released; it stands up. Nothing where none was released.
+
+        Raises:
+            SafetyError: The robot is armed, or the service refuses.
+            TransportTimeoutError: The mode does not have the robot in time.
+        """
+        if self._armed:
+            raise SafetyError("go2: make the robot passive before it is handed back")
+        self._homed, self._in_force, self._passive_ns = False, b"", None
+        self._takeover.hand_back(timeout_s)
+
+    def arm(self, timeout_s: float) -> None:
+        """Damp the robot in its measured pose, make sure that states follow, and let commands through.
+
+        Raises:
+            SafetyError: It was not homed, the stop buttons were pressed, or another program commands the
+                motors.
+            TransportTimeoutError: No new states arrive.
+        """
+        self._check_connected()
+        self._in_charge = True
+        self._drain()
+        if not self._homed:
+            raise SafetyError("go2: sport mode may still command the motors; call home() first")
+        if self._takeover.contested:
+            raise SafetyError(self._takeover.complaint())
+        if self._operator_stop:
+            raise SafetyError(f"go2: {self._operator_stop}; let go and call home() again")
+        self._fault = ""
+        self._command_damping()
+        seen = self._stream.accepted
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while self._stream.accepted < seen + _ENOUGH:
+            if (left_ns := deadline_ns - self._clock.now_ns()) <= 0:
+                raise TransportTimeoutError(f"go2: no new states within {timeout_s:g} s of the first command")
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump(left_ns * 1e-9)
+        self._armed, self._passive_ns = True, None
+        self._states.clear()
+
+    def read_state(self, timeout_s: float) -> RobotState:
+        """Return the next sound and new state; others are counted and dropped."""
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        stale = self._stream.stale
+        while not self._states:
+            try:
+                self._pump(max(0, deadline_ns - self._clock.now_ns()) * 1e-9)
+            except TransportTimeoutError as error:
+                frozen = " (it repeats old ones: its clock stands still)" * (self._stream.stale > stale)
+                raise TransportTimeoutError(
+                    f"go2: no new state within {timeout_s:g} s{frozen}; is the robot on, is the cable in "
+                    f"({self.link_errors} link errors so far)?"
+                ) from error
+        return self._states.popleft()
+
+    def send_command(self, command: JointCommand) -> JointCommand:
+        """Send P-D targets; once passive, damping is sent instead and returned.
+
+        The wire has no limits of effort and speed: those of the description come back.
+
+        Raises:
+            SafetyError: A value is not finite, or the robot was never armed.
+        """
+        low = LowCommand(
+            command.position_target,
+            command.velocity_target,
+            command.stiffness,
+            command.damping,
+            command.effort,
+        )
+        try:
+            payload = self._encoder.encode(low)
+        except FrameError as error:
+            raise SafetyError(f"go2: {error}") from error
+        if not self._armed:
+            if not self._in_force:
+                raise SafetyError("go2: not armed; call arm() before the first command")
+            low = self._damping_command()
+            payload = self._encoder.encode(low)
+        stamp_ns = self._publish(topics.LOW_COMMAND, payload)
+        self._in_force = payload
+        self._sequence += 1
+        self._echo.note(self._sequence, stamp_ns)
+        q, dq, kp, kd, tau = (
+            part.astype(np.float32).astype(np.float64)
+            for part in (low.position, low.velocity, low.stiffness, low.damping, low.effort)
+        )
+        return JointCommand(q, dq, kp, kd, tau, self._effort_limit.copy(), self._speed_limit.copy())
+
+    def repeat(self) -> None:
+        """Send the command in force again, the same bytes; nothing before the first."""
+        if self._in_force:
+            self._transport.send(Message(topics.LOW_COMMAND, self._in_force, self._clock.now_ns()))
+
+    def passive(self) -> None:
+        """Damp all joints; works on an open transport whatever happened before, and never waits.
+
+        States that were received before are forgotten, so that none of them passes for a confirmation.
+        Whoever set out to take the robot over and never commanded it sends nothing: sport mode may still hold
+        it, and two who command make the robot jump.
+        """
+        self._armed = False
+        self._states.clear()
+        if self._in_charge and not self._in_force:
+            return
+        self._passive_ns = self._clock.now_ns()
+        self._command_damping()
+        for _ in range(PASSIVE_COPIES - 1):
+            self.repeat()
+
+    @property
+    def operator_stop(self) -> str:
+        """Why the operator asked to stop by the remote since ``home``; "": nobody did."""
+        return self._operator_stop
+
+    @property
+    def fault(self) -> str:
+        """That another program commanded the motors since the robot was armed; "": none did."""
+        return self._fault
+
+    @property
+    def last_sequence(self) -> int:
+        """Number of the last new command; -1 before the first."""
+        return self._sequence
+
+    @property
+    def link_errors(self) -> int:
+        """Corrupt, missing, repeated and overtaken states so far."""
+        return self._stream.errors
+
+    def fileno(self) -> int:
+        """Return -1: each process opens its own path to the topics."""
+        return -1
+
+    def take_wire(self) -> list[Message]:
+        """Return and forget the messages since the last call; repeats of a command are left out."""
+        wire = list(self._wire)
+        self._wire.clear()
+        return wire
+
+    def _await_robot(self) -> Go2Info:
+        stream = self._stream
+        deadline_ns = self._clock.now_ns() + round(CONNECT_TIMEOUT_S * 1e9)
+        while stream.accepted < _ENOUGH and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
+            if stream.errors >= _TOO_MANY and (error := stream.complaint()) is not None:
+                raise error
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump(left_ns * 1e-9)
+        frame = self._frame
+        if frame is None or stream.accepted < _ENOUGH:
+            raise stream.complaint() or TransportTimeoutError(self._why_silent())
+        stream.errors = 0
+        self._states.clear()
+        values = frame.values()
+        return Go2Info(values.battery_percent / 100, values.voltage, values.serial, values.version)
+
+    def _why_silent(self) -> str:
+        where = getattr(self._transport, "port", type(self._transport).__name__)
+        if self._stream.stale:
+            return (
+                f"go2 on {where}: states come, but their clock stands still at "
+                f"{self._stream.device_ns // 1_000_000} ms; a robot that hangs (restart it), or a simulator "
+                "that leaves the tick alone?"
+            )
+        writers = self._transport.writers(topics.LOW_STATE)
+        seen = f" Seen writing it: {'; '.join(writers)}." if writers else ""
+        return (
+            f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{seen} Is the robot on "
+            "and booted, the cable in, the interface the one with an address 192.168.123.x (the robot is "
+            "192.168.123.161), and does the firewall let UDP through? Over Zenoh: does the bridge carry "
+            f"{topics.LOW_STATE}?"
+        )
+
+    def _publish(self, topic: str, payload: bytes) -> int:
+        stamp_ns = self._clock.now_ns()
+        self._transport.send(Message(topic, payload, stamp_ns))
+        self._wire.append(Message("tx", payload, stamp_ns))
+        return stamp_ns
+
+    def _damping_command(self) -> LowCommand:
+        zero = np.zeros(len(self._damping))
+        pose = self._motion()[0]
+        return LowCommand(pose if np.isfinite(pose).all() else zero, zero, zero, self._damping, zero)
+
+    def _command_damping(self) -> None:
+        """Send the passive command; it is none of the behaviour's, so it has no number."""
+        self._in_force = self._encoder.encode(self._damping_command())
+        self._publish(topics.LOW_COMMAND, self._in_force)
+
+    def _drain(self) -> None:
+        with contextlib.suppress(TransportTimeoutError):
+            while True:
+                self._pump(0.0)
+
+    def _pump(self, timeout_s: float) -> None:
+        """Take one message, waiting for it."""
+        message = self._transport.receive(timeout_s)
+        self._wire.append(Message("rx", message.payload, message.stamp_ns))
+        if message.channel == topics.LOW_STATE:
+            if (frame := self._stream.take(message)) is not None:
+                self._take_frame(frame, message.stamp_ns)
+            return
+        self._takeover.take(message)
+        if message.channel == topics.LOW_COMMAND and self._armed and not self._fault:
+            self._fault = self._takeover.complaint()
+
+    def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:
+        self._frame = frame
+        remote = decode_remote(frame.remote)
+        if remote is not None and remote.holds(self._stop_mask):
+            self._operator_stop = f"{self._stop_text} was pressed on the remote"
+        stream = self._stream
+        sequence, age_ns = self._echo.at(stream.device_ns, stream.offset_ns)
+        self._states.append(
+            RobotState(
+                position=frame.position, velocity=frame.velocity, effort=frame.effort, receive_ns=receive_ns,
+                device_ns=stream.device_ns, sequence=stream.sequence, command_sequence=sequence,
+                command_age_ns=age_ns, status=self._status(frame), body=body_state(frame, remote),
+            )
+        )  # fmt: skip
+
+    def _status(self, frame: LowStateFrame) -> Status:
+        if self._passive_ns is not None:
+            sensed_ns = self._stream.device_ns + self._stream.offset_ns
+            if sensed_ns - self._passive_ns >= PASSIVE_DELAY_NS and is_damped(
+                frame, self._damping, self._effort_limit
+            ):
+                self._passive_ns = None
+        status = Status.HOMED if self._homed else Status.NONE
+        if self._armed or self._passive_ns is not None:
+            status |= Status.ARMED
+        return status | Status.FAULT if self._fault else status
+
+    def _motion(self) -> tuple[FloatArray, FloatArray]:
+        """Return newest positions and velocities; zeros before the first state."""
+        if self._frame is None:
+            return np.zeros(len(self._damping)), np.zeros(len(self._damping))
+        return self._frame.position, self._frame.velocity
+
+    def _check_connected(self) -> None:
+        if self.info is None:
+            raise SafetyError("go2: not connected; call connect() first")
+
+
+class Go2HungRobot(Go2Robot):
+    """The same robot with its base held in the air."""
+
+    description: ClassVar[RobotDescription] = hung.DESCRIPTION

@@ -1,0 +1,162 @@
+"""Taking the motors over: the robot's own controller lets go, and nobody else commands them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, Services
+from deal_hw.errors import SafetyError, TransportTimeoutError
+from deal_hw.transport import Message, TopicTransport
+from deal_hw.types import FloatArray
+
+LISTEN_S: Final = 0.5
+"""How long nobody else may have commanded the motors before the robot is armed [s]."""
+RELEASE_PAUSE_S: Final = 1.0
+"""The vendor's example waits as long between releasing a mode and looking again [s]."""
+LIE_DOWN_S: Final = 4.0
+"""Longest wait for a robot that was told to lie down to come to rest [s]."""
+STILL_S: Final = 0.5
+_STILL_RAD_S: Final = 0.3
+_LYING_RAD: Final = 0.5
+"""A robot whose joints are this close to its rest pose needs not be laid down."""
+
+
+class Takeover:
+    """Releases sport mode, gives the robot back to it, and listens for others who command the motors.
+
+    Args:
+        transport: Topics of the robot.
+        clock: For waiting.
+        send: Sends a payload on a topic.
+        pump: Receives one message, waiting at most so long [s], and hands it to whom it concerns; raises
+            TransportTimeoutError where none comes.
+        motion: Returns positions and velocities of the joints in the newest state, (J,) each.
+        rest: The pose of a lying robot, (J,) [rad]; None for one whose base is held, which cannot fall.
+    """
+
+    def __init__(
+        self,
+        transport: TopicTransport,
+        clock: Clock,
+        send: Callable[[str, bytes], object],
+        pump: Callable[[float], None],
+        motion: Callable[[], tuple[FloatArray, FloatArray]],
+        rest: FloatArray | None,
+    ) -> None:
+        self._transport, self._clock, self._pump = transport, clock, pump
+        self._motion, self._rest = motion, rest
+        self._services = Services(send, pump, clock)
+        self._switcher = MotionSwitcher(self._services, clock)
+        self._foreign, self._foreign_ns = 0, -1
+
+    def take(self, message: Message) -> None:
+        """Take a message that is no state: somebody's command, or a service's answer."""
+        if message.channel == topics.LOW_COMMAND:
+            self._foreign += 1
+            self._foreign_ns = message.stamp_ns
+        else:
+            self._services.take(message)
+
+    def run(self, timeout_s: float) -> None:
+        """Release the active mode, lying, and return once nobody else has commanded the motors for a while.
+
+        Raises:
+            TransportTimeoutError: The robot's services do not answer, or do not let go in time.
+            SafetyError: The robot does not lie down, a service refuses, or another program commands the
+                motors; the text names it.
+        """
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while name := self._switcher.active(self._left_s(deadline_ns)):
+            self._lie_down(name, deadline_ns)
+            self._switcher.release(name, self._left_s(deadline_ns))
+            self._pump_until(self._clock.now_ns() + round(RELEASE_PAUSE_S * 1e9))
+            if self._left_s(deadline_ns) <= 0:
+                raise TransportTimeoutError(
+                    f"go2: mode {name!r} did not let go of the robot within {timeout_s:g} s; lay the robot "
+                    "down by its remote, or switch sport mode off in the vendor's app, and try again"
+                )
+        self._await_silence(deadline_ns)
+
+    def hand_back(self, timeout_s: float) -> None:
+        """Return the robot to the mode that was released; nothing where none was.
+
+        Raises:
+            TransportTimeoutError: The mode does not have the robot in time.
+            SafetyError: The service refuses.
+        """
+        if self._switcher.released:
+            self._switcher.select(self._switcher.released, timeout_s)
+
+    @property
+    def foreign(self) -> int:
+        """Commands of others heard so far."""
+        return self._foreign
+
+    @property
+    def contested(self) -> bool:
+        """Whether somebody else has commanded the motors just now."""
+        return self._foreign > 0 and self._clock.now_ns() - self._foreign_ns < round(LISTEN_S * 1e9)
+
+    def complaint(self) -> str:
+        """Return in words that somebody else commands the motors, and who it may be."""
+        writers = self._transport.writers(topics.LOW_COMMAND)
+        who = f" It is one of: {'; '.join(writers)}." if writers else ""
+        return (
+            f"go2: another program commands the robot's motors on {topics.LOW_COMMAND}.{who} Stop it; if it "
+            "is the robot's own sport mode, switch that off in the vendor's app"
+        )
+
+    def _lie_down(self, name: str, deadline_ns: int) -> None:
+        """Lay the robot down where it does not lie: released while it stands, it falls."""
+        if self._lies():
+            return
+        self._switcher.lie_down(self._left_s(deadline_ns))
+        self._await_stillness(deadline_ns)
+        if not self._lies():
+            raise SafetyError(
+                f"go2: mode {name!r} did not lay the robot down, and a robot that is released while it "
+                "stands falls; lay it down by its remote and try again"
+            )
+
+    def _lies(self) -> bool:
+        return self._rest is None or bool(np.abs(self._motion()[0] - self._rest).max() < _LYING_RAD)
+
+    def _await_stillness(self, deadline_ns: int) -> None:
+        """Wait until the robot lies and its joints have stopped, but not for ever."""
+        until_ns = min(self._clock.now_ns() + round(LIE_DOWN_S * 1e9), deadline_ns)
+        still_since_ns = self._clock.now_ns()
+        while (now_ns := self._clock.now_ns()) < until_ns:
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump((until_ns - now_ns) * 1e-9)
+            if np.abs(self._motion()[1]).max() > _STILL_RAD_S:
+                still_since_ns = self._clock.now_ns()
+            elif self._clock.now_ns() - still_since_ns >= round(STILL_S * 1e9) and self._lies():
+                return
+
+    def _await_silence(self, deadline_ns: int) -> None:
+        """Listen; a writer that is known but silent does not count: the robot keeps some of its own."""
+        listen_ns = round(LISTEN_S * 1e9)
+        begin_ns = self._clock.now_ns()
+        until_ns = max(deadline_ns, begin_ns + listen_ns)
+        while (now_ns := self._clock.now_ns()) < until_ns:
+            quiet_ns = max(begin_ns, self._foreign_ns)
+            if now_ns - quiet_ns >= listen_ns:
+                return
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump((min(quiet_ns + listen_ns, until_ns) - now_ns) * 1e-9)
+        if self._foreign_ns >= until_ns - listen_ns:
+            raise SafetyError(self.complaint())
+
+    def _pump_until(self, deadline_ns: int) -> None:
+        while (now_ns := self._clock.now_ns()) < deadline_ns:
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump((deadline_ns - now_ns) * 1e-9)
+
+    def _left_s(self, deadline_ns: int) -> float:
+        return max(deadline_ns - self._clock.now_ns(), 0) * 1e-9

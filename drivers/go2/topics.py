@@ -1,0 +1,59 @@
+"""Topics of the Go2 and the types that travel on them.
+
+Names are those of DDS, without a leading slash; zenoh-bridge-dds uses them as keys unchanged. Source:
+unitree_sdk2_python @ 37116c5 and unitree_ros2 @ eea2719.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from deal_hw.errors import UnknownNameError
+
+LOW_COMMAND: Final = "rt/lowcmd"
+LOW_STATE: Final = "rt/lowstate"
+LOW_STATE_SLOW: Final = "rt/lf/lowstate"
+SPORT_STATE: Final = "rt/sportmodestate"
+SPORT_STATE_SLOW: Final = "rt/lf/sportmodestate"
+WIRELESS: Final = "rt/wirelesscontroller"
+
+SERVICES: Final = ("motion_switcher", "sport", "robot_state")
+"""Services that answer requests: who moves the robot, the vendor's gaits, what runs on the robot."""
+
+
+def request(service: str) -> str:
+    """Return the topic of a service's requests.
+
+    Raises:
+        UnknownNameError: There is no such service.
+    """
+    return f"rt/api/{_known(service)}/request"
+
+
+def response(service: str) -> str:
+    """Return the topic of a service's responses.
+
+    Raises:
+        UnknownNameError: There is no such service.
+    """
+    return f"rt/api/{_known(service)}/response"
+
+
+def _known(service: str) -> str:
+    if service not in SERVICES:
+        raise UnknownNameError("Go2 service", service, SERVICES)
+    return service
+
+
+TYPES: Final[Mapping[str, str]] = {
+    LOW_COMMAND: "unitree_go::msg::dds_::LowCmd_",
+    LOW_STATE: "unitree_go::msg::dds_::LowState_",
+    LOW_STATE_SLOW: "unitree_go::msg::dds_::LowState_",
+    SPORT_STATE: "unitree_go::msg::dds_::SportModeState_",
+    SPORT_STATE_SLOW: "unitree_go::msg::dds_::SportModeState_",
+    WIRELESS: "unitree_go::msg::dds_::WirelessController_",
+    **{request(service): "unitree_api::msg::dds_::Request_" for service in SERVICES},
+    **{response(service): "unitree_api::msg::dds_::Response_" for service in SERVICES},
+}
+"""Topic -> name of its DDS type."""

@@ -1,0 +1,139 @@
+"""Topics over DDS (Cyclone DDS), as Unitree's robots speak it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.go2.topics import TYPES
+from deal_hw.drivers.transports.dds_discovery import DdsSurvey
+from deal_hw.drivers.transports.dds_domain import acquire_domain, dds_errors, release_domain
+from deal_hw.drivers.transports.dds_session import DdsSession
+from deal_hw.drivers.transports.dds_types import load_types
+from deal_hw.drivers.transports.interfaces import find_interface
+from deal_hw.errors import (
+    ConfigurationError,
+    TransportError,
+    TransportLostError,
+    TransportTimeoutError,
+    UnknownNameError,
+)
+from deal_hw.transport import Message, TopicTransport, WireOptions
+
+_OK, _BAD_PARAMETER, _TIMEOUT = 0, -3, -10
+"""Return codes of the C library."""
+
+
+class DdsTransport(TopicTransport):
+    """A participant of a DDS domain.
+
+    The quality of service is that of Unitree's SDKs (Cyclone's defaults: writers Reliable, readers
+    BestEffort), which matches whatever the robot uses, but readers keep more than one message and writers
+    never wait.
+
+    There is no thread of ours: Cyclone's own threads receive, and :meth:`receive` waits without the GIL.
+    Those threads inherit the scheduling of the thread that opens the transport, so set the real-time
+    priority before. DDS does not survive a fork; a child process opens a transport of its own.
+
+    Args:
+        port: Network interface, by name or IPv4 address; "lo" for this machine only.
+        clock: Gives the stamps.
+        options: The domain counts.
+    """
+
+    def __init__(self, port: str, clock: Clock, options: WireOptions | None = None) -> None:
+        self.port = port
+        self._clock = clock
+        self._domain = (options or WireOptions()).domain
+        self._topics: dict[str, tuple[bool, bool]] = {}
+        self._live: DdsSession | None = None
+
+    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
+        """Say which topics will be used; calls add up, and count from the next ``open``."""
+        for topic in (*publish, *subscribe):
+            if topic not in TYPES:
+                raise UnknownNameError("DDS topic", topic, TYPES)
+            writes, reads = self._topics.get(topic, (False, False))
+            self._topics[topic] = (writes or topic in publish, reads or topic in subscribe)
+
+    def open(self) -> None:
+        """Join the domain.
+
+        Raises:
+            PortNotFoundError: There is no such interface; the text lists those there are.
+            MissingExtraError: cyclonedds is not installed.
+            VersionMismatchError: Our types are not the robot's; joining could crash its DDS process.
+            ConfigurationError: This process has the domain open on another interface.
+        """
+        if self._live is None:
+            known = load_types()
+            types = {topic: known[TYPES[topic]] for topic in self._topics}
+            acquire_domain(self._domain, find_interface(self.port))
+            try:
+                with dds_errors(f"DDS on {self.port}, domain {self._domain}"):
+                    self._live = DdsSession(self._domain, self._topics, types, self._clock)
+            except BaseException:
+                release_domain(self._domain)
+                raise
+
+    def close(self) -> None:
+        """Leave the domain; peers hear of it at once."""
+        live, self._live = self._live, None
+        if live is not None:
+            live.close()
+            release_domain(self._domain)
+
+    def send(self, message: Message) -> None:
+        """Write at once.
+
+        Raises:
+            ConfigurationError: The topic is not declared, or the payload is no message of its type.
+            TransportTimeoutError: A peer confirms nothing and the queue is full; after 1 ms.
+        """
+        live = self._opened()
+        writer = live.writers.get(message.channel)
+        if writer is None:
+            declared = ", ".join(live.writers) or "none"
+            raise ConfigurationError(
+                f"topic {message.channel!r} is not declared for publishing; declared: {declared}"
+            )
+        code = live.write(writer, message.payload)
+        if code != _OK:
+            raise _send_error(message, code)
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the next message of all subscribed topics."""
+        live = self._opened()
+        message = live.next_message(max(0, round(timeout_s * 1e9)))
+        if message is None:
+            raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s")
+        return message
+
+    def writers(self, topic: str) -> tuple[str, ...]:
+        """Return the other participants that write a topic, each once.
+
+        Left out are processes that died on this computer, which discovery remembers for 10 s.
+        """
+        ends = self._opened().discovery.endpoints()
+        peers = {end.peer for end in ends if end.writes and end.topic == topic}
+        return tuple(sorted(str(peer) for peer in peers if not peer.is_ghost()))
+
+    def survey(self) -> DdsSurvey:
+        """Return who else is on the domain, with which types, and what does not fit."""
+        return self._opened().discovery.survey(TYPES)
+
+    def _opened(self) -> DdsSession:
+        if self._live is None:
+            raise TransportLostError(f"DDS on {self.port}: the transport is not open")
+        return self._live
+
+
+def _send_error(message: Message, code: int) -> TransportError | ConfigurationError:
+    if code == _TIMEOUT:
+        return TransportTimeoutError(f"{message.channel}: a peer confirms nothing and the queue is full")
+    if code == _BAD_PARAMETER:
+        return ConfigurationError(
+            f"{message.channel}: {len(message.payload)} bytes starting {message.payload[:4].hex(' ')!r} are "
+            f"no {TYPES[message.channel]} in CDR with its 4-byte header"
+        )
+    return TransportError(f"{message.channel}: DDS did not take the message (code {code})")

@@ -1,0 +1,271 @@
+"""Messages with topics over Zenoh, as zenoh-bridge-dds maps DDS: topic as key, CDR as payload."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import queue
+import re
+import threading
+from collections.abc import Callable, Collection, Iterator
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.drivers.transports import zenoh_session
+from deal_hw.errors import (
+    ConfigurationError,
+    PortBusyError,
+    PortNotFoundError,
+    TransportLostError,
+    TransportTimeoutError,
+)
+from deal_hw.transport import Message, TopicTransport, WireOptions
+
+if TYPE_CHECKING:
+    import zenoh
+    from zenoh.handlers import Handler, RingChannel
+
+T = TypeVar("T")
+
+_TOPIC: Final = re.compile(r"[^/*$?#\s]+(/[^/*$?#\s]+)*")
+_AT_HAND: Final = 256
+"""Messages kept for a reader that does not come: half a second of states. The oldest are dropped."""
+_JOIN_S: Final = 1.0
+
+
+class ZenohTransport(TopicTransport):
+    """A Zenoh session with named end points, no discovery, and nothing that waits.
+
+    Sending never waits: what a stalled peer cannot take is dropped. A thread per subscribed topic stamps
+    messages as they arrive; it has the scheduling of the thread that calls :meth:`open`, and so have Zenoh's
+    own threads with the first session of a process. A process with deadlines therefore calls ``open`` after
+    it has become a real-time process.
+
+    The side that listens has no peer in particular, so silence is all it notices. The side that went to an
+    end point knows when its link is gone: then ``send`` and ``receive`` raise
+    :class:`~deal_hw.errors.TransportLostError`, ``receive`` only after it has handed out what was at hand.
+    Zenoh goes on trying to reach the end point, and once it is back both work again.
+
+    Args:
+        port: End points, comma separated: "tcp/127.0.0.1:7447". A peer goes to all of them, a client to the
+            first that answers.
+        clock: Gives the stamps.
+        options: Whether to listen there, the mode, and who may connect.
+    """
+
+    def __init__(self, port: str, clock: Clock | None = None, options: WireOptions | None = None) -> None:
+        self.port = port
+        self._clock = clock or MonotonicClock()
+        self._options = options or WireOptions()
+        self._publish: set[str] = set()
+        self._subscribe: set[str] = set()
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._threads: list[threading.Thread] = []
+        self._arrived: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        self._lost = False
+        # A daemon thread that is inside Zenoh when the interpreter ends makes the process abort, so close()
+        # waits for it. Re-entrant, because a signal handler may close what the code that it interrupted uses.
+        self._sending = threading.RLock()
+
+    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
+        """Say which topics will be used, from the next ``open`` on.
+
+        Raises:
+            ConfigurationError: A name is no topic, such as one with a wildcard.
+        """
+        for topic in (*publish, *subscribe):
+            if not _TOPIC.fullmatch(topic):
+                raise ConfigurationError(
+                    f"topic {topic!r}: write it as on the wire of DDS, such as rt/lowstate, without a "
+                    "leading slash and without * $ ? #"
+                )
+        self._publish |= set(publish)
+        self._subscribe |= set(subscribe)
+
+    def open(self) -> None:
+        """Listen at the end points, or go to them and wait for the session.
+
+        Raises:
+            ConfigurationError: The end points cannot be used as they are.
+            PortNotFoundError: Nothing listens there, or it is no Zenoh, or there is no such address here.
+            PortBusyError: Somebody else listens there.
+            TransportTimeoutError: The host does not answer.
+        """
+        if self._session is not None:
+            return
+        self._arrived, self._lost = queue.SimpleQueue(), False
+        self._session = self._open_session()
+        # A process that dies of an exception must not stay behind, alive for its peers.
+        atexit.register(self.close)
+        try:
+            self._declare_all(self._session)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the session; what came and was not received is lost."""
+        session, self._session = self._session, None
+        with self._sending:
+            self._publishers = {}
+        if session is None:
+            return
+        atexit.unregister(self.close)
+        with contextlib.suppress(Exception):
+            session.close()  # type: ignore[no-untyped-call]
+        # Their channels are closed now, so they end; one that hangs is a daemon and keeps nobody.
+        threads, self._threads = self._threads, []
+        for thread in threads:
+            thread.join(_JOIN_S)
+
+    def send(self, message: Message) -> None:
+        """Put a message on the wire, or drop it where a peer takes no more.
+
+        Raises:
+            ConfigurationError: The topic was not declared for publishing.
+            TransportLostError: The link to the end points is gone, or the transport is not open.
+        """
+        with self._sending:
+            publisher = self._publishers.get(message.channel)
+            if publisher is None:
+                self._opened()
+                raise ConfigurationError(
+                    f"{self.port}: topic {message.channel!r} is not declared for publishing; declared: "
+                    f"{', '.join(sorted(self._publish)) or '(none)'}"
+                )
+            if self._lost:
+                raise self._gone()
+            try:
+                publisher.put(message.payload)
+            except Exception as error:  # Zenoh raises an error of its own, which is not imported here.
+                raise TransportLostError(f"{self.port}: sending failed: {error}") from error
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the next message of the subscribed topics."""
+        self._opened()
+        try:
+            message = self._arrived.get(timeout=timeout_s) if timeout_s > 0 else self._arrived.get_nowait()
+        except queue.Empty:
+            if self._lost:
+                raise self._gone() from None
+            raise TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s") from None
+        if message is not None:
+            return message
+        if self._lost:
+            raise self._gone()
+        return self.receive(timeout_s)
+
+    def writers(self, topic: str) -> tuple[str, ...]:
+        """Return nothing: Zenoh does not tell who writes."""
+        return ()
+
+    def _open_session(self) -> zenoh.Session:
+        endpoints = zenoh_session.parse_endpoints(self.port)
+        zenoh_session.check_security(endpoints, self._options)
+        if not self._options.listen:
+            endpoints = zenoh_session.answering(endpoints, self._options)
+        import zenoh
+
+        try:
+            config = zenoh.Config()
+            for key, value in zenoh_session.settings(endpoints, self._options).items():
+                config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise ConfigurationError(f"{self.port}: Zenoh refuses a setting: {error}") from error
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            raise self._open_error(endpoints, str(error)) from error
+
+    def _open_error(
+        self, endpoints: tuple[zenoh_session.Endpoint, ...], text: str
+    ) -> PortNotFoundError | PortBusyError:
+        if "Address already in use" in text:
+            return PortBusyError(f"{self.port}: another process listens there; name another port")
+        if self._options.listen:
+            return PortNotFoundError(
+                f"{self.port}: cannot listen there ({text[:200]}); name an address of this machine"
+            )
+        reason = zenoh_session.why_no_session(endpoints, self._options)
+        return PortNotFoundError(f"{self.port}: no Zenoh session: {reason}")
+
+    def _declare_all(self, session: zenoh.Session) -> None:
+        import zenoh
+
+        if not self._options.listen:
+            events = session.info.declare_transport_events_listener(_ring(), history=True)
+            # The link may be gone again already, and then there is no history of it.
+            self._lost = not session.info.transports()
+            self._start(self._follow_links, "zenoh links", events, self._arrived)
+        for topic in sorted(self._subscribe):
+            # Handlers, never callbacks: a callback has a thread that keeps the interpreter from ending.
+            subscriber = session.declare_subscriber(topic, _ring(), allowed_origin=zenoh.Locality.REMOTE)
+            self._start(self._read, f"zenoh {topic}", topic, subscriber, self._arrived)
+        for topic in sorted(self._publish):
+            self._publishers[topic] = session.declare_publisher(
+                topic,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
+
+    def _start(self, run: Callable[..., None], name: str, *arguments: object) -> None:
+        thread = threading.Thread(target=run, name=name, args=arguments, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _read(
+        self,
+        topic: str,
+        subscriber: zenoh.Subscriber[Handler[zenoh.Sample]],
+        arrived: queue.SimpleQueue[Message | None],
+    ) -> None:
+        for sample in _until_closed(subscriber.recv):
+            arrived.put(Message(topic, sample.payload.to_bytes(), self._clock.now_ns()))
+            if arrived.qsize() > _AT_HAND:
+                with contextlib.suppress(queue.Empty):
+                    arrived.get_nowait()
+
+    def _follow_links(
+        self,
+        events: zenoh.TransportEventsListener[Handler[zenoh.TransportEvent]],
+        arrived: queue.SimpleQueue[Message | None],
+    ) -> None:
+        import zenoh
+
+        links: set[str] = set()
+        for event in _until_closed(events.recv):
+            if event.kind == zenoh.SampleKind.PUT:
+                links.add(str(event.transport.zid))
+            else:
+                links.discard(str(event.transport.zid))
+            self._lost = not links
+            if self._lost:
+                # Whoever waits shall hear it now.
+                arrived.put(None)
+
+    def _opened(self) -> None:
+        if self._session is None:
+            raise TransportLostError(f"{self.port}: the transport is not open")
+
+    def _gone(self) -> TransportLostError:
+        return TransportLostError(
+            f"{self.port}: the link is gone: the bridge or emulator stopped, or the network is down; Zenoh "
+            "goes on trying to reach it"
+        )
+
+
+def _ring() -> RingChannel[Any]:
+    from zenoh.handlers import RingChannel
+
+    return RingChannel(_AT_HAND)
+
+
+def _until_closed(receive: Callable[[], T]) -> Iterator[T]:
+    """Yield what comes until the session is closed."""
+    with contextlib.suppress(Exception):
+        while True:
+            yield receive()

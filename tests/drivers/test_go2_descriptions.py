@@ -1,0 +1,76 @@
+"""The Go2 as its driver has it: facts that agree with the simulated robot's, each limit with its source."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.description import LegLimits, RobotDescription
+from deal_hw.drivers.go2 import hung, suspended
+from deal_hw.drivers.go2.description import DESCRIPTION
+from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.sim.model import load_model
+
+BOTH = pytest.mark.parametrize("driven", [DRIVEN, hung.DESCRIPTION], ids=lambda d: d.name)
+
+
+@BOTH
+def test_every_limit_for_legs_has_a_source(driven: RobotDescription) -> None:
+    """Assumptions are called assumptions."""
+    assert driven.limits.legs is not None
+    for field in dataclasses.fields(LegLimits):
+        assert driven.sources[f"legs.{field.name}"]
+    for name in ("repeat_rate_hz", "passive_damping", "rest_position", "state_rate_hz", "silence_s"):
+        assert driven.sources[name]
+
+
+@BOTH
+def test_the_rest_pose_can_be_commanded_and_measured(driven: RobotDescription) -> None:
+    """Targets reach it; a robot that lies on its stops, calves at -2.81 rad, does not trip."""
+    rest = np.array(driven.rest_position)
+    low, high = np.array(driven.limits.target).T
+    assert ((low <= rest) & (rest <= high)).all()
+    lying = np.tile([0.33, 1.29, -2.811], 4)
+    low, high = np.array(driven.limits.trip_position).T
+    assert ((low <= lying) & (lying <= high)).all()
+
+
+@BOTH
+def test_the_models_step_is_the_drives_period(driven: RobotDescription) -> None:
+    """Recordings of 500 Hz are simulated at 500 Hz, whatever the shared model's own step."""
+    robot = load_model(driven)
+    assert math.isclose(robot.step_s * driven.device_rate_hz, 1.0)
+    assert driven.steps_per_control == 10
+    for foot in driven.feet:
+        robot.model.geom(foot)
+
+
+def test_the_suspended_recording_keeps_its_own_step() -> None:
+    """The same file, 400 Hz."""
+    assert hung.DESCRIPTION.mjcf == suspended.DESCRIPTION.mjcf
+    assert load_model(suspended.DESCRIPTION).step_s == 0.0025
+
+
+def test_the_shipped_policy_fits_the_driven_robot() -> None:
+    """Trained on the simulated description, it meets the same names, poses, gains and rate."""
+    path = Path(str(resources.files("deal_hw.policies") / "assets" / "go2_udr.onnx"))
+    OnnxPolicy(path).spec.check_fits(DRIVEN)
+    assert (DRIVEN.name, DRIVEN.stiffness, DRIVEN.damping) == (
+        DESCRIPTION.name,
+        DESCRIPTION.stiffness,
+        DESCRIPTION.damping,
+    )
+
+
+def test_the_hung_robot_may_lean() -> None:
+    """It hangs as it hangs: neither tilt nor free fall trip it; everything else does."""
+    legs, floor = hung.DESCRIPTION.limits.legs, DRIVEN.limits.legs
+    assert legs is not None and floor is not None
+    assert math.isinf(legs.tilt) and legs.free_fall == 0.0
+    assert dataclasses.replace(legs, tilt=floor.tilt, free_fall=floor.free_fall) == floor

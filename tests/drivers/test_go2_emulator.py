@@ -1,0 +1,253 @@
+"""The emulated Go2 in time: on a clock that the test sets and a wire in memory, and as a process."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.cli.emulate_go2 import Go2Options, free_port, make_transport, summary
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.clock import MonotonicClock, VirtualClock
+from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.device import Go2Device
+from deal_hw.drivers.go2.emulator import Go2Emulator
+from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, decode_low_state
+from deal_hw.drivers.go2.rpc import Request, decode_response, encode_request
+from deal_hw.drivers.go2.sport_controller import STANDING
+from deal_hw.drivers.go2.truth import nominal_truth
+from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError, UnknownNameError
+from deal_hw.transport import Message, TopicTransport, WireOptions
+
+MS = 1_000_000
+ZERO = np.zeros(12)
+STAND = LowCommandEncoder().encode(LowCommand(STANDING, ZERO, np.full(12, 60.0), np.full(12, 5.0), ZERO))
+
+
+class MemoryWire(TopicTransport):
+    """The robot's end of a wire whose other end is two lists."""
+
+    def __init__(self) -> None:
+        self.published: set[str] = set()
+        self.subscribed: set[str] = set()
+        self.arriving: deque[Message] = deque()
+        self.sent: list[Message] = []
+        self.is_open = self.broken = False
+
+    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
+        self.published |= set(publish)
+        self.subscribed |= set(subscribe)
+
+    def open(self) -> None:
+        self.is_open = True
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def send(self, message: Message) -> None:
+        assert message.channel in self.published
+        if self.broken:
+            raise TransportLostError("cut")
+        self.sent.append(message)
+
+    def receive(self, timeout_s: float) -> Message:
+        if not self.arriving:
+            raise TransportTimeoutError("nothing")
+        return self.arriving.popleft()
+
+    def writers(self, topic: str) -> tuple[str, ...]:
+        return ()
+
+
+class Bench:
+    """An emulator whose time the test moves."""
+
+    def __init__(self, **options: Any) -> None:
+        self.clock = VirtualClock(5_000 * MS)
+        self.device = Go2Device(nominal_truth(), **options)
+        self.wire = MemoryWire()
+        self.emulator = Go2Emulator(self.device, self.wire, self.clock)
+        self.emulator.open()
+
+    def run(self, milliseconds: int) -> list[Message]:
+        """Step through the milliseconds; return what was sent."""
+        self.wire.sent.clear()
+        for _ in range(milliseconds):
+            self.emulator.step()
+        return self.wire.sent
+
+    def ticks(self) -> list[int]:
+        """Return the ticks of the states of the last run [ms]."""
+        return [decode_low_state(m.payload).tick_ms for m in self.wire.sent if m.channel == topics.LOW_STATE]
+
+
+def test_device_time_follows_the_clock() -> None:
+    """A step is a tick at its own deadline: 100 steps end 99 ms after the first."""
+    bench = Bench(sport="")
+    bench.run(100)
+    assert bench.ticks() == list(range(0, 100, 2))
+    assert bench.clock.now_ns() == 5_099 * MS
+    assert bench.emulator.slips == bench.emulator.late == 0
+
+
+def test_it_reads_and_writes_what_the_robot_does() -> None:
+    """It subscribes commands and requests; rt/lowcmd is written only where sport mode is to be seen."""
+    wire = Bench(sport="normal").wire
+    assert wire.is_open
+    assert topics.LOW_COMMAND in wire.published
+    assert wire.subscribed == {topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES)}
+    assert wire.published <= set(topics.TYPES)
+    assert topics.LOW_COMMAND not in Bench(sport="normal", sport_on_wire=False).wire.published
+
+
+def test_commands_and_requests_arrive() -> None:
+    """A command moves the log, with the host's stamp; a request is answered within a tick."""
+    bench = Bench(sport="normal")
+    bench.wire.arriving.append(Message(topics.LOW_COMMAND, STAND, 77))
+    request = encode_request(Request(5, 1001))
+    bench.wire.arriving.append(Message(topics.request("motion_switcher"), request, 78))
+    sent = bench.run(1)
+    (answer,) = [m for m in sent if m.channel == topics.response("motion_switcher")]
+    assert decode_response(answer.payload).json() == {"form": "0", "name": "normal"}
+    assert bench.device.log.changes == [(0, 77, "stiff")]
+
+
+def test_a_short_stall_is_caught_up() -> None:
+    """40 ms behind are made good at once, and counted as late."""
+    bench = Bench(sport="")
+    bench.run(2)
+    bench.clock.advance_ns(40 * MS)
+    bench.run(1)
+    assert bench.ticks() == list(range(2, 42, 2))
+    assert (bench.emulator.late, bench.emulator.slips) == (1, 0)
+
+
+def test_a_long_stall_stops_the_robots_time() -> None:
+    """After a second away no burst of old states comes; the robot's clock stood still once."""
+    bench = Bench(sport="")
+    bench.run(2)
+    bench.clock.advance_ns(1000 * MS)
+    bench.run(4)
+    assert bench.ticks() == [2, 4]
+    report = bench.emulator.report()
+    assert (report["slips"], report["late_ticks"]) == (1, 1)
+    assert report["origin_host_ns"] == 5_000 * MS + 999 * MS
+
+
+def test_a_flood_does_not_stop_time() -> None:
+    """Of a thousand commands at once a tick takes 200, the next one goes on."""
+    bench = Bench(sport="")
+    bench.wire.arriving.extend(Message(topics.LOW_COMMAND, STAND, 0) for _ in range(1000))
+    bench.run(2)
+    assert bench.device.log.accepted == 400
+
+
+def test_a_cut_wire_does_not_stop_the_robot() -> None:
+    """What cannot be sent is counted; the robot goes on."""
+    bench = Bench(sport="", remote=None)
+    bench.wire.broken = True
+    bench.run(11)
+    # Six states, and one copy at the slow rate.
+    assert bench.emulator.report()["unsent"] == 7
+
+
+def test_the_summary_says_what_happened() -> None:
+    """Faults come with the time to damping, or with its absence."""
+    bench = Bench(sport="")
+    bench.run(2)
+    bench.device.begin_fault("hot")
+    assert bench.device.log.faults[0].begin_host_ns == 5_002 * MS
+    bench.run(2)
+    assert summary(bench.emulator.report()) == [
+        "emulator: 0.0 s, 2 states sent, 0 ticks late (worst 0.0 ms), 0 stalls, 0 messages not sent",
+        "commands: 0 taken, 0 refused, the last kind: none; sport mode: released",
+        "fault hot at 0.002 s: no damping since",
+    ]
+
+
+# The command line.
+
+
+def test_wrong_options_are_refused_before_anything_opens() -> None:
+    """Unknown wires, options of the other robot and contradictions are named."""
+    with pytest.raises(UnknownNameError, match="transport to emulate on 'serial'; known: dds, zenoh"):
+        Emulate(robot="go2", transport="serial")
+    with pytest.raises(UnknownNameError, match="robot to emulate 'spot'; known: cartpole, go2"):
+        Emulate(robot="spot")
+    with pytest.raises(ConfigurationError, match="emulate cartpole has no --suspended, --push, --port"):
+        Emulate(go2=Go2Options(suspended=True, push=5.0), port="lo")
+    with pytest.raises(ConfigurationError, match="emulate go2 has no --link, --vanish-after-s"):
+        Emulate(robot="go2", link=Path("x"), vanish_after_s=1.0)
+    contradiction = Go2Options(no_remote=True, remote_script=Path("x"))
+    with pytest.raises(ConfigurationError, match="--no-remote and --remote-script exclude each other"):
+        emulate(Emulate(robot="go2", transport="zenoh", go2=contradiction))
+
+
+def test_a_free_port_is_found() -> None:
+    """Number 0 becomes a number; anything else stays; an address of others is an error."""
+    assert free_port("tcp/127.0.0.1:7447") == "tcp/127.0.0.1:7447"
+    assert free_port("127.0.0.1") == "127.0.0.1"
+    found = free_port("tcp/127.0.0.1:0")
+    assert found.startswith("tcp/127.0.0.1:")
+    assert int(found.rpartition(":")[2]) > 0
+    with pytest.raises(ConfigurationError, match=r"port 'tcp/192\.0\.2\.1:0'"):
+        free_port("tcp/192.0.2.1:0")
+
+
+def test_transports_are_made_by_name() -> None:
+    """A name that is none lists those there are."""
+    with pytest.raises(UnknownNameError, match="transport of the Go2 'serial'; known: dds, zenoh"):
+        make_transport("serial", "x", WireOptions())
+
+
+def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
+    """A client releases sport mode and commands, sees ticks that count up; at the end the truth is told."""
+    pytest.importorskip("zenoh")
+    revealed = tmp_path / "truth.json"
+    process = EmulatorProcess(
+        "go2", "--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--seed", "3", "--start", "standing",
+        "--hot-after-s", "0", "--reveal-to", str(revealed),
+    )  # fmt: skip
+    with process:
+        client = make_transport("zenoh", process.port, WireOptions())
+        asked = topics.request("motion_switcher")
+        answers = topics.response("motion_switcher")
+        client.declare(publish=(asked, topics.LOW_COMMAND), subscribe=(answers, topics.LOW_STATE))
+        with client:
+            clock = MonotonicClock()
+            end_ns = clock.now_ns() + 20_000 * MS
+            wanted = {topics.LOW_STATE, answers, "hot"}
+            ticks: list[int] = []
+            while wanted and clock.now_ns() < end_ns:
+                client.send(Message(asked, encode_request(Request(9, 1003)), 0))
+                client.send(Message(topics.LOW_COMMAND, STAND, 0))
+                for _ in range(20):
+                    try:
+                        message = client.receive(0.5)
+                    except TransportTimeoutError:
+                        break
+                    wanted.discard(message.channel)
+                    if message.channel == topics.LOW_STATE:
+                        state = decode_low_state(message.payload)
+                        ticks.append(state.tick_ms)
+                        if state.temperature.max() == 95:
+                            wanted.discard("hot")
+            assert not wanted
+            assert ticks == sorted(ticks)
+        out, messages = process.stop()
+    assert "profile realistic, seed 3, on zenoh" in out
+    assert "fault hot at" in messages
+    report = json.loads(revealed.read_text())
+    assert report["commands"]["accepted"] > 0
+    assert report["requests_answered"] > 0
+    assert report["stiffness"]["FL_hip_joint"] != 1.0
+    again = Emulate(
+        robot="go2", transport="zenoh", port="tcp/127.0.0.1:0", truth_from=revealed, duration_s=0.0
+    )
+    assert emulate(again) == 0

@@ -1,0 +1,60 @@
+"""Network interfaces are found by name and address, and the wrong ones refused with advice."""
+
+from __future__ import annotations
+
+import pytest
+
+from deal_hw.drivers.transports import interfaces
+from deal_hw.drivers.transports.interfaces import Interface, find_interface, list_interfaces
+from deal_hw.errors import PortNotFoundError
+
+LO = Interface("lo", ("127.0.0.1",), up=True, carrier=True, multicast=False, loopback=True)
+CABLE = Interface(
+    "eth0", ("10.0.0.2", "192.168.123.99"), up=True, carrier=False, multicast=True, loopback=False
+)
+BARE = Interface("eth1", (), up=True, carrier=True, multicast=True, loopback=False)
+OFF = Interface("eth2", ("10.0.0.3",), up=False, carrier=False, multicast=True, loopback=False)
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with loopback and three cables."""
+    monkeypatch.setattr(interfaces, "list_interfaces", lambda: (LO, CABLE, BARE, OFF))
+
+
+def test_this_machine_has_loopback() -> None:
+    """Read from the kernel: name, address and flags."""
+    (lo,) = [interface for interface in list_interfaces() if interface.name == "lo"]
+    assert "127.0.0.1" in lo.addresses
+    assert lo.up
+    assert lo.loopback
+    assert lo.carrier
+
+
+@pytest.mark.usefixtures("machine")
+@pytest.mark.parametrize(
+    ("port", "found"), [("lo", LO), ("127.0.0.1", LO), ("eth0", CABLE), ("192.168.123.99", CABLE)]
+)
+def test_an_interface_has_a_name_and_addresses(port: str, found: Interface) -> None:
+    """Each of them finds it, also the second address."""
+    assert find_interface(port) is found
+
+
+@pytest.mark.usefixtures("machine")
+@pytest.mark.parametrize(
+    ("port", "words"),
+    [
+        (
+            "eth9",
+            r"'eth9'; interfaces at hand: lo 127\.0\.0\.1; eth0 10\.0\.0\.2, 192\.168\.123\.99 \(no carrier\)"
+            r"; eth1 without an IPv4 address; eth2 10\.0\.0\.3 \(down\)",
+        ),
+        ("", "interfaces at hand"),
+        ("eth1", r"ip address add 192\.168\.123\.99/24 dev eth1"),
+        ("eth2", "ip link set eth2 up"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_advice(port: str, words: str) -> None:
+    """The text lists the interfaces with their addresses, or says the command that helps."""
+    with pytest.raises(PortNotFoundError, match=words):
+        find_interface(port)

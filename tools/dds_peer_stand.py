@@ -1,0 +1,113 @@
+"""Let a C program on Cyclone DDS 0.10.2 stand the emulated Go2 up and lay it down; the result as JSON.
+
+    make dds-peer
+    python tools/dds_peer_stand.py --out docs/measured/dds_peer_stand.json
+
+The program does what the vendor's low-level example does: it releases sport mode by RPC, then sends targets
+at 500 Hz with kp 60 and kd 5. It runs twice: once until the robot stands, once to the end. What the program
+saw stands beside what only the emulator knows.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+PEER = ROOT / "build/dds_peer/go2_peer"
+STAND, LIE = 3, 4
+STANDING_M, LYING_M = 0.28, 0.12
+"""Base height above which the robot stands, below which it lies."""
+TOLD = ("base_height_m", "largest_tilt_rad", "sport", "commands", "requests_answered", "bad_requests")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DdsPeerStand:
+    """Stand the emulated Go2 up from a 0.10.2 program, and lay it down."""
+
+    out: Path | None = None
+    """Where the result goes; standard output by default."""
+
+    domain: int = 42
+    """DDS domain, and the next one."""
+
+    profile: str = "realistic"
+    """Profile of the emulator."""
+
+    seed: int = 0
+    """Its seed."""
+
+
+def run(phases: int, domain: int, config: DdsPeerStand) -> dict[str, Any]:
+    """Run an emulator and the program's first phases; return what both tell."""
+    with tempfile.TemporaryDirectory() as folder:
+        truth = Path(folder, "truth.json")
+        emulator = subprocess.Popen(
+            [
+                sys.executable, "-m", "deal_hw", "emulate", "go2", "--transport", "dds", "--port", "lo",
+                "--domain", str(domain), "--profile", config.profile, "--seed", str(config.seed),
+                "--duration-s", "120", "--reveal-to", str(truth),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )  # fmt: skip
+        wait_until_ready(emulator)
+        peer = subprocess.run(
+            [PEER, "stand", str(domain), str(phases)],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=100,
+        )
+        emulator.send_signal(signal.SIGINT)
+        emulator.communicate(timeout=30)
+        known = json.loads(truth.read_text())
+    return {
+        "peer": json.loads(peer.stdout) if peer.stdout else {},
+        "peer_exit_code": peer.returncode,
+        "peer_warnings": peer.stderr.splitlines(),
+        "emulator": {name: known[name] for name in TOLD},
+    }
+
+
+def wait_until_ready(emulator: subprocess.Popen[str]) -> None:
+    """Wait for the emulator's first line."""
+    if emulator.stdout is None or not emulator.stdout.readline().startswith("port "):
+        raise SystemExit("the emulator did not start: try deal-hw emulate go2 --transport dds --port lo")
+
+
+def clean(result: dict[str, Any]) -> bool:
+    """Return whether the program ended well, without a warning or a wrong checksum."""
+    return result["peer_exit_code"] == 0 and not result["peer_warnings"] and not result["peer"]["bad_crc"]
+
+
+def main(config: DdsPeerStand) -> int:
+    """Run twice; return the exit status."""
+    subprocess.run([ROOT / "tools/build_dds_peer.sh"], check=True)
+    stood = run(STAND, config.domain, config)
+    lay = run(LIE, config.domain + 1, config)
+    passed = (
+        stood["emulator"]["base_height_m"] > STANDING_M
+        and lay["emulator"]["base_height_m"] < LYING_M
+        and all(clean(result) for result in (stood, lay))
+    )
+    settings = {"passed": passed, "profile": config.profile, "seed": config.seed}
+    text = json.dumps({**settings, "stood": stood, "lay_down": lay}, indent=1) + "\n"
+    if config.out is None:
+        print(text, end="")
+    else:
+        config.out.write_text(text)
+    return 0 if passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(DdsPeerStand)))

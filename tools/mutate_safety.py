@@ -1,0 +1,102 @@
+"""Mutation run over the safety module: `make mutation`.
+
+mutmut changes the module in one place after another and runs the safety tests against each change. A change
+that no test notices survives. Survivors must stand in docs/safety-mutation.md with the reason why they may;
+any other fails the run.
+
+mutmut wants to own the directory it runs in, so the sources and the tests are copied into build/mutation; the
+rest of deal_hw (drivers) comes from the installed package.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+WORK = ROOT / "build" / "mutation"
+PAGE = ROOT / "docs" / "safety-mutation.md"
+MUTATED = ("deal_hw/control/safety*.py", "deal_hw/control/leg_checks.py")
+TESTS = "tests/control/test_control_safety*.py"
+SURVIVED = ("survived", "no tests", "suspicious", "skipped")
+CONFIGURATION = f"""
+[tool.mutmut]
+source_paths = ["deal_hw/"]
+only_mutate = {list(MUTATED)!r}
+pytest_add_cli_args_test_selection = ["tests"]
+use_git_change_detection = false
+# A busy machine must not make a test look as if it had noticed a change.
+timeout_multiplier = 60.0
+timeout_constant = 20.0
+
+[tool.pytest.ini_options]
+addopts = "--import-mode=importlib -p no:cacheprovider"
+filterwarnings = ["error"]
+"""
+
+
+def prepare() -> None:
+    """Copy what mutmut needs."""
+    shutil.rmtree(WORK, ignore_errors=True)
+    (WORK / "tests").mkdir(parents=True)
+    shutil.copytree(ROOT / "deal_hw", WORK / "deal_hw", ignore=shutil.ignore_patterns("__pycache__"))
+    for test in ROOT.glob(TESTS):
+        shutil.copy(test, WORK / "tests")
+    (WORK / "pyproject.toml").write_text(CONFIGURATION)
+
+
+def mutmut(*arguments: str) -> str:
+    """Run mutmut and return what it says."""
+    program = Path(sys.executable).parent / "mutmut"
+    done = subprocess.run([program, *arguments], cwd=WORK, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(
+            f"mutmut {' '.join(arguments)} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+        )
+    return done.stdout
+
+
+def verdicts() -> dict[str, str]:
+    """Return the verdict of each mutant."""
+    rows = (line.strip().rsplit(": ", 1) for line in mutmut("results", "--all", "true").splitlines())
+    return {row[0]: row[1] for row in rows if len(row) == 2}
+
+
+def change(mutant: str) -> tuple[str, str]:
+    """Return the changed line before and after."""
+    lines = mutmut("show", mutant).splitlines()
+    before = [line[1:].strip() for line in lines if line.startswith("-") and not line.startswith("---")]
+    after = [line[1:].strip() for line in lines if line.startswith("+") and not line.startswith("+++")]
+    return " ".join(before), " ".join(after)
+
+
+def main() -> int:
+    os.nice(10)
+    prepare()
+    children = str(max((os.cpu_count() or 2) - 1, 1))
+    mutmut("run", "--max-children", children)
+    found = verdicts()
+    counts = Counter(found.values())
+    print(f"{len(found)} mutants: " + ", ".join(f"{n} {name}" for name, n in counts.most_common()))
+    page = PAGE.read_text() if PAGE.exists() else ""
+    unexplained = 0
+    for mutant in sorted(name for name, verdict in found.items() if verdict in SURVIVED):
+        before, after = change(mutant)
+        known = f"`{after}`" in page
+        unexplained += not known
+        print(f"\n{'argued' if known else 'NEW'}: {mutant} ({found[mutant]})\n  - {before}\n  + {after}")
+    for mutant in sorted(name for name, verdict in found.items() if verdict == "timeout"):
+        print("\ntimed out, so noticed: {}\n  - {}\n  + {}".format(mutant, *change(mutant)))
+    if unexplained:
+        print(
+            f"\n{unexplained} survivors are not argued in {PAGE.relative_to(ROOT)}: test them or argue them"
+        )
+    return int(unexplained > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
