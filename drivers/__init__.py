@@ -32,6 +32,7 @@ SPACES: Final = {
     "ant": "deal_hw.drivers.ant.description:SPACES",
     "cartpole": "deal_hw.drivers.cartpole.description:SPACES",
     "go2": "deal_hw.drivers.go2.description:SPACES",
+    "go2_hung": "deal_hw.drivers.go2.hung:SPACES",
     "go2_suspended": "deal_hw.drivers.go2.suspended:SPACES",
     "so101": "deal_hw.drivers.so101.description:SPACES",
 }

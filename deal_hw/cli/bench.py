@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import json
 import os
 import platform
@@ -15,6 +16,7 @@ from typing import Any, Literal, cast
 import tyro
 
 from deal_hw.calibration import Budget
+from deal_hw.cli.bench_go2_transport import TransportBench
 from deal_hw.cli.calibrate_model import Recordings
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
@@ -27,11 +29,14 @@ FORMAT = "deal_hw.bench/1"
 class Bench:
     """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
 
-    bench: tyro.conf.Positional[Literal["loop", "honest", "mismatch", "paper", "real"]]
+    bench: tyro.conf.Positional[
+        Literal["loop", "honest", "mismatch", "paper", "real", "go2-codec", "go2-transport"]
+    ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
     simulator here does. paper: DEAL's protocol, whose target is the centre of the range. real: recordings
-    of a real robot (--model, --data), judged on held-out motion."""
+    of a real robot (--model, --data), judged on held-out motion. go2-codec: what the Go2's messages cost to
+    write and read. go2-transport: how regular 500 commands and states a second are over a wire."""
 
     recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
 
@@ -42,7 +47,10 @@ class Bench:
     """real: held-out predictions restart this often [s]."""
 
     residual_std: tuple[str, ...] = ()
-    """real: what a prediction may be off, as for `deal-hw calibrate`."""
+    """real: what a prediction may be off, as for `deal-hw calibrate`; by default the residual of a first
+    fit to the recordings that are fitted."""
+
+    link: tyro.conf.OmitArgPrefixes[TransportBench] = field(default_factory=TransportBench)
 
     task: str = "cartpole"
     """Tasks, comma separated: cartpole, ant, go2 (loop: the cart-pole only)."""
@@ -124,6 +132,14 @@ def parse_ratios(text: str) -> tuple[float, ...]:
 
 def bench(config: Bench) -> int:
     """Run the cells that are not done yet, writing the files after each; return 1 if any cell failed."""
+    if config.bench == "go2-codec":
+        from deal_hw.cli.bench_go2 import bench_codec
+
+        return bench_codec(config.out, quiet=config.quiet)
+    if config.bench == "go2-transport":
+        from deal_hw.cli.bench_go2_transport import bench_transport
+
+        return bench_transport(config.link, config.out, quiet=config.quiet)
     out = config.out or Path(f"{config.bench}.json")
     rows = _load(out)
     makers = {"loop": _loop_runs, "real": _real_runs}
@@ -206,11 +222,11 @@ def _calibration_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
 def _real_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
     try:
         from deal_hw.calib.methods import check_method
-        from deal_hw.cli.bench_real import KEY, prepare, run_cell
+        from deal_hw.cli.bench_real import KEY, METHODS, expected_std, prepare, run_cell, split_name
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "bench") from err
 
-    methods = _methods(config, ("nominal", "default"))
+    methods = _methods(config, METHODS)
     for method in methods:
         check_method(method)
     (ratio,) = parse_ratios(config.xi)[:1]
@@ -220,10 +236,14 @@ def _real_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
         config.recordings, config.holdout, xi, config.residual_std, threads=config.threads, quiet=config.quiet
     )
 
+    split = split_name(config.recordings, config.holdout)
+    # Fitted before the first cell that needs it, and once.
+    std = functools.cache(lambda: expected_std(work, config.residual_std, config.threads))
+
     def make(method: str, seed: int) -> Callable[[], dict[str, Any]]:
         polish = method == "default" or config.polish_all
         return lambda: run_cell(
-            work, task, method, seed, ratio, polish=polish, std=config.residual_std, threads=config.threads,
+            work, task, split, method, seed, ratio, polish=polish, std=std(), threads=config.threads,
             budget=lambda polish: Budget(
                 population=config.population, generations=config.generations, polish=polish
             ),
@@ -231,7 +251,7 @@ def _real_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
         )  # fmt: skip
 
     cells = [(method, seed) for seed in parse_seeds(config.seeds) for method in methods]
-    keys = [(task, m, m == "default" or config.polish_all, ratio, s) for m, s in cells]
+    keys = [(task, split, m, m == "default" or config.polish_all, ratio, s) for m, s in cells]
     return KEY, [(key, make(*cell)) for key, cell in zip(keys, cells, strict=True)]
 
 
@@ -269,23 +289,31 @@ def _load(path: Path) -> list[dict[str, Any]]:
 
 def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows with the machine they came from, the CSV and the figure."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    machine = {
-        "platform": platform.platform(),
-        "processors": len(os.sched_getaffinity(0)),
-        "load": list(os.getloadavg()),
-        "versions": versions(),
-        "git_commit": git_commit(),
-    }
-    write_json(
-        path, {"format": FORMAT, "machine": machine, "argv": ["deal-hw", *sys.argv[1:]], "rows": list(rows)}
-    )
+    write_rows(path, rows)
     names = sorted({k for row in rows for k, v in row.items() if not isinstance(v, dict | list)})
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
     _figure(path.with_suffix(".png"), [row for row in rows if not row["error"]])
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the machine they came from, as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = {"format": FORMAT, "machine": describe_machine(), "argv": ["deal-hw", *sys.argv[1:]]}
+    write_json(path, {**values, "rows": list(rows)})
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return what a reader of measurements must know of the machine."""
+    return {
+        "platform": platform.platform(),
+        "processors": len(os.sched_getaffinity(0)),
+        "load": list(os.getloadavg()),
+        "versions": versions(),
+        "git_commit": git_commit(),
+    }
 
 
 def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -326,14 +354,16 @@ def _print_real(rows: Sequence[Mapping[str, Any]]) -> None:
     from rich.table import Table
 
     table = Table(title="held-out RMSE in rad or m: mean over joints, all samples pooled")
-    for name in ("robot", "method", "seed", "mean", "pooled", "nominal", "at a bound", "flagged", "seconds"):
-        table.add_column(name, justify="left" if name in ("robot", "method") else "right")
+    words = ("robot", "held out", "method")
+    for name in (*words, "seed", "mean", "pooled", "nominal", "at a bound", "flagged", "seconds"):
+        table.add_column(name, justify="left" if name in words else "right")
     for row in rows:
         numbers = (
             row.get(f"heldout_{key}") for key in ("rmse_calibrated", "pooled_calibrated", "rmse_nominal")
         )
         table.add_row(
             row["task"],
+            row.get("split", ""),
             _group(row)[-1],
             str(row["seed"]),
             *("diverged" if value is None else f"{value:.4f}" for value in numbers),

@@ -58,6 +58,8 @@ def calibration_row(
         truth=[d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]],
         threads=threads,
     )  # fmt: skip
+    verdicts = zip(d.space.names, result.verdicts, strict=False)
+    untold = [name for name, verdict in verdicts if verdict == "not identifiable"]
     row = {
         "error_percent": error_percent(result.estimate, d.theta),
         "log_error_x100": log_error_x100(result.estimate, d.theta),
@@ -72,9 +74,10 @@ def calibration_row(
         "latency_found": result.latency_s,
         "steps": result.steps,
         "seconds": result.seconds,
-        "flagged": bool(result.alarms),
+        "flagged": bool(result.alarms) or bool(untold),
         "chi2": result.chi2,
         "alarms": list(result.alarms),
+        "untold": untold,
         "per_parameter": {
             p.name: {
                 "truth": float(d.theta[k]),
@@ -85,6 +88,7 @@ def calibration_row(
             for k, p in enumerate(d.space)
         },
         "refused_truths": d.refused,
+        "vigors": list(d.vigors),
     }
     return row, result
 

@@ -1,7 +1,8 @@
 """The real bench: methods against each other on recordings of a real robot, judged on held-out motion.
 
 There is no truth, so a row has held-out errors instead of parameter errors. All methods get the same
-recordings, parameters, ranges and budget.
+recordings, parameters, ranges and budget. What the searches may expect of a residual is fitted once, to the
+recordings that are fitted, unless it is given.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calibration import Budget
-from deal_hw.cli.calibrate_model import Recordings, prepare_model
+from deal_hw.cli.calibrate_model import HELDOUT_PART, Recordings, prepare_model
 from deal_hw.cli.calibrate_run import Narrowing, Work, calibrate_episodes, residual_std
 from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.types import FloatArray
 
-KEY = ("task", "method", "polish", "xi", "seed")
+KEY = ("task", "split", "method", "polish", "xi", "seed")
+METHODS = ("nominal", "open-loop", "weki", "mujoco-sysid", "least-squares-multistart")
+"""Rows where nothing else is asked for."""
 
 
 def prepare(
@@ -51,16 +55,36 @@ def prepare(
     )
 
 
+def split_name(recordings: Recordings, holdout: Sequence[Path]) -> str:
+    """Return what is held out, in a word or two."""
+    if holdout:
+        return "+".join(path.stem for path in holdout)
+    share = HELDOUT_PART if recordings.holdout_part is None else recordings.holdout_part
+    return f"last {share:.0%}"
+
+
+def expected_std(work: Work, words: Sequence[str], threads: int | None) -> FloatArray:
+    """Return what a prediction may be off, (2 C,): as it is given, or the residual of a first fit."""
+    from deal_hw.calib.horizon import expected_residual
+    from deal_hw.calib.problem import Problem
+
+    given = residual_std(words, work.robot)
+    if given is not None:
+        return given
+    return expected_residual(Problem(work.robot, work.space, work.episodes, threads=threads))
+
+
 def run_cell(
     work: Work,
     task: str,
+    split: str,
     method: str,
     seed: int,
     xi: float,
     *,
     polish: bool,
     budget: Callable[[bool], Budget],
-    std: Sequence[str],
+    std: FloatArray,
     window_s: float,
     threads: int | None,
 ) -> dict[str, Any]:
@@ -69,24 +93,25 @@ def run_cell(
     Args:
         work: What was prepared.
         task: Name of the robot in the row.
+        split: What is held out.
         method: Name of the method.
         seed: Of everything random.
         xi: Ratio of the search range, for the row.
         polish: Whether the polish follows.
         budget: Makes the budget.
-        std: What a prediction may be off, as for ``deal-hw calibrate --residual-std``.
+        std: What a prediction may be off, (2 C,); `open-loop` finds it itself.
         window_s: Held-out predictions restart this often [s].
         threads: Simulation threads.
     """
     row: dict[str, Any] = {
-        "bench": "real", "task": task, "profile": "real", "method": method, "polish": polish, "xi": xi,
-        "seed": seed, "error": "",
+        "bench": "real", "task": task, "split": split, "profile": "real", "method": method,
+        "polish": polish, "xi": xi, "seed": seed, "error": "",
     }  # fmt: skip
     try:
         result = calibrate_episodes(
             work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget(polish),
-            rng=np.random.default_rng(seed), threads=threads, known_std=residual_std(std, work.robot),
-            heldout_window_s=window_s,
+            rng=np.random.default_rng(seed), threads=threads, heldout_window_s=window_s,
+            known_std=None if method == "open-loop" else std,
         )  # fmt: skip
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"
@@ -107,8 +132,8 @@ def run_cell(
         "at_bound": [
             name for name, u in zip(work.space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6
         ],
-        "folds": result.provenance.get("folds"),
-        "halves": result.provenance.get("halves"),
+        "null_directions": list(result.null_directions),
+        **{name: result.provenance.get(name) for name in ("folds", "halves", "confounded", "heldout_rmse")},
         "estimate": dict(zip(work.space.names, map(float, result.estimate), strict=True)),
     }
     return row

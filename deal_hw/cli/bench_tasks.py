@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from deal_hw.cli.run_plan import Profile, RunPlan, make_behaviour, shipped_policy
-from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.virtual import VirtualCartpole, demonstrate
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.oracle import draw_truth
@@ -53,6 +53,7 @@ class Case:
         channel_std: True standard deviation of the measured channels, (M,); None where nothing is noisy.
         refused: Truths that were drawn and could not demonstrate.
         truth: The emulated robot's truth, where there is an emulator.
+        vigors: How lively each attempt at a demonstration was; the one in use moves best.
     """
 
     task: str
@@ -69,6 +70,7 @@ class Case:
     channel_std: FloatArray | None
     refused: int
     truth: Truth | None = None
+    vigors: tuple[float, ...] = (0.0,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,12 +126,13 @@ def _cartpole(ask: _Ask) -> Case:
     truth = nominal_truth(profile, seed) if ask.centred else draw_truth(profile, seed, xi=ask.xi)
     space = ask.ranges(SPACES)
     virtual = VirtualCartpole(truth)
-    recordings = []
-    policy = str(shipped_policy("cartpole") or "")
-    kinds: tuple[Profile, ...] = ("rich", "chirp")
-    for kind in kinds:
-        plan = RunPlan(robot="cartpole", profile=kind, seconds=DEMONSTRATION_S, seed=seed, policy=policy)
-        recordings.append(virtual.run(make_behaviour(plan, DESCRIPTION), DEMONSTRATION_S))
+    plan = RunPlan(
+        robot="cartpole", profile="rich", seconds=DEMONSTRATION_S, seed=seed,
+        policy=str(shipped_policy("cartpole") or ""),
+    )  # fmt: skip
+    shown, search = demonstrate(virtual, plan)
+    chirp = replace(plan, profile="chirp")
+    recordings = (shown, virtual.run(make_behaviour(chirp, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
     # The truth is of K9; what else may be searched has its nominal value.
     values = space.known | {p.name: p.nominal for p in space} | dict(truth.parameters)
@@ -139,6 +142,7 @@ def _cartpole(ask: _Ask) -> Case:
         heldout=heldout, fit_truth=recordings[0].true_states(fit),
         heldout_truth=recordings[1].true_states(heldout)[0],
         channel_std=find_profile(profile).sensor.position_std, refused=truth.refused, truth=truth,
+        vigors=tuple(attempt.vigor for attempt in search.attempts),
     )  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,8 @@ from deal_hw.cli.calibrate_run import (
     finish,
     residual_std,
 )
+from deal_hw.cli.excite import balancer
+from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
@@ -124,6 +126,9 @@ class Calibrate:
     report: bool = True
     """Write report.html, one page with everything; takes some seconds."""
 
+    advise: bool = True
+    """Compute what to record next where a parameter stayed weak or open; takes some seconds then."""
+
     quiet: bool = False
     """Print nothing but errors."""
 
@@ -188,7 +193,14 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)
     report = finish(
-        work, result, folder, settings, page=config.report, threads=config.threads, quiet=config.quiet
+        work,
+        result,
+        folder,
+        settings,
+        page=config.report,
+        advise=config.advise,
+        threads=config.threads,
+        quiet=config.quiet,
     )
     checkpoint.unlink(missing_ok=True)
     return report
@@ -269,6 +281,7 @@ def prepare_dataset(config: Calibrate) -> Work:
             "holdout": list(holdout),
         },
         advice="`deal-hw collect --profile chirp` records one",
+        balance=balancer(robot.description, None),
     )
 
 
@@ -281,9 +294,16 @@ def choose_episodes(
         ConfigurationError: Nothing is left to fit, or an episode is in both.
     """
     every = range(len(dataset.episodes))
-    profiles = {i: str(dataset.read(i).metadata.get("profile", "")) for i in every}
+    metadata = [dataset.read(i).metadata for i in every]
+    profiles = [str(m.get("profile", "")) for m in metadata]
     held = tuple(holdout) or tuple(i for i in every if profiles[i] == HELDOUT_PROFILE and i not in episodes)
-    fit = tuple(episodes) or tuple(i for i in every if i not in held)
+    repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
+    if repeated:
+        print(
+            f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)",
+            file=sys.stderr,
+        )
+    fit = tuple(episodes) or tuple(i for i in every if i not in held and i not in repeated)
     both = sorted(set(fit) & set(held))
     if both:
         raise ConfigurationError(
@@ -297,6 +317,12 @@ def choose_episodes(
     return fit, held
 
 
+def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
+    """Say whether a recording is the livelier repetition of the one before, by their metadata."""
+    same = all(one.get(key) == former.get(key) for key in ("profile", "seed", "seconds"))
+    return same and one.get("attempt", 0) == former.get("attempt", 0) + 1
+
+
 def make_space(robot: str, config: Calibrate) -> ParameterSpace:
     """Return the parameters to search.
 
@@ -304,7 +330,7 @@ def make_space(robot: str, config: Calibrate) -> ParameterSpace:
         UnknownNameError: A name is not known; the message lists the names.
         ConfigurationError: A range is empty, reversed, or excludes the nominal value.
     """
-    table = importlib.import_module(f"deal_hw.drivers.{robot}.description").SPACES
+    table = parameter_spaces(robot)
     name = config.space or next(iter(table))
     if name not in table:
         raise UnknownNameError("parameter set", name, table)
@@ -318,9 +344,14 @@ def _simulation(
     try:
         from deal_hw.sim.episode import align
         from deal_hw.sim.model import load_model
+        from deal_hw.sim.standing import with_sensed_base
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
-    from deal_hw.drivers import robot_description
 
-    description = robot_description(dataset.description["name"])
-    return load_model(description), {i: align(t, description) for i, t in recordings.items()}
+    robot = load_model(recorded_description(dataset.description["name"]))
+    episodes = {}
+    for i, trajectory in recordings.items():
+        episodes[i] = align(trajectory, robot.description)
+        if robot.base is not None and trajectory.body is not None:
+            episodes[i] = with_sensed_base(episodes[i], robot, trajectory.body)
+    return robot, episodes

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DROOP_EXPLAINED, DROOP_LEAST = 0.5, 0.01
 """A droop is believed where the model's gravity explains this share of it, and it is this large [rad, m]."""
-MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation")
+MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation", "actuation")
 """Checks that mean something where commands are efforts and not positions."""
 
 
@@ -50,7 +50,13 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
 
 
 def examine_recording(
-    table: Table, facts: JointFacts | None, force: bool, *, servo: bool = True, say: Callable[[str], None]
+    table: Table,
+    facts: JointFacts | None,
+    force: bool,
+    *,
+    servo: bool = True,
+    kept: Table | None = None,
+    say: Callable[[str], None],
 ) -> list[Verdict]:
     """Check a recording and tell what is wrong; return what is worth keeping.
 
@@ -59,19 +65,26 @@ def examine_recording(
         facts: The model's joints, for their limits; None without a model.
         force: Go on although a check failed.
         servo: Commands are positions; efforts are not compared with positions.
+        kept: The recording without what is left out; None: all of it is used.
         say: Takes each finding in words.
 
     Raises:
         DatasetError: A check failed, and that is not to be overlooked.
     """
     from deal_hw.data.checks import Severity
+    from deal_hw.data.command_kind import command_kind
     from deal_hw.data.plausibility import examine, require
     from deal_hw.errors import DatasetError
 
     limits = None
     if facts is not None:
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    found = [v for v in examine(table, limits) if v.severity is not Severity.OK]
+    every = list(examine(table, limits, kept))
+    if facts is not None and {v.name for v in every} >= {"assignment"}:
+        # The later checks ran, so clock and values are sound.
+        command = facts.command[[facts.names.index(name) for name in table.actuated]]
+        every.append(command_kind(table, servo=servo, limits=command))
+    found = [v for v in every if v.severity is not Severity.OK]
     if not servo:
         found = [v for v in found if v.name in MOTOR_CHECKS]
     for verdict in found:

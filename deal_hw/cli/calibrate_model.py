@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -152,14 +153,14 @@ def prepare_model(
     fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
+    parts = without(config.leave_out, fitted, held)
+    servo = description.actuation == "position"
     verdicts = {
-        table.name: examine_recording(
-            table, facts, config.force, servo=description.actuation == "position", say=say
-        )
-        for table in (*fitted, *held)
+        table.name: examine_recording(table, facts, config.force, servo=servo, kept=kept, say=say)
+        for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }
     robot = load_model(description, rates.step_s)
-    fitted, held = without(config.leave_out, fitted, held)
+    fitted, held = parts
     fit_recordings, held_recordings = (
         [r for table in tables for r in on_grid(table, robot, rates)] for tables in (fitted, held)
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -21,6 +21,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.control.behaviours import Behaviour
     from deal_hw.sim.episode import Episode
     from deal_hw.sim.model import RobotModel
 
@@ -42,6 +43,7 @@ class Work:
         telemetry: Verdicts on the recordings, for the report.
         provenance: Where all of it comes from: plain JSON values.
         advice: How to get a held-out recording where there is none.
+        balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
     """
 
     robot: RobotModel
@@ -52,6 +54,7 @@ class Work:
     telemetry: Sequence[str]
     provenance: Mapping[str, Any]
     advice: str
+    balance: Callable[[], Behaviour] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,6 +144,9 @@ def calibrate_episodes(
         heldout_window_s: Held-out predictions restart this often [s].
     """
     try:
+        from threadpoolctl import threadpool_limits
+
+        from deal_hw.calib.excitation import check_delays
         from deal_hw.calib.heldout import heldout_rmse
         from deal_hw.calib.methods import make_method
         from deal_hw.calib.problem import Problem
@@ -150,8 +156,14 @@ def calibrate_episodes(
 
     _require_windows(holdout, heldout_window_s)
     problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s, known_std=known_std)
+    check_delays(problem)
     searcher = make_method(method, polish=budget.polish)
-    with show_progress(f"calibrate ({method})", quiet) as report:
+    # The matrices are small: a second BLAS thread only spins, and where processors are shared each
+    # decomposition then takes ten times as long.
+    with (
+        threadpool_limits(1, user_api="blas"),
+        show_progress(f"calibrate ({method})", quiet) as report,
+    ):
 
         def progress(p: Progress) -> None:
             report(p)
@@ -245,6 +257,7 @@ def finish(
     settings: Mapping[str, Any],
     *,
     page: bool = True,
+    advise: bool = True,
     threads: int | None = None,
     quiet: bool = True,
 ) -> CalibrateReport:
@@ -256,11 +269,17 @@ def finish(
         folder: Where to write.
         settings: What else the provenance says: plain JSON values.
         page: Write report.html.
+        advise: Compute what to record next for parameters that stayed open.
         threads: Simulation threads.
         quiet: Print nothing.
     """
     from deal_hw.calib.folder import write_result
 
+    if advise:
+        from deal_hw.calib.next_recording import next_recordings
+
+        found = next_recordings(work.robot, result, work.episodes, balance=work.balance, threads=threads)
+        result = dataclasses.replace(result, advice=tuple(one.to_json() for one in found))
     names = ("deal-hw", "mujoco", "numpy", "scipy", "torch")
     result = dataclasses.replace(
         result,
@@ -348,6 +367,8 @@ def print_result(result: CalibrationResult, advice: str) -> None:
     console.print(table)
     for words in result.null_directions:
         console.print(f"the data cannot tell: {words}")
+    for row in result.advice:
+        console.print(f"next: {row['sentence']}")
     for words in result.alarms:
         console.print(f"[bold]alarm:[/bold] {words}")
     if not result.heldout_nrmse:

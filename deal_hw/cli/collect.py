@@ -13,6 +13,7 @@ from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
+from deal_hw.control.vigor import ATTEMPTS
 
 EXCITATION_FILE = "excitation.json"
 """Where the excitation of `--excite optimal` is kept, in the run folder."""
@@ -58,6 +59,14 @@ class Collect:
     episodes: int = 1
     """How many episodes."""
 
+    vigor: float = 0.0
+    """Start profile rich livelier (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
+    the safety limits."""
+
+    attempts: int = ATTEMPTS
+    """How often an episode of profile rich is recorded at most: one that hardly moves is repeated livelier.
+    After a trip nothing is repeated; look at the robot first."""
+
     seed: int = 0
     """Fixes the random set-points; episode k uses SEED + k."""
 
@@ -83,6 +92,7 @@ def collect(config: Collect) -> RunReport:
         seconds=seconds,
         seed=config.seed,
         rich=config.rich,
+        vigor=config.vigor,
         excite=excite,
     )
     return run_episodes(
@@ -92,6 +102,7 @@ def collect(config: Collect) -> RunReport:
         episodes=config.episodes,
         purpose="collect",
         quiet=config.quiet,
+        attempts=config.attempts,
     )
 
 

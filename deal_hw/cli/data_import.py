@@ -14,6 +14,7 @@ from deal_hw.cli.calibrate_checks import examine_recording
 from deal_hw.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from deal_hw.data.importing.table import Table
     from deal_hw.sim.joint_facts import JointFacts
 
 
@@ -78,7 +79,10 @@ def import_recordings(config: Import) -> int:
     joints = given["joint_names"] if given is not None else None if facts is None else facts.names
     tables = [table for path in config.paths for table in load_tables(path, columns, joints, _say)]
     problems = {
-        table.name: [v.to_json() for v in examine_recording(table, facts, config.force, say=_say)]
+        table.name: [
+            v.to_json()
+            for v in examine_recording(table, facts, config.force, servo=_takes_positions(facts, table), say=_say)
+        ]
         for table in tables
     }
     period = common_period(tables)
@@ -103,6 +107,14 @@ def import_recordings(config: Import) -> int:
     dataset = write_dataset(config.out, recordings, values, {"plausibility": problems}, _say)
     print(f"{dataset.folder}: {len(dataset.episodes)} episodes of {dataset.description['name']}")
     return 0
+
+
+def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
+    """Return whether commands are to be positions: without a model, or where any actuator takes them."""
+    if facts is None:
+        return True
+    at = [facts.names.index(name) for name in table.actuated]
+    return bool(facts.servo[at].any() or not facts.motor[at].any())
 
 
 def export_recordings(config: Export) -> int:

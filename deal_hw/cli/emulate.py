@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
+from deal_hw.cli.emulate_go2 import DEFAULT_PORTS, Go2Options, emulate_go2
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 
 if TYPE_CHECKING:
-    from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
+    from deal_hw.drivers.cartpole.emulator import Hazards
     from deal_hw.drivers.cartpole.truth import Truth
 
-ROBOTS = ("cartpole",)
-TRANSPORTS = ("serial",)
-_PARENT_CHECK_STEPS = 100
-_FIFO_PRIORITY = 40
-"""Below that of a control process: the host must not wait for the emulator."""
+TRANSPORTS = {"cartpole": ("serial",), "go2": tuple(DEFAULT_PORTS)}
+"""Robots to emulate and the wires that each speaks on; the first is the default."""
+CARTPOLE_XI = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,18 +29,22 @@ class Emulate:
     robot: tyro.conf.Positional[str] = "cartpole"
     """The robot to emulate."""
 
-    transport: str = "serial"
-    """The wire to speak on; "serial" makes a pseudo-terminal."""
+    transport: str | None = None
+    """The wire to speak on. Cart-pole: "serial", a pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
+
+    port: str | None = None
+    """Go2: network interface or its address (dds), or end point to listen at (zenoh; number 0: a free
+    one). By default on this machine alone."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
-    Stribeck friction, backlash and dropped frames."""
+    Stribeck friction and dropped frames, backlash (cart-pole), encoder bias and torque-speed limit (Go2)."""
 
     seed: int = 0
     """Decides the hidden parameters, the noise and the start angles."""
 
-    xi: float = 5.0
-    """Hidden parameters lie within this ratio of the nominal ones."""
+    xi: float | None = None
+    """Hidden parameters lie within this ratio of the nominal ones; 5 for the cart-pole, 2 for the Go2."""
 
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
@@ -58,10 +56,10 @@ class Emulate:
     """Make a symbolic link to the port here."""
 
     reveal: bool = False
-    """Print the truth as one line of JSON at the end."""
+    """Print the truth (and for the Go2 what happened) as one line of JSON at the end."""
 
     reveal_to: Path | None = None
-    """Write the truth to this JSON file at the end."""
+    """Write the same to this JSON file at the end."""
 
     duration_s: float | None = None
     """Stop after this time [s]; without it, at Ctrl-C."""
@@ -76,7 +74,7 @@ class Emulate:
     """Share of frames from the device that come twice."""
 
     freeze_after_s: float | None = None
-    """The firmware hangs this long after the motor was first armed [s]."""
+    """The firmware hangs this long after the motor was first armed, or commanded [s]."""
 
     vanish_after_s: float | None = None
     """The port vanishes this long after the motor was first armed [s]."""
@@ -84,11 +82,16 @@ class Emulate:
     parent: int | None = None
     """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
 
+    go2: tyro.conf.OmitArgPrefixes[Go2Options] = field(default_factory=Go2Options)
+    """Options of the Go2 alone."""
+
     def __post_init__(self) -> None:
-        if self.robot not in ROBOTS:
-            raise UnknownNameError("robot to emulate", self.robot, ROBOTS)
-        if self.transport not in TRANSPORTS:
-            raise UnknownNameError("transport to emulate on", self.transport, TRANSPORTS)
+        if self.robot not in TRANSPORTS:
+            raise UnknownNameError("robot to emulate", self.robot, TRANSPORTS)
+        if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:
+            raise UnknownNameError("transport to emulate on", self.transport, TRANSPORTS[self.robot])
+        if foreign := self._foreign():
+            raise ConfigurationError(f"emulate {self.robot} has no {', '.join(foreign)}")
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
         for name in ("duration_s", "freeze_after_s", "vanish_after_s"):
@@ -96,12 +99,21 @@ class Emulate:
             if value is not None and not value >= 0:
                 raise ConfigurationError(f"{name} must be 0 or more seconds, got {value}")
 
+    def _foreign(self) -> list[str]:
+        """Return the flags given that belong to another robot."""
+        if self.robot == "cartpole":
+            return self.go2.given() + (["--port"] if self.port is not None else [])
+        own = {"--link": self.link, "--vanish-after-s": self.vanish_after_s}
+        return [flag for flag, value in own.items() if value is not None]
+
 
 def emulate(config: Emulate) -> int:
     """Run the emulator until a signal, the time given, or until the port vanished; return the exit status.
 
     The first line on standard output is ``port PATH``.
     """
+    if config.robot == "go2":
+        return emulate_go2(config)
     try:
         from deal_hw.drivers.cartpole.device import CartpoleDevice
         from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
@@ -109,8 +121,7 @@ def emulate(config: Emulate) -> int:
         if error.name in ("mujoco", "scipy"):
             raise MissingExtraError(error.name, "sim") from error
         raise
-    stop = threading.Event()
-    _stop_on_signals(stop)
+    stop = stop_on_signals()
     truth = _truth(config)
     emulator = CartpoleEmulator(CartpoleDevice(truth), link=config.link, hazards=_hazards(config))
     try:
@@ -119,46 +130,13 @@ def emulate(config: Emulate) -> int:
             f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused; Ctrl-C ends",
             flush=True,
         )
-        with _realtime_priority():
-            _run(emulator, config, stop)
+        with realtime_priority():
+            run_until(emulator.step, stop, config.duration_s, config.parent)
     finally:
         emulator.close()
-        _reveal(config, truth)
+        reveal(truth.to_json(), on_stdout=config.reveal, path=config.reveal_to)
     print(f"emulator: {emulator.slips} stalls, {emulator.dropped} writes dropped", file=sys.stderr)
     return 0
-
-
-def _run(emulator: CartpoleEmulator, config: Emulate, stop: threading.Event) -> None:
-    from deal_hw.clock import MonotonicClock
-
-    clock = MonotonicClock()
-    end_ns = None if config.duration_s is None else clock.now_ns() + round(config.duration_s * 1e9)
-    count = 0
-    while not stop.is_set() and emulator.step():
-        count += 1
-        if end_ns is not None and clock.now_ns() >= end_ns:
-            return
-        if config.parent is not None and count % _PARENT_CHECK_STEPS == 0 and os.getppid() != config.parent:
-            return
-
-
-@contextlib.contextmanager
-def _realtime_priority() -> Iterator[None]:
-    """Run ahead of ordinary processes where permitted: a real robot does not share the host's processor."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, *before)
-
-
-def _stop_on_signals(stop: threading.Event) -> None:
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
 
 
 def _truth(config: Emulate) -> Truth:
@@ -168,8 +146,8 @@ def _truth(config: Emulate) -> Truth:
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return Truth.from_json(json.loads(config.truth_from.read_text(encoding="utf-8")))
-    return draw_truth(config.profile, config.seed, xi=config.xi)
+        return Truth.from_json(read_truth(config.truth_from))
+    return draw_truth(config.profile, config.seed, xi=CARTPOLE_XI if config.xi is None else config.xi)
 
 
 def _hazards(config: Emulate) -> Hazards:
@@ -186,14 +164,6 @@ def _hazards(config: Emulate) -> Hazards:
         if rates != FaultRates()
         else None,
     )
-
-
-def _reveal(config: Emulate, truth: Truth) -> None:
-    text = json.dumps(truth.to_json())
-    if config.reveal:
-        print(text, flush=True)
-    if config.reveal_to is not None:
-        config.reveal_to.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import tyro
 from deal_hw.calibration import CalibrationResult
 from deal_hw.data.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import robot_description
+from deal_hw.drivers import recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
@@ -97,7 +97,7 @@ def inspect(config: Inspect) -> InspectReport:
     if not (config.save or config.screenshot or config.web):
         check_display()
     episode = read_episode(config.episode)
-    description = robot_description(str(episode.description["name"]))
+    description = recorded_description(str(episode.description["name"]))
     result = read_result(config.calibration) if config.calibration else None
     overlay, note = _overlay(config, episode, description, result)
     with contextlib.ExitStack() as stack:

@@ -124,6 +124,11 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             help="send a recording's commands again, through the safety filter",
             example="replay runs/first/dataset/episodes/000000.mcap --port /dev/ttyUSB0",
         ),
+        "doctor": _verb(
+            "doctor",
+            help="find out what is wrong with this computer, the link and the robot",
+            example="doctor go2 --port enp2s0",
+        ),
         "bench": _verb(
             "bench",
             help="measure how well calibration and the loop do, as JSON rows",

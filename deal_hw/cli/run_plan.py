@@ -23,6 +23,7 @@ from deal_hw.control.excitation_plan import (
 )
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.velocity import VelocitySource, make_source
+from deal_hw.control.vigor import with_vigor
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.transport import WireOptions
@@ -46,6 +47,7 @@ class RunPlan:
         dry_run: Whether to compute everything and send nothing.
         home: Whether to bring the robot to its start pose first.
         rich: Settings of the profile `rich`; its length is ``seconds``.
+        vigor: Steps that the profile `rich` is livelier, or gentler where negative.
         excite: What the profile `excite` plays: `chirp`, `multisine`, or a file of `deal-hw excite`.
         port: Where the robot is, for transports without a descriptor to inherit.
         wire: More about a transport of topics.
@@ -68,6 +70,7 @@ class RunPlan:
     dry_run: bool = False
     home: bool = True
     rich: RichConfig = field(default_factory=RichConfig)
+    vigor: float = 0.0
     excite: str = ""
     port: str = ""
     wire: WireOptions = field(default_factory=WireOptions)
@@ -112,7 +115,7 @@ class RunPlan:
         rich = dict(known["rich"])
         rich["hold_s"] = tuple(rich["hold_s"])
         rich["segments"] = tuple(Segment(**part) for part in rich["segments"])
-        wire = {
+        wire: dict[str, Any] = {
             key: Path(value) if value is not None and key in ("ca", "certificate", "key") else value
             for key, value in known["wire"].items()
         }
@@ -165,7 +168,8 @@ def _inner_behaviour(plan: RunPlan, description: RobotDescription, source: Veloc
         balance = _policy(plan, description) if excitation.balance_s > 0 else None
         return ExcitationBehaviour(excitation, description, balance)
     if plan.profile == "rich":
-        config = dataclasses.replace(plan.rich, duration_s=plan.seconds)
+        config = with_vigor(plan.rich, plan.vigor, description)
+        config = dataclasses.replace(config, duration_s=plan.seconds)
         balance = _policy(plan, description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)
     return _policy(plan, description, source)

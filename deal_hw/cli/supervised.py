@@ -21,6 +21,8 @@ from deal_hw.control.handover import Beat
 from deal_hw.control.loop import RUNNING, Outcome
 from deal_hw.control.passive import make_passive
 from deal_hw.control.supervisor import OPERATOR, ChildEnd, Supervisor
+from deal_hw.control.vigor import VigorSearch, shortfalls
+from deal_hw.data.excitation import Excitation
 from deal_hw.data.recorder_launch import start_recorder
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
@@ -49,6 +51,7 @@ class EpisodeReport:
         states_recorded: State samples in the file.
         warnings: What the operator should know.
         error: Name of the error's class where it failed.
+        motion: How much the recording moves; None where nothing was recorded.
     """
 
     path: Path | None
@@ -61,6 +64,7 @@ class EpisodeReport:
     states_recorded: int
     warnings: tuple[str, ...]
     error: str = ""
+    motion: Excitation | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -142,6 +146,7 @@ def run_episodes(
     task: str = "",
     quiet: bool = False,
     on_beat: Callable[[Beat], None] = _ignore,
+    attempts: int = 1,
 ) -> RunReport:
     """Run episodes one after the other on one port, each in a control process of its own.
 
@@ -154,6 +159,8 @@ def run_episodes(
         task: For the metadata.
         quiet: Whether to print nothing.
         on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
+        attempts: How often an episode of the profile `rich` is recorded at most, livelier each time, until it
+            moves enough; see :mod:`deal_hw.control.vigor`.
 
     Raises:
         DealHwError: What made it fail, after the robot was made passive and the recording closed.
@@ -162,7 +169,8 @@ def run_episodes(
         raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
     plan = dataclasses.replace(plan, port=port)
     robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire)
-    # Whatever is wrong with policy or recording should be said before anybody touches the robot.
+    # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
+    VigorSearch(plan.vigor, attempts)
     make_behaviour(plan, robot.description)
     reports: list[EpisodeReport] = []
     # The supervisor greets the robot itself, so that a wrong port is known before any process is started.
@@ -172,16 +180,34 @@ def run_episodes(
             # The robot's own controller gets it back after the last episode only.
             last = number == episodes - 1
             episode = dataclasses.replace(plan, seed=plan.seed + number, hand_back=plan.hand_back and last)
-            run = _Episode(episode, robot, port, store, purpose, task)
             title = f"{purpose} {plan.robot} {number + 1}/{episodes}"
-            with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.total_s) as show:
-                reports.append(run.run(_both(show, on_beat)))
-            if not quiet:
-                print_report(reports[-1])
+            search = VigorSearch(plan.vigor, attempts, rearm=False)
+            again = True
+            while again:
+                episode = dataclasses.replace(episode, vigor=search.vigor)
+                run = _Episode(episode, robot, port, store, purpose, task, len(search.attempts))
+                with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.total_s) as show:
+                    reports.append(run.run(_both(show, on_beat)))
+                if not quiet:
+                    print_report(reports[-1])
+                again = _to_repeat(search, episode, reports[-1], robot.description)
+                if search.words:
+                    print(f"warning: {search.words}", file=sys.stderr)
             if reports[-1].outcome is not Outcome.FINISHED:
                 break
     reports[-1].raise_error()
     return RunReport(dataset=dataset, episodes=tuple(reports))
+
+
+def _to_repeat(
+    search: VigorSearch, plan: RunPlan, report: EpisodeReport, description: RobotDescription
+) -> bool:
+    """Say whether an episode is recorded again, at the search's new vigor; its words tell why."""
+    judged = report.outcome in (Outcome.FINISHED, Outcome.TRIPPED) and report.motion is not None
+    if plan.profile != "rich" or not judged or plan.dry_run or description.floating_base is not None:
+        return False
+    tripped = report.reason if report.outcome is Outcome.TRIPPED else ""
+    return report.motion is not None and search.tell(shortfalls(report.motion, description), tripped)
 
 
 @contextlib.contextmanager
@@ -199,7 +225,14 @@ class _Episode:
     """One episode: a recorder, a control process and the account of both."""
 
     def __init__(
-        self, plan: RunPlan, robot: Robot, port: str, store: Dataset | None, purpose: str, task: str
+        self,
+        plan: RunPlan,
+        robot: Robot,
+        port: str,
+        store: Dataset | None,
+        purpose: str,
+        task: str,
+        attempt: int = 0,
     ) -> None:
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
         self._path = store.next_episode_path() if store is not None else None
@@ -215,6 +248,8 @@ class _Episode:
             "excite": plan.excite,
             "seed": plan.seed,
             "seconds": plan.seconds,
+            "vigor": plan.vigor,
+            "attempt": attempt,
             "dry_run": plan.dry_run,
             "velocity": plan.velocity,
             "stand": plan.stand,
@@ -253,7 +288,10 @@ class _Episode:
         report = dataclasses.replace(report, reason=reason)
         if self._store is not None and self._path is not None:
             try:
-                self._store.note_episode(self._path, {"task": self._metadata["task"], **report.to_json()})
+                facts = {"task": self._metadata["task"], **report.to_json()}
+                moved = self._store.note_episode(self._path, facts).excitation
+                if moved is not None:
+                    report = dataclasses.replace(report, motion=Excitation(**moved))
             except (errors.DealHwError, OSError) as err:
                 # As on a full disk. The report matters more, and the next open takes the recording in.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))

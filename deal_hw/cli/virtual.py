@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,10 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
 from deal_hw.control.safety import Safety
+from deal_hw.control.vigor import ATTEMPTS, VigorSearch, shortfalls
+from deal_hw.data.excitation import excitation
 from deal_hw.data.reader import read_trajectory
 from deal_hw.data.record import CycleRecord
 from deal_hw.data.recorder import EpisodeRecorder
@@ -100,3 +104,28 @@ class VirtualCartpole:
                 report = ControlLoop(robot, behaviour, safety, self.clock, sink, config).run()
             trajectory = read_trajectory(file)
         return VirtualEpisode(trajectory, ticks[0], self.device.true_trajectory(), report)
+
+
+def demonstrate(
+    virtual: VirtualCartpole, plan: RunPlan, attempts: int = ATTEMPTS
+) -> tuple[VirtualEpisode, VigorSearch]:
+    """Record the profile `rich`, again and livelier or gentler until it is whole and moves.
+
+    Args:
+        virtual: The robot.
+        plan: The run; how lively it starts is its ``vigor``.
+        attempts: Most recordings.
+
+    Returns:
+        The best recording, and how the search for it went.
+    """
+    search = VigorSearch(plan.vigor, attempts)
+    runs: list[VirtualEpisode] = []
+    again = True
+    while again:
+        behaviour = make_behaviour(dataclasses.replace(plan, vigor=search.vigor), virtual.description)
+        run = virtual.run(behaviour, plan.seconds)
+        runs.append(run)
+        tripped = "" if run.report.outcome is Outcome.FINISHED else run.report.reason
+        again = search.tell(shortfalls(excitation(run.trajectory), virtual.description), tripped)
+    return runs[search.best], search

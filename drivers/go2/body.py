@@ -44,6 +44,8 @@ def body_state(frame: LowStateFrame, remote: Remote | None) -> BodyState:
 def is_damped(frame: LowStateFrame, damping: FloatArray, effort_limit: FloatArray) -> bool:
     """Return whether the drives' estimated efforts are those of pure damping.
 
+    A joint whose sensor gives no number is left out, unless none gives one.
+
     Args:
         frame: The state.
         damping: kd of each joint, (J,) [N·m·s/rad].
@@ -51,4 +53,6 @@ def is_damped(frame: LowStateFrame, damping: FloatArray, effort_limit: FloatArra
     """
     braking = np.clip(-damping * frame.velocity, -effort_limit, effort_limit)
     allowed = DAMPED_TOLERANCE_NM + DAMPED_TOLERANCE_SHARE * np.abs(braking)
-    return bool((np.abs(frame.effort - braking) <= allowed).all())
+    excess = np.abs(frame.effort - braking) - allowed
+    known = excess[np.isfinite(excess)]
+    return known.size > 0 and bool((known <= 0.0).all())

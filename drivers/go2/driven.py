@@ -63,10 +63,18 @@ LEG_SOURCES: Final[Mapping[str, str]] = {
 def driven_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyLimits:
     """Return limits with those for legs, and with room for a robot that lies on its stops.
 
-    The calves of a lying robot were seen at -2.81 rad, 0.09 beyond the mechanical range of the models.
+    The calves of a lying robot were seen at -2.81 rad, 0.09 beyond the mechanical range of the models. The
+    wire carries no effort limit, so none is asked for below the drives' own: the predicted effort is limited
+    instead.
     """
     trip = tuple((low - TRIP_MARGIN_RAD, high + TRIP_MARGIN_RAD) for low, high in limits.trip_position)
-    return dataclasses.replace(limits, trip_position=trip, silence_s=0.2, legs=legs)
+    return dataclasses.replace(
+        limits,
+        trip_position=trip,
+        effort=go2.per_joint(go2.EFFORT_LIMIT_NM),
+        silence_s=0.2,
+        legs=legs,
+    )
 
 
 DRIVEN: Final[RobotDescription] = dataclasses.replace(

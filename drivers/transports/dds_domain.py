@@ -15,6 +15,10 @@ from deal_hw.errors import ConfigurationError, MissingExtraError, TransportError
 _LINGER: Final = "100 ms"
 """How long closing waits for peers that have not confirmed the last message; Cyclone's default is 1 s."""
 
+_SEEK: Final = "1 s"
+"""How often we announce ourselves. With Cyclone's default, a cable plugged in again is dumb for longer."""
+_LOG_FATAL, _LOG_ERROR, _LOG_WARNING = 1, 2, 4
+
 
 @dataclass(slots=True)
 class _Opened:
@@ -39,7 +43,8 @@ def domain_xml(number: int, interface: Interface) -> str:
         where = f"name={quoteattr(interface.name)} multicast={quoteattr('default')}"
     return (
         f'<CycloneDDS><Domain Id="{number}"><General><Interfaces><NetworkInterface {where}/></Interfaces>'
-        f"</General><Internal><WriterLingerDuration>{_LINGER}</WriterLingerDuration></Internal>"
+        f"</General><Discovery><SPDPInterval>{_SEEK}</SPDPInterval></Discovery>"
+        f"<Internal><WriterLingerDuration>{_LINGER}</WriterLingerDuration></Internal>"
         "</Domain></CycloneDDS>"
     )
 
@@ -105,7 +110,14 @@ def dds_errors(what: str) -> Iterator[None]:
 def _create(number: int, interface: Interface) -> Any:
     try:
         from cyclonedds.domain import Domain
+        from cyclonedds.internal import DDS
     except ImportError as error:
         raise MissingExtraError("cyclonedds", "dds") from error
+    set_log_mask = DDS._dll_handle.dds_set_log_mask
+    set_log_mask(_LOG_FATAL | _LOG_ERROR | _LOG_WARNING)
     with dds_errors(f"DDS domain {number} cannot be opened on {interface}"):
-        return Domain(number, domain_xml(number, interface))
+        domain = Domain(number, domain_xml(number, interface))
+    # From now on Cyclone is silent. With the interface down it would write a line for each send, and a
+    # terminal that does not keep up would hold the control loop; silence of the robot is what tells.
+    set_log_mask(_LOG_FATAL)
+    return domain

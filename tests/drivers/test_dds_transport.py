@@ -188,6 +188,14 @@ def test_xml_forces_multicast_on_loopback_and_names_other_interfaces() -> None:
     assert '<NetworkInterface name="eth0" multicast="default"/>' in domain_xml(0, eth)
 
 
+def test_cyclone_is_silent_once_open(domain: int) -> None:
+    """A line per failed send on a slow terminal would hold the control loop; only fatal errors remain (1)."""
+    from cyclonedds.internal import DDS
+
+    with make(domain):
+        assert DDS._dll_handle.dds_get_log_mask() == 1
+
+
 def test_the_raw_calls_of_cyclonedds_are_still_there(domain: int) -> None:
     """If this fails, cyclonedds changed them: mend dds_session.py before the pin in pyproject moves."""
     from cyclonedds import _clayer
@@ -197,10 +205,11 @@ def test_the_raw_calls_of_cyclonedds_are_still_there(domain: int) -> None:
     data = payload("rt/lowcmd", 9)
     reader = make(domain, subscribe=("rt/lowcmd",))
     with make(domain, publish=("rt/lowcmd",)) as writer, reader:
-        session = reader._live
+        session, sender = reader._live, writer._live
         assert session is not None
+        assert sender is not None
         patiently(writer, lambda: reader.writers("rt/lowcmd"))
-        assert session.write(next(iter(writer._live.writers.values())), data) == 0, advice  # type: ignore[union-attr]
+        assert sender.write(sender.writers["rt/lowcmd"], data) == 0, advice
         ((_, reader_entity),) = session._readers
         (sample,) = session._take(reader_entity._ref, session._mask, 5)
         assert sample[0] == data, advice

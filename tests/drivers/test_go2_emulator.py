@@ -184,9 +184,23 @@ def test_wrong_options_are_refused_before_anything_opens() -> None:
         Emulate(go2=Go2Options(suspended=True, push=5.0), port="lo")
     with pytest.raises(ConfigurationError, match="emulate go2 has no --link, --vanish-after-s"):
         Emulate(robot="go2", link=Path("x"), vanish_after_s=1.0)
+    with pytest.raises(ConfigurationError, match="tick_start_ms is a number of 32 bits, got -1"):
+        Go2Options(tick_start_ms=-1)
     contradiction = Go2Options(no_remote=True, remote_script=Path("x"))
     with pytest.raises(ConfigurationError, match="--no-remote and --remote-script exclude each other"):
         emulate(Emulate(robot="go2", transport="zenoh", go2=contradiction))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("{", "is not JSON"), ("[]", "no truth"), ("{}", "not the truth")]
+)
+def test_a_file_that_holds_no_truth_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    """Whatever is in the file, the error says what writes one."""
+    path = tmp_path / "truth.json"
+    path.write_text(text)
+    for robot in ("go2", "cartpole"):
+        with pytest.raises(ConfigurationError, match=message):
+            emulate(Emulate(robot=robot, truth_from=path))
 
 
 def test_a_free_port_is_found() -> None:

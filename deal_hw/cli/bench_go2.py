@@ -1,0 +1,102 @@
+"""Benches of the Go2's wire: what its messages cost to write and read."""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import timeit
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from deal_hw.cli.bench import describe_machine, write_rows
+from deal_hw.drivers.go2.protocol import (
+    LowCommand,
+    LowCommandEncoder,
+    LowState,
+    decode_low_command,
+    decode_low_state,
+    encode_low_state,
+)
+
+BATCHES: Final = 200
+BATCH: Final = 200
+TARGETS_US: Final[Mapping[str, float]] = {"encode LowCmd with CRC": 5.0, "decode LowState": 2.0}
+"""What the control loop's budget allows, medians [us]."""
+
+
+def bench_codec(out: Path | None = None, *, quiet: bool = False, batches: int = BATCHES) -> int:
+    """Measure the codec; print and, where a file is named, write the figures.
+
+    Args:
+        out: File of the rows; None: print only.
+        quiet: Whether to print nothing.
+        batches: How many batches of :data:`BATCH` calls to time.
+
+    Returns:
+        0 where every median is within its target, else 1.
+    """
+    rows = [_row(name, call, batches) for name, call in _calls().items()]
+    machine = describe_machine()
+    if not quiet:
+        processors, load = machine["processors"], machine["load"][0]
+        print(f"{machine['platform']}, {processors} processors, load {load:.1f}, numpy {np.__version__}")
+        print(f"microseconds a call, {batches} batches of {BATCH} calls")
+        for row in rows:
+            target = f"  target {row['target_us']:g}" if row["target_us"] is not None else ""
+            print(
+                f"{row['operation']:28} median {row['median_us']:6.2f}  lowest {row['lowest_us']:6.2f}"
+                f"  p99 {row['p99_us']:6.2f}{target}"
+            )
+    if out is not None:
+        write_rows(out, rows)
+        if not quiet:
+            print(f"written: {out}")
+    return (
+        1 if any(row["target_us"] is not None and row["median_us"] > row["target_us"] for row in rows) else 0
+    )
+
+
+def _calls() -> dict[str, Callable[[], object]]:
+    rng = np.random.default_rng(0)
+    parts = rng.normal(size=(5, 12))
+    command = LowCommand(*parts)
+    encoder, state = LowCommandEncoder(), _state(rng)
+    command_bytes, state_bytes = encoder.encode(command), encode_low_state(state)
+    return {
+        "encode LowCmd with CRC": lambda: encoder.encode(command),
+        "decode LowState": lambda: decode_low_state(state_bytes, check_crc=False),
+        "decode LowState with CRC": lambda: decode_low_state(state_bytes),
+        "encode LowState with CRC": lambda: encode_low_state(state),
+        "decode LowCmd with CRC": lambda: decode_low_command(command_bytes),
+    }
+
+
+def _state(rng: np.random.Generator) -> LowState:
+    return LowState(
+        position=rng.normal(size=12), velocity=rng.normal(size=12), acceleration=rng.normal(size=12),
+        effort=rng.normal(size=12), temperature=np.full(12, 40), lost=np.zeros(12, np.int64),
+        mode=np.ones(12, np.int64), orientation=np.array([1.0, 0.0, 0.0, 0.0]),
+        angular_velocity=rng.normal(size=3), specific_force=np.array([0.0, 0.0, 9.81]), rpy=np.zeros(3),
+        imu_temperature=60, foot_force=np.full(4, 20), foot_force_estimate=np.full(4, 20), tick_ms=123456,
+        remote=bytes(40), battery_percent=80, battery_current_ma=-2000, battery_status=1, battery_cycles=10,
+        cell_voltage_mv=np.full(15, 3900), voltage=29.5, current=2.0,
+    )  # fmt: skip
+
+
+def _row(operation: str, call: Callable[[], object], batches: int) -> dict[str, Any]:
+    timer = timeit.Timer(call)
+    timer.timeit(BATCH)
+    gc.collect()
+    times = sorted(timer.timeit(BATCH) / BATCH * 1e6 for _ in range(batches))
+    return {
+        "bench": "go2-codec",
+        "operation": operation,
+        "median_us": statistics.median(times),
+        "lowest_us": times[0],
+        "p99_us": times[min(len(times) - 1, int(0.99 * len(times)))],
+        "target_us": TARGETS_US.get(operation),
+        "error": "",
+    }

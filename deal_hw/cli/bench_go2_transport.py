@@ -1,0 +1,327 @@
+"""``deal-hw bench go2-transport``: a controller and a robot on the Go2's topics, 500 times a second."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Any, Final, Literal
+
+import tyro
+
+from deal_hw.errors import ConfigurationError, TransportError
+from deal_hw.transport import WireOptions
+
+_START_S: Final = 30.0
+_END_S: Final = 20.0
+_SETTLE_S: Final = 2.0
+FREEZE_LIMIT_S: Final = 2e-3
+"""No control cycle may be delayed by more than this while the peer is frozen [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransportBench:
+    """The bench go2-transport: two processes, one wire."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """go2-transport: the wire."""
+
+    port: str = ""
+    """go2-transport: network interface (dds) or end point (zenoh); by default on this machine's loopback."""
+
+    seconds: float = 20.0
+    """go2-transport: how long to measure [s]."""
+
+    rate: float = 500.0
+    """go2-transport: commands and states a second [1/s]."""
+
+    freeze_at: float | None = None
+    """go2-transport: stop the robot's process (SIGSTOP) this long after the start [s]."""
+
+    freeze_s: float = 1.0
+    """go2-transport: for how long [s]."""
+
+    wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
+    """go2-transport: more about the network."""
+
+    def __post_init__(self) -> None:
+        if not (0 < self.rate <= 10_000 and self.seconds > 0):
+            raise ConfigurationError(f"--rate {self.rate:g} --seconds {self.seconds:g}: both are above 0")
+        if self.freeze_at is not None and not (
+            self.freeze_at > 0 and self.freeze_s > 0 and self.freeze_at + self.freeze_s < self.seconds
+        ):
+            raise ConfigurationError(
+                f"--freeze-at {self.freeze_at:g} --freeze-s {self.freeze_s:g}: begin and end lie inside the "
+                f"{self.seconds:g} s of the run"
+            )
+
+
+def bench_transport(settings: TransportBench, out: Path | None = None, *, quiet: bool = False) -> int:
+    """Measure, print and, where a file is named, write.
+
+    Returns:
+        0, or 1 where a frozen peer delayed a control cycle by more than :data:`FREEZE_LIMIT_S`.
+
+    Raises:
+        TransportError: A process failed; the message holds what it said.
+    """
+    # Imported here: the verb's module holds our settings.
+    from deal_hw.cli.bench import describe_machine, write_rows
+
+    machine = describe_machine()
+    row = summary(settings, *measure(settings, quiet=quiet))
+    row["load_before"] = machine["load"]
+    if not quiet:
+        print("\n".join(lines(row)))
+    if out is not None:
+        write_rows(out, [row])
+        if not quiet:
+            print(f"written: {out}")
+    frozen = row["frozen"]
+    return int(frozen is not None and frozen["cycle_delay"]["max_s"] > FREEZE_LIMIT_S)
+
+
+def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Run both processes and return what the controller and the robot measured."""
+    orders = {
+        "parent_pid": os.getpid(),
+        "transport": settings.transport,
+        "port": settings.port or _default_port(settings.transport),
+        "rate_hz": settings.rate,
+        "cycles": round(settings.seconds * settings.rate),
+    }
+    wire = {
+        key: str(value) if isinstance(value, Path) else value for key, value in asdict(settings.wire).items()
+    }
+    # Zenoh needs one side that waits, and a client cannot; DDS does not care.
+    robot_wire, wire = {**wire, "listen": True, "mode": "peer"}, {**wire, "listen": False}
+    with _Side("robot", {**orders, "wire": robot_wire}) as robot:
+        robot.expect("ready", _START_S)
+        freeze = {"pid": robot.pid, **_freeze_cycles(settings)}
+        with _Side("controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
+            controller.expect("ready", _START_S)
+            controller.expect("running", _START_S)
+            with _progress(f"go2-transport {settings.transport}", settings.seconds, quiet) as update:
+                measured = controller.result(settings.seconds + _END_S, update)
+        robot.stop()
+        return measured, robot.result(_END_S)
+
+
+def _freeze_cycles(settings: TransportBench) -> dict[str, int]:
+    if settings.freeze_at is None:
+        return {"first": 0, "last": 0, "settled": 0}
+    first = max(1, round(settings.freeze_at * settings.rate))
+    last = first + max(1, round(settings.freeze_s * settings.rate))
+    cycles = round(settings.seconds * settings.rate)
+    return {"first": first, "last": last, "settled": min(cycles, last + round(_SETTLE_S * settings.rate))}
+
+
+def _default_port(transport: str) -> str:
+    if transport == "dds":
+        return "lo"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class _Side:
+    """One of the two processes; it never outlives the block."""
+
+    def __init__(self, name: str, orders: Mapping[str, Any]) -> None:
+        self._name = name
+        # A session of its own: Ctrl-C in the terminal is this process's to handle.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "deal_hw.cli.bench_go2_sides", name],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            start_new_session=True, bufsize=0,
+        )  # fmt: skip
+        with _pipe(self._process.stdin) as orders_pipe:
+            orders_pipe.write(json.dumps(orders).encode())
+        self._process.stdin = None  # Or communicate() would flush it.
+        self._out = b""
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def stop(self) -> None:
+        """Ask it to end and tell its result."""
+        self._process.terminate()
+
+    def expect(self, word: str, timeout_s: float) -> None:
+        """Wait for a line."""
+        line = self._line(timeout_s)
+        if line != word:
+            raise self._failed(line)
+
+    def result(self, timeout_s: float, update: Callable[[float], None] | None = None) -> dict[str, Any]:
+        """Wait for the result, telling ``update`` the seconds that have passed."""
+        values: dict[str, Any] = json.loads(self._line(timeout_s, update) or "null") or {"error": "no result"}
+        if "error" in values:
+            raise self._failed(values["error"])
+        return values
+
+    def __enter__(self) -> _Side:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # SIGKILL ends a stopped process, too.
+        self._process.kill()
+        self._process.communicate()
+
+    def _line(self, timeout_s: float, update: Callable[[float], None] | None = None) -> str:
+        out, begun = _pipe(self._process.stdout), time.monotonic()
+        while b"\n" not in self._out:
+            passed = time.monotonic() - begun
+            if passed > timeout_s:
+                raise TransportError(f"the {self._name}'s process said nothing for {timeout_s:g} s")
+            if update is not None:
+                update(passed)
+            if select.select([out], [], [], 0.2)[0]:
+                part = out.read(65536)
+                if not part:
+                    return ""
+                self._out += part
+        line, _, self._out = self._out.partition(b"\n")
+        return line.decode()
+
+    def _failed(self, said: str) -> TransportError:
+        self._process.kill()
+        _, errors = self._process.communicate()
+        with contextlib.suppress(ValueError, TypeError, KeyError):
+            said = json.loads(said)["error"]
+        return TransportError(f"the {self._name}'s process failed: {said} {errors.decode().strip()[-2000:]}")
+
+
+def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
+    """Return the pipe that was asked for."""
+    if pipe is None:
+        raise TransportError("a process was started without its pipes")
+    return pipe
+
+
+def summary(
+    settings: TransportBench, controller: Mapping[str, Any], robot: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the row of the result from what both sides measured.
+
+    Losses that fall into the freeze and the 2 s after it are counted apart: nobody could have delivered them.
+    """
+    freeze = _freeze_cycles(settings)
+    commands, states = robot["commands"], controller["states"]
+    touched = (freeze["first"], freeze["settled"]) if freeze["first"] else (1, 0)
+    states_touched = (controller["states_touched"][0] + 1, controller["states_touched"][1])
+    return {
+        "bench": "go2-transport",
+        "transport": settings.transport,
+        "port": settings.port or "(loopback)",
+        "rate_hz": settings.rate,
+        "seconds": settings.seconds,
+        "error": "",
+        "period": controller["cadence"]["period"],
+        "period_error": controller["period_error"],
+        "lateness": controller["cadence"]["lateness"],
+        "skipped_periods": controller["cadence"]["skipped_periods"],
+        "cycle_delay": controller["quiet"]["cycle_delay"],
+        "work": controller["quiet"]["work"],
+        "send": controller["quiet"]["send"],
+        "cycles_without_link": controller["quiet"]["cycles_without_link"],
+        "state_age": controller["quiet"]["state_age"],
+        "commands": _stream(controller["sent"], commands, touched),
+        "states": _stream(robot["sent"], states, states_touched),
+        "controller_cpu_share": controller["cpu_share"],
+        "robot_cpu_share": robot["cpu_share"],
+        "controller_scheduling": controller["scheduling"],
+        "robot_scheduling": robot["scheduling"],
+        "warnings": [*controller["warnings"], *robot["warnings"]],
+        "freeze_at_s": settings.freeze_at,
+        "freeze_s": settings.freeze_s if settings.freeze_at is not None else None,
+        "frozen": controller["frozen"],
+    }
+
+
+def _stream(sent: int, arrived: Mapping[str, Any], touched: tuple[int, int]) -> dict[str, Any]:
+    gaps = arrived["gaps"]
+    missing = sum(gaps[1::2])
+    frozen = sum(
+        max(0, min(first + count - 1, touched[1]) - max(first, touched[0]) + 1)
+        for first, count in zip(gaps[::2], gaps[1::2], strict=True)
+    )
+    return {
+        "sent": sent,
+        "arrived": arrived["count"],
+        "lost": missing - frozen,
+        "lost_percent": 100 * (missing - frozen) / max(1, sent),
+        "lost_around_freeze": frozen,
+        "disordered": arrived["disordered"],
+        "older_than_100_ms": arrived["stale"],
+        "age_at_arrival": arrived["age"],
+    }
+
+
+def lines(row: Mapping[str, Any]) -> list[str]:
+    """Return the result for a person."""
+    text = [
+        f"{row['transport']}, {row['rate_hz']:g} Hz both ways, {row['seconds']:g} s; p50 / p99 / max",
+        f"period error     {_ms(row['period_error'])}",
+        f"cycle delay      {_ms(row['cycle_delay'])} (from the deadline until the command is on its way)",
+        f"  of it work     {_ms(row['work'])} (reading, writing; the rest is waking up late)",
+        f"send             {_ms(row['send'])}",
+        f"state age        {_ms(row['state_age'])} (when a command is sent)",
+    ]
+    for name in ("commands", "states"):
+        part = row[name]
+        text.append(
+            f"{name:<16} {part['lost']} of {part['sent']} lost ({part['lost_percent']:.3f} %), "
+            f"{part['disordered']} out of order; age at arrival {_ms(part['age_at_arrival'])}"
+        )
+    text.append(
+        f"CPU share        controller {100 * row['controller_cpu_share']:.1f} % "
+        f"({row['controller_scheduling']}), robot {100 * row['robot_cpu_share']:.1f} % "
+        f"({row['robot_scheduling']})"
+    )
+    if row["cycles_without_link"] or row["skipped_periods"]:
+        text.append(
+            f"attention        {row['cycles_without_link']} cycles without a link, "
+            f"{row['skipped_periods']} periods skipped"
+        )
+    if frozen := row["frozen"]:
+        longest_s = frozen["cycle_delay"]["max_s"]
+        text += [
+            f"frozen {row['freeze_s']:g} s, then {_SETTLE_S:g} s: cycle delay {_ms(frozen['cycle_delay'])}",
+            f"  of it work     {_ms(frozen['work'])}, {frozen['cycles_without_link']} cycles without a link",
+            f"                 {row['commands']['lost_around_freeze']} commands dropped, "
+            f"{row['commands']['older_than_100_ms']} delivered late",
+            f"                 longest delay {longest_s * 1e3:.2f} ms: "
+            + ("kept" if longest_s <= FREEZE_LIMIT_S else "NOT kept")
+            + f" the limit of {FREEZE_LIMIT_S * 1e3:g} ms",
+        ]
+    return [*text, *(f"warning: {warning}" for warning in dict.fromkeys(row["warnings"]))]
+
+
+def _ms(spread: Mapping[str, float | None]) -> str:
+    values = (spread[name] for name in ("p50_s", "p99_s", "max_s"))
+    return " / ".join("-" if v is None else f"{v * 1e3:.3f}" for v in values) + " ms"
+
+
+@contextlib.contextmanager
+def _progress(title: str, seconds: float, quiet: bool) -> Iterator[Callable[[float], None]]:
+    if quiet or not sys.stderr.isatty():
+        yield lambda passed: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=seconds)
+        yield lambda passed: bar.update(task, completed=min(passed, seconds))

@@ -1,0 +1,80 @@
+"""What every emulator's command needs: a way to end, priority over other processes, the truth at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from deal_hw.clock import MonotonicClock
+from deal_hw.errors import ConfigurationError
+
+_PARENT_CHECK_STEPS = 100
+_FIFO_PRIORITY = 40
+"""Below that of a control process: the host must not wait for the emulator."""
+
+
+def stop_on_signals() -> threading.Event:
+    """Return an event that SIGINT and SIGTERM set."""
+    stop = threading.Event()
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+@contextlib.contextmanager
+def realtime_priority() -> Iterator[None]:
+    """Run ahead of ordinary processes where permitted: a real robot does not share the host's processor."""
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, *before)
+
+
+def run_until(
+    step: Callable[[], bool], stop: threading.Event, duration_s: float | None, parent: int | None
+) -> None:
+    """Call ``step`` until it returns False, a signal, the time given [s], or the parent's end."""
+    clock = MonotonicClock()
+    end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * 1e9)
+    count = 0
+    while not stop.is_set() and step():
+        count += 1
+        if end_ns is not None and clock.now_ns() >= end_ns:
+            return
+        if parent is not None and count % _PARENT_CHECK_STEPS == 0 and os.getppid() != parent:
+            return
+
+
+def read_truth(path: Path) -> Mapping[str, Any]:
+    """Return what ``reveal`` wrote.
+
+    Raises:
+        ConfigurationError: The file is no JSON object.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ConfigurationError(f"{path} is not JSON: {error}; --reveal-to writes one") from error
+    if not isinstance(values, dict):
+        raise ConfigurationError(f"{path} holds no truth; --reveal-to writes one")
+    return values
+
+
+def reveal(values: Mapping[str, Any], *, on_stdout: bool, path: Path | None) -> None:
+    """Print the truth as one line of JSON, write it to a file, both or neither."""
+    text = json.dumps(values)
+    if on_stdout:
+        print(text, flush=True)
+    if path is not None:
+        path.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,251 @@
+"""``deal-hw emulate go2``: its options beside the common ones, and how it runs."""
+
+from __future__ import annotations
+
+import gc
+import re
+import socket
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.transport import TopicTransport, WireOptions
+
+if TYPE_CHECKING:
+    from deal_hw.cli.emulate import Emulate
+    from deal_hw.drivers.go2.device import Go2Device
+    from deal_hw.drivers.go2.truth import Truth
+
+DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
+"""Transports of the Go2, and where its emulator is by default: on this machine alone."""
+_ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Go2Options:
+    """Options of ``emulate go2`` alone; times of faults count from the first stiff command."""
+
+    suspended: bool = False
+    """The base is held in the air: no floor, no contact."""
+
+    start: Literal["lying", "standing"] = "lying"
+    """Limp on the floor, or standing with sport mode in control."""
+
+    sport: Literal["normal", "ai", "advanced", "mcf", "off"] = "normal"
+    """The sport mode that is active at power-up; it fights every other command until it is released."""
+
+    sport_silent: bool = False
+    """Sport mode's own commands are not seen on rt/lowcmd."""
+
+    remote_script: Path | None = None
+    """JSON file with what the remote says from when on: [{"at_s": 2.0, "buttons": "L2+B", "left_y": 0.5}]"""
+
+    no_remote: bool = False
+    """No remote is heard: its 40 bytes are zeros."""
+
+    tick_start_ms: int = 0
+    """The robot's clock at the start [ms]; it wraps at 2**32."""
+
+    reorder: float = 0.0
+    """Share of states that come after their successor."""
+
+    wire_after_s: float | None = None
+    """When the shares --drop, --duplicate, --reorder and --corrupt begin [s]; by default at once."""
+
+    stale_after_s: float | None = None
+    """When the same state begins to be sent again and again [s]."""
+
+    lost_after_s: float | None = None
+    """When a motor gives no torque any more and counts lost commands [s]."""
+
+    lost_joint: str = "FL_calf_joint"
+    """That motor."""
+
+    sport_after_s: float | None = None
+    """When sport mode comes back [s]."""
+
+    battery_after_s: float | None = None
+    """When the battery is nearly empty [s]."""
+
+    nan_after_s: float | None = None
+    """When a joint's position and velocity become NaN [s]."""
+
+    nan_joint: str = "FL_calf_joint"
+    """That joint."""
+
+    hot_after_s: float | None = None
+    """When a motor reports 95 degrees [s]."""
+
+    hot_joint: str = "FL_calf_joint"
+    """That motor."""
+
+    stop_after_s: float | None = None
+    """When the operator presses L2 and B and holds them [s]."""
+
+    push_after_s: float | None = None
+    """When somebody pushes the base to its left [s]."""
+
+    push: float = 25.0
+    """The push's impulse, over 0.1 s [N*s]."""
+
+    domain: int = 0
+    """DDS domain."""
+
+    mode: Literal["peer", "client"] = "peer"
+    """Zenoh: wait for peers at the port, or be a client of the router there."""
+
+    insecure: bool = False
+    """Zenoh: allow plain TCP beyond this machine."""
+
+    ca: Path | None = None
+    """Zenoh over TLS: the authority that peers are checked against (PEM)."""
+
+    certificate: Path | None = None
+    """Zenoh over TLS: our certificate (PEM)."""
+
+    key: Path | None = None
+    """Zenoh over TLS: its private key (PEM)."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.tick_start_ms < 2**32:
+            raise ConfigurationError(f"tick_start_ms is a number of 32 bits, got {self.tick_start_ms}")
+
+    def wire(self, transport: str) -> WireOptions:
+        """Return how the emulator joins the wire."""
+        return WireOptions(
+            domain=self.domain, listen=transport == "zenoh" and self.mode == "peer", mode=self.mode,
+            insecure=self.insecure, ca=self.ca, certificate=self.certificate, key=self.key,
+        )  # fmt: skip
+
+    def given(self) -> list[str]:
+        """Return the flags of options that differ from their defaults."""
+        return [
+            "--" + entry.name.replace("_", "-")
+            for entry in fields(self)
+            if getattr(self, entry.name) != entry.default
+        ]
+
+
+def make_transport(name: str, port: str, options: WireOptions) -> TopicTransport:
+    """Return a topic transport that is not opened yet.
+
+    Raises:
+        UnknownNameError: There is no such transport.
+        MissingExtraError: Its package is not installed.
+    """
+    from deal_hw import drivers
+    from deal_hw.clock import MonotonicClock
+
+    if name not in DEFAULT_PORTS:
+        raise UnknownNameError("transport of the Go2", name, DEFAULT_PORTS)
+    made = drivers.make_transport(name, port, MonotonicClock(), options)
+    if not isinstance(made, TopicTransport):
+        raise ConfigurationError(f"transport {name!r} carries no topics")
+    return made
+
+
+def emulate_go2(config: Emulate) -> int:
+    """Run the emulator until a signal or the time given; return the exit status.
+
+    The first line on standard output is ``port PORT``.
+    """
+    try:
+        from deal_hw.drivers.go2.emulator import Go2Emulator
+    except ModuleNotFoundError as error:
+        if error.name == "mujoco":
+            raise MissingExtraError(error.name, "sim") from error
+        raise
+    stop = stop_on_signals()
+    truth = _truth(config)
+    device = _device(config, truth)
+    transport = config.transport or "dds"
+    port = free_port(config.port or DEFAULT_PORTS[transport])
+    emulator = Go2Emulator(device, make_transport(transport, port, config.go2.wire(transport)))
+    gc.collect()
+    gc.freeze()
+    # The transport's threads inherit the priority that holds when it is opened.
+    with realtime_priority():
+        try:
+            emulator.open()
+            print(f"port {port}", flush=True)
+            print(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends", flush=True)
+
+            def step() -> bool:
+                emulator.step()
+                return True
+
+            run_until(step, stop, config.duration_s, config.parent)
+        finally:
+            emulator.close()
+    report = emulator.report()
+    reveal(report, on_stdout=config.reveal, path=config.reveal_to)
+    for line in summary(report):
+        print(line, file=sys.stderr)
+    return 0
+
+
+def summary(report: dict[str, Any]) -> list[str]:
+    """Return what happened, in words."""
+    commands = report["commands"]
+    lines = [
+        f"emulator: {report['device_ms'] / 1e3:.1f} s, {report['sent']['rt/lowstate']} states sent, "
+        f"{report['late_ticks']} ticks late (worst {report['latest_ms']:.1f} ms), {report['slips']} stalls, "
+        f"{report['unsent']} messages not sent",
+        f"commands: {commands['accepted']} taken, {commands['refused']} refused"
+        + (f" (the last: {commands['last_refusal']})" if commands["refused"] else "")
+        + f", the last kind: {commands['last_kind'] or 'none'}; sport mode: {report['sport'] or 'released'}",
+    ]
+    for fault in commands["faults"]:
+        damped = fault["first_damping_ms"]
+        after = "no damping since" if damped is None else f"damping {damped - fault['begin_ms']} ms later"
+        lines.append(f"fault {fault['name']} at {fault['begin_ms'] / 1e3:.3f} s: {after}")
+    return lines
+
+
+def free_port(port: str) -> str:
+    """Return the port, its number 0 replaced by that of a free TCP port."""
+    found = _ANY_PORT.fullmatch(port)
+    if found is None:
+        return port
+    address = found["address"]
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
+        try:
+            probe.bind((address, 0))
+        except OSError as error:
+            raise ConfigurationError(f"port {port!r}: {error}") from error
+        return f"{found['host']}:{probe.getsockname()[1]}"
+
+
+def _truth(config: Emulate) -> Truth:
+    from deal_hw.drivers.go2.truth import DEFAULT_XI, Truth, draw_truth, nominal_truth
+
+    if config.nominal:
+        return nominal_truth(config.profile, config.seed)
+    if config.truth_from is not None:
+        return Truth.from_json(read_truth(config.truth_from))
+    return draw_truth(config.profile, config.seed, xi=DEFAULT_XI if config.xi is None else config.xi)
+
+
+def _device(config: Emulate, truth: Truth) -> Go2Device:
+    from deal_hw.drivers.go2.device import Go2Device
+    from deal_hw.drivers.go2.faults import FaultPlan
+    from deal_hw.drivers.go2.remote_script import read_remote_script
+
+    own = config.go2
+    names = {entry.name for entry in fields(FaultPlan)}
+    chosen = {entry.name: getattr(own, entry.name) for entry in fields(own) if entry.name in names}
+    plan = FaultPlan(
+        drop=config.drop, duplicate=config.duplicate, corrupt=config.corrupt,
+        freeze_after_s=config.freeze_after_s, **chosen,
+    )  # fmt: skip
+    if own.no_remote and own.remote_script is not None:
+        raise ConfigurationError("--no-remote and --remote-script exclude each other")
+    script = () if own.remote_script is None else read_remote_script(own.remote_script)
+    return Go2Device(
+        truth, suspended=own.suspended, start=own.start, sport="" if own.sport == "off" else own.sport,
+        sport_on_wire=not own.sport_silent, plan=plan, remote=None if own.no_remote else script,
+        tick_ms=own.tick_start_ms,
+    )  # fmt: skip
