@@ -13,12 +13,13 @@ BENCH_ARGS ?= --profile sensor --seeds 0,1 --out runs/bench/loop.json
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
+SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check bench typing format clean
+.PHONY: help setup demo test dds-peer check coverage-safety mutation bench typing format clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(STAMP) ## make .venv with everything in it (done by the other targets when needed)
 
@@ -37,14 +38,30 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
+# Without the DDS peer, the tests that meet it are skipped and say what to install.
 test: $(STAMP) ## all tests that need no robot
+	@tools/build_dds_peer.sh || true
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-check: $(STAMP) typing ## format, lint, types and import order
+dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
+	@tools/build_dds_peer.sh
+
+check: $(STAMP) typing coverage-safety ## format, lint, types, import order and coverage of the safety module
 	$(BIN)/ruff format --check --output-format concise .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/house/test_layers.py
+
+# The repository's own coverage settings measure everything; here every line and branch of a few files counts.
+coverage-safety: $(STAMP) ## each line and branch of the safety module is tested
+	@mkdir -p build
+	$(BIN)/coverage run $(SAFETY_COVERAGE) --branch \
+	  --include='deal_hw/control/safety*.py,deal_hw/control/leg_checks.py' \
+	  -m pytest -q tests/control/test_control_safety*.py
+	$(BIN)/coverage report $(SAFETY_COVERAGE) --show-missing --fail-under=100
+
+mutation: $(STAMP) ## change the safety module in 900 places; each change must break a test (10 minutes)
+	$(BIN)/python tools/mutate_safety.py
 
 bench: $(STAMP) ## a small benchmark; BENCH_ARGS chooses another
 	$(BIN)/deal-hw bench loop $(BENCH_ARGS)

@@ -6,8 +6,10 @@ is added to what the calibration knows already.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,6 +54,16 @@ class Advice:
     after: float
     excitation: str
     sentence: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; a figure that was not computed is None."""
+        return {
+            "parameter": self.parameter,
+            "std": self.before if math.isfinite(self.before) else None,
+            "std_after": self.after if math.isfinite(self.after) else None,
+            "excitation": self.excitation,
+            "sentence": self.sentence,
+        }
 
 
 def excitation_menu(

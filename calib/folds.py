@@ -21,6 +21,7 @@ from deal_hw.calib.residuals import Shooting, States
 from deal_hw.calib.robust import robust_polish
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.sim.episode import Episode
 from deal_hw.types import FloatArray
 
 FOLDS = 2
@@ -116,19 +117,37 @@ def choose(
 def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each fold which samples of each recording it leaves out, (T,) each.
 
-    Each fold leaves out some stretches of every recording, so that all phases of the motion are on both
-    sides.
+    Where there are as many motions as folds, whole motions are left out, every other one: other motion is
+    what a calibration is for. The stretches of a single motion are left out likewise. A single recording is
+    divided into blocks, so that all phases of the motion are on both sides.
 
     Args:
         problem: The problem.
         count: Folds.
     """
+    episodes = problem.episodes
+    unit = motion_numbers(episodes)
+    if unit[-1] + 1 < count:
+        unit = list(range(len(episodes)))
     found: list[list[npt.NDArray[np.bool_]]] = [[] for _ in range(count)]
-    for episode in problem.episodes:
+    for number, episode in zip(unit, episodes, strict=True):
         T = len(episode.sample)
-        block = np.arange(T) * count * BLOCKS // T
+        block = np.arange(T) * count * BLOCKS // T if len(episodes) < count else np.full(T, number)
         for fold in range(count):
             found[fold].append(block % count == fold)
+    return found
+
+
+def motion_numbers(episodes: Sequence[Episode]) -> list[int]:
+    """Return which motion each episode is of, counted from 0: stretches of one follow each other."""
+    number, found = -1, []
+    last: tuple[int, int] | None = None
+    for episode in episodes:
+        at = episode.first_row, episode.origin
+        if last is None or at <= last:
+            number += 1
+        found.append(number)
+        last = at
     return found
 
 

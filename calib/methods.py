@@ -13,6 +13,7 @@ from deal_hw.errors import UnknownNameError
 METHODS: dict[str, str] = {
     "default": "deal_hw.calib.weki:Weki",
     "weki": "deal_hw.calib.weki:Weki",
+    "open-loop": "deal_hw.calib.open_loop:OpenLoop",
     "deal": "deal_hw.calib.deal:Deal",
     "deal-paper": "deal_hw.calib.deal_paper:paper",
     "deal-paper-literal": "deal_hw.calib.deal_paper:literal",
@@ -24,6 +25,7 @@ METHODS: dict[str, str] = {
     "cma": "deal_hw.calib.baselines.cma_es:Cma",
     "gauss-newton": "deal_hw.calib.baselines.gauss_newton:GaussNewton",
     "least-squares": "deal_hw.calib.baselines.least_squares:LeastSquares",
+    "least-squares-multistart": "deal_hw.calib.baselines.least_squares:MultiStartLeastSquares",
     "ekf": "deal_hw.calib.baselines.ekf:Ekf",
     "mujoco-sysid": "deal_hw.calib.baselines.sysid:MujocoSysid",
     "random": "deal_hw.calib.baselines.simple:RandomSearch",
@@ -34,6 +36,9 @@ METHODS: dict[str, str] = {
 
 NULL_METHODS = frozenset({"centre", "nominal", "deal-paper-flat"})
 """Rows that must not read the data, so they are never polished."""
+
+WHOLE_METHODS = frozenset({"open-loop"})
+"""Methods that decide themselves, on inner folds, what follows their search."""
 
 
 def check_method(name: str) -> None:
@@ -51,7 +56,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
 
     Args:
         name: A name in `METHODS`.
-        polish: Follow the search by the polish; null rows stay what they are.
+        polish: Follow the search by the polish; null rows and whole methods stay what they are.
 
     Raises:
         UnknownNameError: The name is not in the table.
@@ -59,7 +64,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
     check_method(name)
     module, _, attribute = METHODS[name].partition(":")
     search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
-    if not polish or name in NULL_METHODS:
+    if not polish or name in NULL_METHODS | WHOLE_METHODS:
         return search
     from deal_hw.calib.pipeline import PolishedMethod
     from deal_hw.calib.weki import Weki

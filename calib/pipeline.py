@@ -170,8 +170,9 @@ class PolishedMethod(CalibrationMethod[Problem]):
         polished: Polished,
         progress: ProgressCallback | None,
     ) -> Choice | None:
-        """Return what inner folds say of the polish; None where it explains the recording."""
-        if not self.settings.folds or not unexplained(polished):
+        """Return what inner folds say of the polish; None where it explains the recording to its noise."""
+        # A residual that was chosen explains itself: only what no fit has seen can judge then.
+        if not self.settings.folds or not (unexplained(polished) or problem.known_std is not None):
             return None
         if problem.robot.base is not None:
             # A fold is a search and a polish; with contacts these take a minute each.

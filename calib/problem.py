@@ -22,6 +22,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.batch import ServoBatch
 from deal_hw.sim.episode import Episode, fill_gaps
 from deal_hw.sim.model import RobotModel
+from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray
 
@@ -151,7 +152,7 @@ class Problem:
         for e in self.episodes:
             values = np.concatenate([e.position, e.velocity], axis=1)[:, self.channels]
             found[self.channels] = np.maximum(found[self.channels], white_noise_std(values, floor))
-        return found
+        return self._with_given_noise(found, np.arange(2 * self.coordinates))
 
     def _noise_model(self, floor: float) -> NoiseModel:
         # At a low sample rate what is left of the motion itself grows with speed like a jitter's noise does.
@@ -166,7 +167,19 @@ class Problem:
         moved = noise_model(positions, [s.velocity[:, columns] for s in self.starts], floor)
         std = self.noise_std[self.channels]
         std[timed] = moved.position_std
-        return NoiseModel(std, moved.timing_std_s)
+        return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
+
+    def _with_given_noise(self, std: FloatArray, channels: IntArray) -> FloatArray:
+        """Return standard deviations, (M,), with those of joints whose sensor's noise is known in their place."""
+        joints = self.robot.description.joint_names
+        first = self.coordinates - len(joints)
+        given = {
+            first + joints.index(name): p.nominal
+            for p in self.space.parameters
+            if p.kind == SENSOR_NOISE
+            for name in p.elements
+        }
+        return np.array([given.get(int(c), s) for c, s in zip(channels, std, strict=True)])
 
     @property
     def steps(self) -> int:

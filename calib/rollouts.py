@@ -173,7 +173,7 @@ def _closed_loop(
     path = np.empty((N, T * period, A))
     rate = batch.servo_factor("servo_speed_limit") * episode.step_s
     # A causal simulator cannot act before it is commanded.
-    lag = np.maximum(members.latency_s, 0.0) / episode.step_s
+    lag = np.maximum(batch.lag_s(members.latency_s), 0.0) / episode.step_s
     reach = int(np.ceil(lag.max())) + 1
     for t in range(T):
         at = int(ticks.start[t])

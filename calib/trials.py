@@ -170,9 +170,11 @@ class _Path:
         self._factor = batch.servo_factor("servo_speed_limit")
         start = scenario.position[:, list(description.actuated_index)]
         self._now = np.zeros_like(start) if self._motor else start.copy()
-        late = scenario.latency_s / step_s
+        late = batch.lag_s(scenario.latency_s) / step_s
+        # (N, 1, 1), or (N, 1, A) where actuators have delays of their own.
+        late = late.reshape(len(late), 1, -1)
         self._whole = np.floor(late).astype(int)
-        self._part = (late - self._whole)[:, None, None]
+        self._part = late - self._whole
         self._margin = int(self._whole.max()) + 1
         self._done = self._margin
         self._path = np.repeat(self._now[:, None], self._margin + steps, axis=1)
@@ -187,10 +189,10 @@ class _Path:
             ahead = self._now[:, None] + np.clip(gap, -reach, reach)
         self._path[:, self._done : self._done + steps] = ahead
         self._now = ahead[:, -1]
-        index = self._done + np.arange(steps) - self._whole[:, None]
+        index = self._done + np.arange(steps)[:, None] - self._whole
         self._done += steps
-        late = np.take_along_axis(self._path, index[..., None], axis=1)
-        later = np.take_along_axis(self._path, index[..., None] - 1, axis=1)
+        late = np.take_along_axis(self._path, index, axis=1)
+        later = np.take_along_axis(self._path, index - 1, axis=1)
         return np.asarray((1 - self._part) * late + self._part * later)
 
 
@@ -219,14 +221,17 @@ class _Loop:
                 sent.append(self.sent[-1][n])
                 continue
             wanted = behaviour.command(_state(position[n], velocity[n], tick), time_s)
-            sent.append(self._filtered(n, wanted, position[n][self._index], time_s))
+            measured, moving = position[n][self._index], velocity[n][self._index]
+            sent.append(self._filtered(n, wanted, measured, moving, time_s))
         running = [command for command, why in zip(sent, self.tripped, strict=True) if not why]
         if any(not _same_limits(running[0], other) for other in running):
             raise ConfigurationError("behaviours that run side by side must send the same gains and limits")
         self.sent.append(sent)
         return sent
 
-    def _filtered(self, n: int, wanted: JointCommand, measured: FloatArray, time_s: float) -> JointCommand:
+    def _filtered(
+        self, n: int, wanted: JointCommand, measured: FloatArray, velocity: FloatArray, time_s: float
+    ) -> JointCommand:
         if not is_finite_target(wanted):
             self.tripped[n] = "the behaviour asked for a command that is not finite"
             return dataclasses.replace(wanted, position_target=self._previous[n])
@@ -235,8 +240,10 @@ class _Loop:
             share = min(time_s / self._description.limits.ease_in_s, 1.0)
         eased = self._start[n] + share * (wanted.position_target - self._start[n])
         command, clipped = self._filters[n].clip(
-            dataclasses.replace(wanted, position_target=eased), self._previous[n], measured
+            dataclasses.replace(wanted, position_target=eased), self._previous[n], measured, velocity
         )
+        if "gains" in clipped:
+            self.tripped[n] = "a joint moved so fast that its braking would exceed the limit of effort"
         self.clipped[n] += bool(clipped)
         self._previous[n] = command.position_target
         return command

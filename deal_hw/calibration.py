@@ -74,6 +74,9 @@ class CalibrationResult:
         latency_interval_s: 90 % interval of the latency [s].
         chi2: Mean squared residual over its expected variance; 1 is a perfect model.
         alarms: Reasons to distrust the model (mismatch), in words; empty is good.
+        advice: What to record next, one mapping a weak or unidentified parameter: ``parameter``, its standard
+            deviation in its own scale now (``std``) and after that recording (``std_after``),
+            ``excitation`` and a ``sentence``; empty where nothing is open or nobody asked.
         heldout_nrmse: Held-out error by predictor: "nominal", "calibrated", "null" (the state stays as it
             is).
         trace: One mapping a generation or iteration.
@@ -94,6 +97,7 @@ class CalibrationResult:
     latency_interval_s: tuple[float, float] = (0.0, 0.0)
     chi2: float = float("nan")
     alarms: tuple[str, ...] = ()
+    advice: Sequence[Mapping[str, Any]] = ()
     heldout_nrmse: Mapping[str, float] = field(default_factory=dict)
     trace: Sequence[Mapping[str, float]] = ()
     steps: int = 0
@@ -135,6 +139,7 @@ class CalibrationResult:
             "latency_interval_s": list(self.latency_interval_s),
             "chi2": self.chi2,
             "alarms": list(self.alarms),
+            "advice": [dict(row) for row in self.advice],
             "heldout_nrmse": dict(self.heldout_nrmse),
             "steps": self.steps,
             "seconds": self.seconds,
@@ -159,6 +164,7 @@ class CalibrationResult:
             latency_interval_s=(values["latency_interval_s"][0], values["latency_interval_s"][1]),
             chi2=values["chi2"],
             alarms=tuple(values["alarms"]),
+            advice=tuple(values.get("advice", ())),
             heldout_nrmse=values["heldout_nrmse"],
             steps=values["steps"],
             seconds=values["seconds"],

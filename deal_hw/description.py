@@ -44,8 +44,8 @@ class LegLimits:
 
     Attributes:
         effort: Largest predicted P-D effort of a command, (A,) [N·m]; targets are moved to keep it.
-        tilt: Leaning further than this trips, angle between the base's z axis and the vertical [rad]; infinite
-            for a robot whose base is held.
+        tilt: Leaning further than this trips, angle between the base's z axis and the vertical [rad];
+            infinite for a robot whose base is held.
         tumble: Turning faster than this trips, any axis of the base [rad/s].
         free_fall: A specific force below this [m/s²] for ``free_fall_s`` is a fall.
         free_fall_s: See there [s].
@@ -139,9 +139,11 @@ class RobotDescription:
             ``effort_limit``, and stiffness and damping are 0.
         floating_base: Name of the free joint that carries the robot; None for a fixed base. It is not among
             ``joint_names``.
-        passive_damping: kd of the passive command, (A,) [N·m·s/rad], for robots whose passive state is damping;
-            empty: the motors are off.
+        passive_damping: kd of the passive command, (A,) [N·m·s/rad], for robots whose passive state is
+            damping; empty: the motors are off.
         rest_position: The pose in which a robot with legs lies and may go limp, (J,); empty: none.
+        feet: Names of the model's foot geoms (spheres), in the order of ``BodyState.foot_force``; empty: no
+            legs.
         sources: Where each number comes from, by attribute name.
     """
 
@@ -165,6 +167,7 @@ class RobotDescription:
     repeat_rate_hz: float = 0.0
     passive_damping: tuple[float, ...] = ()
     rest_position: tuple[float, ...] = ()
+    feet: tuple[str, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -213,6 +216,7 @@ class RobotDescription:
         for name, default in (
             ("actuation", "position"), ("floating_base", None), ("repeat_rate_hz", 0.0),
             ("passive_damping", ()), ("rest_position", ()),
+            ("feet", ()),
         ):  # fmt: skip
             if values[name] == default:
                 del values[name]

@@ -81,7 +81,9 @@ class WireOptions:
     Attributes:
         domain: Number of the DDS domain.
         listen: Whether to wait for peers at the port (Zenoh) instead of going to them.
-        mode: Zenoh session mode, "peer" or "client" (of a router).
+        mode: Zenoh session mode, "peer" or "client"; "" is a peer where it listens, else a client. Two
+            clients of one listener hear each other, two peers do not: another program's commands would stay
+            unnoticed.
         insecure: Whether plain TCP to another machine is allowed.
         ca: Certificate authority that peers are checked against (PEM).
         certificate: Our own certificate (PEM), which the peer checks.
@@ -90,14 +92,14 @@ class WireOptions:
 
     domain: int = 0
     listen: bool = False
-    mode: str = "peer"
+    mode: str = ""
     insecure: bool = False
     ca: Path | None = None
     certificate: Path | None = None
     key: Path | None = None
 
     def __post_init__(self) -> None:
-        if self.mode not in ("peer", "client"):
+        if self.mode not in ("", "peer", "client"):
             raise ConfigurationError(f"wire mode {self.mode!r}: peer or client")
         if not 0 <= self.domain <= 232:
             raise ConfigurationError(f"DDS domain {self.domain}: 0 to 232")
@@ -105,6 +107,11 @@ class WireOptions:
             raise ConfigurationError(
                 "a certificate and its private key belong together: give both or neither"
             )
+
+    @property
+    def session_mode(self) -> str:
+        """The Zenoh session mode that is meant, "peer" or "client"."""
+        return self.mode or ("peer" if self.listen else "client")
 
 
 class TopicTransport(Transport):

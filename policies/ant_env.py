@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.locomotion import (
     GRAVITY,
@@ -21,6 +20,7 @@ from deal_hw.policies.locomotion import (
     vector_terms,
 )
 from deal_hw.policies.servo_loop import BoolArray
+from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.types import FloatArray
 
@@ -46,10 +46,7 @@ class RunTask:
     start_noise_rad: float = 0.1
 
     def __post_init__(self) -> None:
-        if self.ticks < 1:
-            raise ConfigurationError(f"ticks must be at least 1, got {self.ticks}")
-        if not self.top_height_m > 0:
-            raise ConfigurationError(f"top_height_m must be positive, got {self.top_height_m!r}")
+        check_task(self.ticks, top_height_m=self.top_height_m)
 
 
 def run_spec(

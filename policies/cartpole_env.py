@@ -12,7 +12,7 @@ from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.servo_loop import BoolArray
-from deal_hw.policies.vector_env import ServoVectorEnv
+from deal_hw.policies.vector_env import ServoVectorEnv, check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.types import FloatArray
 
@@ -58,11 +58,8 @@ class BalanceTask:
     host_delay_s: tuple[float, float] = (0.0, 0.007)
 
     def __post_init__(self) -> None:
-        if self.ticks < 1:
-            raise ConfigurationError(f"ticks must be at least 1, got {self.ticks}")
-        for name in ("end_angle_rad", "end_position_m", "action_scale_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
+        positive = ("end_angle_rad", "end_position_m", "action_scale_m")
+        check_task(self.ticks, **{name: getattr(self, name) for name in positive})
         low, high = self.host_delay_s
         if not 0 <= low <= high:
             raise ConfigurationError(

@@ -23,6 +23,7 @@ from deal_hw.policies.locomotion import (
     vector_terms,
 )
 from deal_hw.policies.servo_loop import BoolArray
+from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.types import FloatArray
 
@@ -69,10 +70,7 @@ class WalkTask:
     start_noise_rad: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.ticks < 1:
-            raise ConfigurationError(f"ticks must be at least 1, got {self.ticks}")
-        if not self.tracking_width > 0:
-            raise ConfigurationError(f"tracking_width must be positive, got {self.tracking_width!r}")
+        check_task(self.ticks, tracking_width=self.tracking_width)
         if not 0 <= self.speed_m_s[0] <= self.speed_m_s[1]:
             raise ConfigurationError(
                 f"speed_m_s must be (low, high) with 0 <= low <= high, got {self.speed_m_s}"

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.batch import COMMAND_DELAY, ServoBatch
 from deal_hw.sim.model import load_model
 from deal_hw.types import FloatArray, IntArray
 
@@ -38,21 +38,22 @@ def delayed_setpoints(
         start: Set-point before the first step, (N, A).
         older: Target in force before the change, (N, A).
         newer: Target in force from it on, (N, A).
-        switch: Steps for which the older one is in force, (N,).
+        switch: Steps for which the older one is in force, (N,), or for each actuator, (N, A).
         rate: Largest change a step, (N, A).
         steps: Steps S in a control period.
 
     Returns:
         (N, S, A).
     """
-    count = np.arange(1, steps + 1)
-    before = np.minimum(count[None, :], switch[:, None])[..., None] * rate[:, None]
-    after = np.maximum(count[None, :] - switch[:, None], 0)[..., None] * rate[:, None]
-    reach = switch[:, None] * rate
+    count = np.arange(1, steps + 1)[:, None]
+    switch = switch.reshape(len(switch), -1)
+    before = np.minimum(count, switch[:, None]) * rate[:, None]
+    after = np.maximum(count - switch[:, None], 0) * rate[:, None]
+    reach = switch * rate
     middle = start + np.clip(older - start, -reach, reach)
     first = start[:, None] + np.clip((older - start)[:, None], -before, before)
     second = middle[:, None] + np.clip((newer - middle)[:, None], -after, after)
-    return np.where((count[None, :] <= switch[:, None])[..., None], first, second)
+    return np.where(count <= switch[:, None], first, second)
 
 
 class ServoLoop:
@@ -62,7 +63,8 @@ class ServoLoop:
         description: The robot.
         space: The parameters that members differ in.
         count: Members N.
-        longest_latency_s: The longest total latency that :meth:`restart` will be given [s].
+        longest_latency_s: The longest total latency that :meth:`restart` will be given [s], command delays
+            of the parameters not counted.
         sensor: What stands between the true and the reported state; the description's by default.
         threads: Threads of the physics; None for all CPUs.
 
@@ -93,9 +95,10 @@ class ServoLoop:
         C, A = self.batch.position.shape[1], len(description.actuated)
         self._home = self.batch.position[0].copy()
         self._home[self.batch.robot.joints] = description.default_position
+        longest_latency_s += max((p.high for p in space.parameters if p.kind == COMMAND_DELAY), default=0.0)
         depth = int(np.ceil(longest_latency_s * description.device_rate_hz / self.steps)) + 2
         self._targets = np.zeros((depth, count, A))
-        self._latency = np.zeros(count, dtype=np.int64)
+        self._latency = np.zeros((count, A), dtype=np.int64)
         self._setpoint = np.zeros((count, A))
         self._reports = np.zeros((self._window + 1, count, C))
         self.reported_position = np.zeros((count, C))
@@ -135,16 +138,18 @@ class ServoLoop:
         Raises:
             ConfigurationError: A latency is negative or longer than the loop was made for.
         """
-        ticks = np.rint(latency_s / self._step_s).astype(np.int64)
-        longest = (len(self._targets) - 1) * self.steps
-        if ticks.size and (ticks.min() < 0 or ticks.max() >= longest):
-            raise ConfigurationError(
-                f"latencies must lie in [0, {longest * self._step_s:g}) s, "
-                f"got {latency_s.min():g}..{latency_s.max():g}"
-            )
         members = np.flatnonzero(where)
         self._theta[members] = theta
         self.batch.set_parameters(self._theta, members)
+        late = np.zeros(self.count)
+        late[members] = latency_s
+        late = self.batch.lag_s(late).reshape(self.count, -1)[members]
+        ticks = np.rint(late / self._step_s).astype(np.int64)
+        longest = (len(self._targets) - 1) * self.steps
+        if ticks.size and (ticks.min() < 0 or ticks.max() >= longest):
+            raise ConfigurationError(
+                f"latencies must lie in [0, {longest * self._step_s:g}) s, got {late.min():g}..{late.max():g}"
+            )
         self.batch.set_state(position, velocity, members)
         self._latency[members] = ticks
         start = setpoint
@@ -175,6 +180,7 @@ class ServoLoop:
         self._targets[0] = target
         periods, switch = np.divmod(self._latency, self.steps)
         members = np.arange(self.count)
+        rows, columns = members[:, None], np.arange(self._latency.shape[1])
         rate = (
             self.batch.servo_factor("servo_speed_limit")
             * np.array(self.description.speed_limit)
@@ -182,8 +188,8 @@ class ServoLoop:
         )
         rate = np.minimum(rate, SLEWLESS)
         setpoints = delayed_setpoints(
-            self._setpoint, self._targets[periods + 1, members], self._targets[periods, members], switch,
-            rate, self.steps,
+            self._setpoint, self._targets[periods + 1, rows, columns], self._targets[periods, rows, columns],
+            switch, rate, self.steps,
         )  # fmt: skip
         self._setpoint = setpoints[:, -1]
         position, velocity = (values[:, -1] for values in self.batch.advance(setpoints))

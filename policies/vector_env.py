@@ -12,10 +12,28 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray
+
+
+def check_task(ticks: int, **positive: float) -> None:
+    """Check the settings that tasks have in common.
+
+    Args:
+        ticks: Control periods in an episode.
+        **positive: Settings that must be positive, by name.
+
+    Raises:
+        ConfigurationError: One is not.
+    """
+    if ticks < 1:
+        raise ConfigurationError(f"ticks must be at least 1, got {ticks}")
+    for name, value in positive.items():
+        if not value > 0:
+            raise ConfigurationError(f"{name} must be positive, got {value!r}")
 
 
 class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):

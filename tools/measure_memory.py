@@ -92,7 +92,9 @@ def summary(rss_mib: list[float]) -> dict[str, Any]:
 
 def main() -> int:
     """Measure and write one JSON file; return 1 where a search grows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--generations", type=int, default=200)
     parser.add_argument("--population", type=int, default=32)
@@ -114,7 +116,9 @@ def main() -> int:
         print({key: value for key, value in rows[-1].items() if key != "rss_mib"}, flush=True)
     if config.out is not None:
         settings = {key: getattr(config, key) for key in ("generations", "population", "seconds")}
-        config.out.write_text(json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+        config.out.write_text(
+            json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n", encoding="utf-8"
+        )
     return 0 if all(row["flat"] for row in rows) else 1
 
 

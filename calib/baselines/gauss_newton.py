@@ -97,6 +97,8 @@ class Linear:
 class Innovations:
     """Whitened window innovations as functions of parameters in their own scale and of the latency.
 
+    What is expected of parameters (their priors) stands behind them as one more residual each.
+
     Args:
         problem: Data and simulator.
         ticks: Window length in control periods.
@@ -113,6 +115,9 @@ class Innovations:
         K = len(problem.space)
         steps = np.append(np.full(K, PARAMETER_STEP), LATENCY_STEP_S)
         self._steps = steps[: K + (problem.fixed_latency_s is None)]
+        mean, std = problem.space.prior
+        self._expected = np.flatnonzero(np.isfinite(std))
+        self._mean, self._std = problem.space.to_scale(mean)[self._expected], std[self._expected]
 
     def members(self, values: FloatArray) -> Members:
         """Return values, (N, K + 1), in physical units."""
@@ -122,7 +127,10 @@ class Innovations:
         """Return whitened residuals of values, (N, K + 1), in the metric of one of them, (K + 1,): (N, M)."""
         offsets = None if self.offsets is None else list(self.offsets)
         members, around = self.members(values), self.members(centre[None])
-        return whitened_residual(self.problem, members, around, self.windows, offsets)
+        found = whitened_residual(self.problem, members, around, self.windows, offsets)
+        if not len(self._expected):
+            return found
+        return np.concatenate([found, (values[:, self._expected] - self._mean) / self._std], axis=1)
 
     def follow(self, centre: FloatArray) -> None:
         """Move the start states to the most probable ones under a simulator, (K + 1,)."""
@@ -153,9 +161,9 @@ class Innovations:
         return Linear(base, costs(base), gradient, hessian)
 
     def split(self, residual: FloatArray) -> tuple[FloatArray, ...]:
-        """Return one residual, (M,), by episodes: (W, H, channels) each."""
-        sizes = np.cumsum([d.measured.size for d in self.windows])[:-1]
-        parts = np.split(residual, sizes)
+        """Return one residual, (M,), by episodes: (W, H, channels) each; without what is expected."""
+        ends = np.cumsum([d.measured.size for d in self.windows])
+        parts = np.split(residual[: ends[-1]], ends[:-1])
         return tuple(p.reshape(d.measured.shape) for p, d in zip(parts, self.windows, strict=True))
 
 

@@ -1,5 +1,7 @@
 """`least-squares`: one-step prediction error from recorded states, minimised from one start.
 
+And `least-squares-multistart`, a stronger one for real recordings: windows, a latency, several starts.
+
 The plain textbook baseline, as the paper's Table 6 means it. Every control period starts from the state that
 the robot reported, the simulation predicts the next one, and `scipy.optimize.least_squares` (trust region,
 with the ranges as bounds) minimises the sum of squared differences, from the centre of the ranges on. Each
@@ -11,7 +13,7 @@ parameters, and a start on a plateau stays there. Parameters are in their own sc
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from deal_hw.calib.coordinates import Coordinates, Members
+from deal_hw.calib.horizon import HorizonFit, Recipe, fit_horizon
 from deal_hw.calib.identifiability import intervals
 from deal_hw.calib.innovations import explained, samples_per_tick
 from deal_hw.calib.outcome import Run
@@ -28,6 +31,7 @@ from deal_hw.calib.search import Search, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode_parts import spread, stretches
 from deal_hw.types import FloatArray
 
 EXPLAINED_TICKS = 10
@@ -35,6 +39,10 @@ EXPLAINED_TICKS = 10
 
 DIVERGED = 1e3
 """Difference, in typical changes, that stands for a simulation that diverged: scipy takes no infinities."""
+
+
+PART_S = 2.5
+"""Recordings are cut into parts of this length, of which some are taken [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,6 +177,8 @@ class OneShot(Stepper):
 def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
     """Return s^2 inv(J'J) with the range as a flat prior, which keeps what the data cannot see finite.
 
+    Where a parameter has a prior of its own that is added.
+
     Args:
         space: The parameters.
         jacobian: Derivatives in each parameter's own scale, (R, K).
@@ -176,40 +186,52 @@ def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: F
     """
     variance = float(residual @ residual) / max(len(residual) - len(space), 1)
     information = jacobian.T @ jacobian / max(variance, np.finfo(float).tiny)
-    return np.asarray(np.linalg.inv(information + np.diag(12.0 / space.width**2)), dtype=np.float64)
+    prior = 12.0 / space.width**2 + 1.0 / space.prior[1] ** 2
+    return np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
 
 
 def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float) -> Found:
     space = problem.space
     error = OneStep(problem, latency_s)
-    step = PARAMETER_STEP * np.eye(len(space))
-
-    def residual(value: FloatArray) -> FloatArray:
-        return np.asarray(error.residual(value[None])[0], dtype=np.float64)
-
-    def jacobian(value: FloatArray) -> FloatArray:
-        r = error.residual(np.concatenate([value[None], value + step]))
-        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
-
-    solution = least_squares(
-        residual,
-        space.to_scale(space.center),
-        jac=jacobian,
-        bounds=(space.to_scale(space.low), space.to_scale(space.high)),
-        ftol=tolerance,
-        xtol=tolerance,
-        gtol=tolerance,
-        max_nfev=max(iterations, 1),
-    )
+    ends = dict.fromkeys(("ftol", "xtol", "gtol"), tolerance) | {"max_nfev": max(iterations, 1)}
+    solution = _minimise(error, 0.0, space.to_scale(space.center), ends)
+    count = len(solution.fun)
+    if np.isfinite(space.prior[1]).any():
+        # Residuals have no noise model here: a prior's standard deviation is weighed against their own spread.
+        spread = float(np.sqrt(solution.fun @ solution.fun / max(count - len(space), 1)))
+        solution = _minimise(error, max(spread, np.finfo(float).tiny), solution.x, ends)
     theta = np.clip(space.from_scale(solution.x), space.low, space.high)
     return Found(
         theta=theta,
-        covariance=textbook_covariance(space, np.asarray(solution.jac), solution.fun),
+        covariance=textbook_covariance(space, np.asarray(solution.jac)[:count], solution.fun[:count]),
         latency_s=latency_s,
         iterations=int(solution.nfev),
         message=str(solution.message),
         alarms=() if solution.status else (f"not converged after {solution.nfev} iterations",),
     )
+
+
+def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[str, float]) -> Any:
+    """Run scipy's trust region on the one-step error and, times a weight, on what is expected of parameters."""
+    space = error.space
+    mean, std = space.prior
+    expected = np.isfinite(std) & (weight > 0)
+    step = PARAMETER_STEP * np.eye(len(space))
+
+    def rows(values: FloatArray) -> FloatArray:
+        found = error.residual(values)
+        off = ((values - space.to_scale(mean)) / std)[:, expected]
+        return np.concatenate([found, weight * off], axis=1) if expected.any() else found
+
+    def residual(value: FloatArray) -> FloatArray:
+        return np.asarray(rows(value[None])[0], dtype=np.float64)
+
+    def jacobian(value: FloatArray) -> FloatArray:
+        r = rows(np.concatenate([value[None], value + step]))
+        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
+
+    bounds = space.to_scale(space.low), space.to_scale(space.high)
+    return least_squares(residual, start, jac=jacobian, bounds=bounds, **ends)
 
 
 class OneStep:
@@ -222,6 +244,7 @@ class OneStep:
 
     def __init__(self, problem: Problem, latency_s: float) -> None:
         self._problem, self._latency_s = problem, latency_s
+        self.space = problem.space
         self._data = problem.windows(samples_per_tick(problem))
         self._recorded = [self._states(d) for d in self._data]
         first = problem.episodes[self._data[0].episode]
@@ -258,3 +281,90 @@ class OneStep:
             parts.append(difference.reshape(len(values), -1))
         whole = np.concatenate(parts, axis=1)
         return np.asarray(np.nan_to_num(whole, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MultiStartSettings:
+    """Settings of `least-squares-multistart`.
+
+    Attributes:
+        starts: The nominal values, and draws over all ranges.
+        survivors: Best starts that go on with all recordings.
+        window_s: Length of the windows [s].
+        first_s: How much of the recordings, evenly spread, the starts are first fitted to [s].
+        first_iterations: Iterations of each start there.
+    """
+
+    starts: int = 8
+    survivors: int = 2
+    window_s: float = 0.4
+    first_s: float = 12.0
+    first_iterations: int = 8
+
+
+class MultiStartLeastSquares(Search):
+    """Least squares on open-loop predictions from smoothed states, the best of several starts.
+
+    What a careful user writes: windows of some tenths of a second, Levenberg-Marquardt on the position error
+    (each channel over its own root mean square residual), the latency one more unknown, the ranges as bounds
+    and no other prior; the best of several starts counts. The budget's generations bound the last fits'
+    iterations. The run is one generation: interrupted in the middle of it, it begins anew, to the same
+    numbers.
+
+    Args:
+        settings: How to run.
+    """
+
+    name = "least-squares-multistart"
+
+    def __init__(self, settings: MultiStartSettings | None = None) -> None:
+        self.settings = settings or MultiStartSettings()
+
+    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+        """Return the run with its starts drawn."""
+        coordinates, settings = Coordinates(run.problem), self.settings
+        drawn = coordinates.members(coordinates.sample(rng, settings.starts - 1))
+        nominal = run.problem.space.nominal, coordinates.clip_latency(0.0)
+        starts = [nominal, *zip(drawn.theta, map(float, drawn.latency_s), strict=True)]
+
+        def solve() -> Found:
+            return _solve_starts(run.problem, starts, settings, run.budget.generations)
+
+        return OneShot(run, settings, solve, f"textbook s^2 inv(J'J), best of {settings.starts} starts")
+
+
+def _solve_starts(
+    problem: Problem,
+    starts: Sequence[tuple[FloatArray, float]],
+    settings: MultiStartSettings,
+    iterations: int,
+) -> Found:
+    recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
+    parts = [p for e in problem.episodes for p in stretches(e, PART_S)]
+    part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
+    rough = [fit_horizon(part, *start, recipe, iterations=settings.first_iterations) for start in starts]
+    order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]
+    fits = [
+        fit_horizon(problem, rough[i].theta, rough[i].latency_s, recipe, iterations=max(iterations, 1))
+        for i in order
+    ]
+    best = min(fits, key=_score)
+    K = len(problem.space)
+    residual = np.concatenate([r.ravel() for r in best.residual])
+    variance = float(residual @ residual) / max(len(residual) - K, 1)
+    # The range as a flat prior keeps what the data cannot see finite.
+    flat = np.diag(12.0 / problem.space.width**2)
+    return Found(
+        theta=best.theta,
+        covariance=np.asarray(np.linalg.inv(best.hessian[:K, :K] / variance + flat)),
+        latency_s=best.latency_s,
+        iterations=sum(fit.iterations for fit in (*rough, *fits)),
+        message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
+        steps=part.steps,
+        alarms=() if best.iterations < iterations else (f"not converged after {iterations} iterations",),
+    )
+
+
+def _score(fit: HorizonFit) -> float:
+    score = float(np.mean(np.log(fit.scale)))
+    return score if np.isfinite(score) else np.inf

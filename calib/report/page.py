@@ -50,6 +50,16 @@ class Row:
     prior: str
 
 
+@dataclass(frozen=True, slots=True)
+class AdviceRow:
+    """One line of what to record next, in words."""
+
+    parameter: str
+    before: str
+    after: str
+    sentence: str
+
+
 def write_report(path: Path, inputs: ReportInputs) -> None:
     """Write the report, whole or not at all.
 
@@ -97,6 +107,7 @@ def render(inputs: ReportInputs) -> str:
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
         panels_each=charts.PANELS,
         residuals=drawn,
+        advice=advice_rows(result),
         scan=charts.latency_scan(scan, inputs.tick_s),
         correlations=charts.correlations(result),
         trace=charts.trace(result.trace),
@@ -165,6 +176,27 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             )
         )
     return rows
+
+
+def advice_rows(result: CalibrationResult) -> list[AdviceRow]:
+    """Return the table of what to record next."""
+    return [
+        AdviceRow(
+            parameter=str(row["parameter"]),
+            before=_spread(result, str(row["parameter"]), row["std"]),
+            after=_spread(result, str(row["parameter"]), row["std_after"]) if row["excitation"] else "–",
+            sentence=str(row["sentence"]),
+        )
+        for row in result.advice
+    ]
+
+
+def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
+    """Return a standard deviation in the parameter's own scale in words."""
+    if std is None:
+        return "–"
+    parameter = result.space[name]
+    return f"{100 * std:.2g} %" if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
 
 
 def told(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:

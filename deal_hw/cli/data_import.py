@@ -81,7 +81,9 @@ def import_recordings(config: Import) -> int:
     problems = {
         table.name: [
             v.to_json()
-            for v in examine_recording(table, facts, config.force, servo=_takes_positions(facts, table), say=_say)
+            for v in examine_recording(
+                table, facts, config.force, servo=_takes_positions(facts, table), say=_say
+            )
         ]
         for table in tables
     }

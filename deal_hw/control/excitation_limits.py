@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from deal_hw.description import RobotDescription
@@ -88,5 +86,7 @@ def fit_to_limits(description: RobotDescription, offsets: FloatArray, *, smooth:
     scale = np.ones(offsets.shape[1])
     for found, most in pairs:
         over = (found > most) & np.isfinite(most)
-        scale = np.where(over, np.minimum(scale, most / np.where(over, found, math.inf)), scale)
+        # Limits may be infinite: they are none.
+        ratio = np.where(over, most, 0.0) / np.where(over, found, 1.0)
+        scale = np.where(over, np.minimum(scale, ratio), scale)
     return np.asarray(scale)

@@ -285,9 +285,11 @@ class ControlLoop:
         self._states += 1
 
     def _input(self, action_age_ns: int = 0) -> CycleInput:
+        now_ns, sent_ns = self._clock.now_ns(), self._repeater.sent_ns
         return CycleInput(
-            now_ns=self._clock.now_ns(), state=self._state, action_age_ns=action_age_ns,
+            now_ns=now_ns, state=self._state, action_age_ns=action_age_ns,
             link_errors=self._robot.link_errors, stop_reason=self._stop_reason or self._robot.operator_stop,
+            command_age_ns=now_ns - sent_ns if sent_ns >= 0 else -1, fault=self._robot.fault,
         )  # fmt: skip
 
     def _make_passive(self) -> bool:

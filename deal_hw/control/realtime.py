@@ -14,7 +14,7 @@ _PR_SET_PDEATHSIG = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
 """Sent by the kernel when the parent dies; nobody else sends it, so the record names the true reason."""
-_FIFO_PRIORITY = 50
+FIFO_PRIORITY = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ def become_realtime() -> Granted:
     # Before SCHED_FIFO: locking reads in every page of every library and must hold up nobody with a deadline.
     memory_refused = _lock_memory()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
         words.append("SCHED_FIFO")
     except OSError as err:
         words.append("default")

@@ -1,8 +1,7 @@
 """Safety between policy and motors: checks each cycle, clips what can be clipped, trips on the rest.
 
 Pure: no I/O, no torch, and time is an argument. Limits are data of the robot (``description.limits``).
-    Clipping changes
-a command and says so; a trip sends nothing more, latches and gives its reason in words.
+Clipping changes a command and says so; a trip sends nothing more, latches and gives its reason in words.
 """
 
 from __future__ import annotations
@@ -13,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.control.safety_filter import SafetyFilter, is_finite
+from deal_hw.control.leg_checks import LegChecks
+from deal_hw.control.safety_filter import SafetyFilter
 from deal_hw.control.safety_machine import SafetyFlags, SafetyMachine, SafetyState
 from deal_hw.description import RobotDescription
 from deal_hw.errors import SafetyError
@@ -55,6 +55,9 @@ class CycleInput:
         action_age_ns: How long the policy took [ns].
         link_errors: Link errors since the connection, as the robot counts them.
         stop_reason: Why the operator, or somebody for them, asked to stop; "" where nobody did.
+        fault: What the driver saw that forbids going on; "" for nothing.
+        command_age_ns: Time since a command was last sent, a repeated one included [ns]; -1: none yet. It
+            counts on robots with legs only.
     """
 
     now_ns: int
@@ -62,6 +65,8 @@ class CycleInput:
     action_age_ns: int = 0
     link_errors: int = 0
     stop_reason: str = ""
+    fault: str = ""
+    command_age_ns: int = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +96,17 @@ class Verdict:
 class Safety:
     """Checks and filters the commands for one robot."""
 
+    _start: FloatArray
+    """Where easing in starts, (A,); from arming on."""
+
     def __init__(self, description: RobotDescription, config: SafetyConfig | None = None) -> None:
         self._description = description
         self._config = config or SafetyConfig()
         self._filter = SafetyFilter(description)
         self._machine = SafetyMachine(round(description.limits.ease_in_s * 1e9))
+        legs = description.limits.legs
+        self._legs = None if legs is None else LegChecks(description, legs)
+        self._command_age_ns = 0 if legs is None else round(legs.command_age_s * 1e9)
         self._index = list(description.actuated_index)
         self._errors_due = (
             self._config.link_error_share * self._config.link_window_s * description.state_rate_hz
@@ -107,11 +118,13 @@ class Safety:
     def _reset(self, now_ns: int) -> None:
         self._armed_ns = now_ns
         self._seen_armed = False
-        self._start: FloatArray | None = None
         self._previous: FloatArray | None = None
         self._offset_ns: int | None = None
         self._offset_at_ns = 0
         self._errors: deque[tuple[int, int]] = deque()
+        self._first_ns: int | None = None
+        if self._legs is not None:
+            self._legs.reset()
 
     @property
     def state(self) -> SafetyState:
@@ -125,7 +138,7 @@ class Safety:
             SafetyError: Not DISARMED, or something is wrong already; the message says what.
         """
         self._reset(cycle.now_ns)
-        wrong = self._failures(cycle, None)
+        wrong = self._failures(cycle, None, arming=True)
         if wrong or cycle.state is None:
             raise SafetyError("refusing to arm: " + "; ".join(wrong.values()))
         self._machine.arm(cycle.now_ns)
@@ -138,15 +151,17 @@ class Safety:
             cycle: What is known.
             wanted: The command asked for; None where there is none yet.
         """
+        self._begin(cycle)
         failures = self._failures(cycle, wanted)
+        unsound = "action_not_finite" in failures or "state_not_finite" in failures
         was_armed = self.state.armed
         flags = SafetyFlags(**dict.fromkeys(failures, True))
         state = self._machine.update(cycle.now_ns, flags)
         if was_armed and not state.armed:
             self.reason = "; ".join(failures[name] for name in flags.raised)
-        if state is SafetyState.PASSIVE or wanted is None or cycle.state is None or not is_finite(wanted):
+        if state is SafetyState.PASSIVE or wanted is None or cycle.state is None or unsound:
             return Verdict(state, None, (), flags.raised, self.reason)
-        command, clipped = self._clip(cycle.now_ns, wanted, cycle.state.position[self._index])
+        command, clipped = self._clip(cycle.now_ns, wanted, cycle.state)
         return Verdict(state, command, clipped, flags.raised, self.reason)
 
     def stop(self, reason: str) -> None:
@@ -164,37 +179,54 @@ class Safety:
         self._machine.rearm()
         self.reason = ""
 
+    def _begin(self, cycle: CycleInput) -> None:
+        # To arm a robot with legs takes seconds, in which it may sink: easing in starts where it is found in
+        # the first cycle after that.
+        if self._legs is None or not self.state.armed or self._first_ns is not None:
+            return
+        self._first_ns = cycle.now_ns
+        self._machine.restart(cycle.now_ns)
+        if cycle.state is not None:
+            self._start = self._previous = cycle.state.position[self._index]
+
     def _clip(
-        self, now_ns: int, wanted: JointCommand, measured: FloatArray
+        self, now_ns: int, wanted: JointCommand, state: RobotState
     ) -> tuple[JointCommand, tuple[str, ...]]:
-        start = measured if self._start is None else self._start
+        measured, velocity = state.position[self._index], state.velocity[self._index]
         previous = measured if self._previous is None else self._previous
         share = self._machine.authority(now_ns)
         if share < 1.0:
-            eased = start + share * (wanted.position_target - start)
+            eased = self._start + share * (wanted.position_target - self._start)
             wanted = dataclasses.replace(wanted, position_target=eased)
-        command, clipped = self._filter.clip(wanted, previous, measured)
+        command, clipped = self._filter.clip(wanted, previous, measured, velocity)
         self._previous = command.position_target
         return command, clipped
 
-    def _failures(self, cycle: CycleInput, wanted: JointCommand | None) -> dict[str, str]:
+    def _failures(
+        self, cycle: CycleInput, wanted: JointCommand | None, *, arming: bool = False
+    ) -> dict[str, str]:
         """Return flag name -> reason in words for all that is wrong."""
         found: dict[str, str] = {}
         limits = self._description.limits
         if cycle.stop_reason:
             found["operator_stop"] = cycle.stop_reason
+        if cycle.fault:
+            found["device_fault"] = cycle.fault
         if cycle.state is None:
             found["no_state"] = "no state sample has arrived"
         else:
             self._check_age(cycle.now_ns, cycle.state, found)
             self._check_status(cycle.now_ns, cycle.state.status, found)
             self._check_motion(cycle.state, found)
-        if wanted is not None and not is_finite(wanted):
+            if self._legs is not None:
+                found |= self._legs.failures(cycle.state, arming=arming)
+        if wanted is not None and not self._filter.accepts(wanted):
             found["action_not_finite"] = "the policy asked for a command that is not finite"
         if cycle.action_age_ns > round(limits.action_age_s * 1e9):
             took_ms, limit_ms = cycle.action_age_ns * 1e-6, limits.action_age_s * 1e3
             found["action_late"] = f"the policy took {took_ms:.1f} ms, at most {limit_ms:g} ms are allowed"
         self._check_link(cycle.now_ns, cycle.link_errors, found)
+        self._check_command_age(cycle, found)
         return found
 
     def _check_age(self, now_ns: int, state: RobotState, found: dict[str, str]) -> None:
@@ -217,7 +249,8 @@ class Safety:
 
     def _check_status(self, now_ns: int, status: Status, found: dict[str, str]) -> None:
         if Status.FAULT in status:
-            found["device_fault"] = "the device reports a fault"
+            # What the driver saw says more.
+            found.setdefault("device_fault", "the device reports a fault")
         if not self.state.armed:
             return
         # Samples from before the arming may still be under way: its status counts once it has confirmed.
@@ -255,4 +288,18 @@ class Safety:
         if count > self._errors_due:
             found["link_errors"] = (
                 f"{count} link errors in {self._config.link_window_s:g} s: check cable and connectors"
+            )
+
+    def _check_command_age(self, cycle: CycleInput, found: dict[str, str]) -> None:
+        # A robot that holds its last command for ever must not be left with one. Counted from the first cycle
+        # after arming at the earliest: what was sent before that is another run's.
+        if self._first_ns is None or not self.state.armed:
+            return
+        age_ns = cycle.now_ns - self._first_ns
+        if cycle.command_age_ns >= 0:
+            age_ns = min(age_ns, cycle.command_age_ns)
+        if age_ns > self._command_age_ns:
+            found["command_stale"] = (
+                f"no command has gone out for {age_ns * 1e-6:.0f} ms, at most "
+                f"{self._command_age_ns * 1e-6:g} ms are allowed"
             )

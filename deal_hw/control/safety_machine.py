@@ -43,15 +43,27 @@ class SafetyFlags:
         no_state: No state sample has arrived yet.
         state_stale: The newest state is too old, or was held up on its way.
         clock_jump: The device's clock jumped, as after a restart.
-        device_fault: The device reports a fault.
+        device_fault: The device reports a fault, or the driver saw what forbids going on.
         device_watchdog: The device stopped its motors because commands stayed away.
         device_disarmed: The device says that its motors do not follow commands.
         position: A joint is outside its trip range.
         velocity: A joint is faster than its trip speed.
         state_not_finite: The state holds NaN or infinity.
+        body_missing: A robot with legs reports nothing of its body.
+        body_not_finite: The inertial sensor reports NaN or infinity.
+        orientation: The orientation is no unit quaternion.
+        tilt: The base leans too far.
+        tumble: The base turns too fast.
+        free_fall: The robot has been falling for too long.
+        flail: A joint has been fast for too long.
+        motor_temperature: A motor is too hot, or does not know.
+        lost_commands: A motor misses too many commands.
+        battery_low: The battery is too empty; arming asks for more.
+        voltage_low: The supply voltage is too low; arming asks for more.
         action_not_finite: The command asked for holds NaN or infinity.
         action_late: The policy took too long.
         link_errors: Too large a share of the state frames is corrupt or lost.
+        command_stale: A robot with legs has not been sent a command for too long.
     """
 
     operator_stop: bool = False
@@ -64,9 +76,21 @@ class SafetyFlags:
     position: bool = False
     velocity: bool = False
     state_not_finite: bool = False
+    body_missing: bool = False
+    body_not_finite: bool = False
+    orientation: bool = False
+    tilt: bool = False
+    tumble: bool = False
+    free_fall: bool = False
+    flail: bool = False
+    motor_temperature: bool = False
+    lost_commands: bool = False
+    battery_low: bool = False
+    voltage_low: bool = False
     action_not_finite: bool = False
     action_late: bool = False
     link_errors: bool = False
+    command_stale: bool = False
 
     @property
     def raised(self) -> tuple[str, ...]:
@@ -96,6 +120,10 @@ class SafetyMachine:
             raise SafetyError(f"cannot arm while {self.state.value}: re-arm explicitly first")
         self._armed_ns = now_ns
         self.state = SafetyState.EASING_IN
+
+    def restart(self, now_ns: int) -> None:
+        """Count the time of easing in from now on."""
+        self._armed_ns = now_ns
 
     def update(self, now_ns: int, flags: SafetyFlags) -> SafetyState:
         """Move on by one cycle: trip on any flag, else finish easing in when its time is over."""

@@ -157,7 +157,8 @@ class Supervisor:
     def _watch(self, status: StatusReceiver) -> None:
         """Return when the control process has said its last word, has died or was killed."""
         while status.open:
-            if select.select([status], [], [], _POLL_S)[0]:
+            left_s = (self._stale_ns - self._clock.now_ns()) * 1e-9
+            if select.select([status], [], [], min(_POLL_S, max(left_s, 0.0) + 1e-3))[0]:
                 while (message := status.receive()) is not None:
                     self._take(message)
             # Only after a wait that brought nothing: a supervisor that was itself held up finds old beats

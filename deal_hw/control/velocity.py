@@ -151,7 +151,7 @@ def _read_script(path: Path) -> list[list[float]]:
         raise ConfigurationError(f"the script {path} cannot be read: {error}") from error
     if [name.strip() for name in head] != names:
         raise ConfigurationError(f"{path}: its first line is {','.join(head)!r}, expected {','.join(names)}")
-    rows = []
+    rows: list[list[float]] = []
     for number, line in enumerate(lines, start=2):
         try:
             row = [float(part) for part in line]

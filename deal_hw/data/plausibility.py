@@ -16,6 +16,7 @@ import numpy as np
 from deal_hw.data.checks import Severity, Verdict
 from deal_hw.data.importing.table import Table
 from deal_hw.data.joint_match import match
+from deal_hw.data.slip import slip_verdict
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
 
@@ -40,7 +41,7 @@ FLAT = 0.1
 """A continuous signal that sits at exactly its extreme for this share of the time is clipped there."""
 
 
-def examine(table: Table, limits: FloatArray | None = None) -> tuple[Verdict, ...]:
+def examine(table: Table, limits: FloatArray | None = None, kept: Table | None = None) -> tuple[Verdict, ...]:
     """Run all checks on a recording; the order is fixed.
 
     Where clock or values are unusable the later checks are left out: they would only say the same again.
@@ -48,6 +49,7 @@ def examine(table: Table, limits: FloatArray | None = None) -> tuple[Verdict, ..
     Args:
         table: The recording, on its own stamps.
         limits: Lowest and highest position of each joint in the model, (J, 2) [rad or m]; infinite if free.
+        kept: The same without what is left out, where slips do no harm.
     """
     first = [_size(table), _finite(table), _clock(table)]
     if any(verdict.severity is Severity.FAIL for verdict in first):
@@ -68,6 +70,7 @@ def examine(table: Table, limits: FloatArray | None = None) -> tuple[Verdict, ..
         _levels(table),
         _inside_limits(table, limits),
         *match(table),
+        _slip(kept or table),
         _clipped_commands(table, limits),
         _saturated_effort(table),
         _excitation(table),
@@ -286,6 +289,14 @@ def _copy(table: Table) -> Verdict:
         "is the wrong one"
     )
     return _verdict("copy", Severity.FAIL, text)
+
+
+def _slip(table: Table) -> Verdict:
+    # A stamp that stands twice is reported by the clock's check; here the first of each counts.
+    new = np.concatenate([[True], np.diff(table.time_s) > 0])
+    return slip_verdict(
+        table.time_s[new], table.position[new], table.command_s, table.target, np.array(table.actuated_index)
+    )
 
 
 _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}

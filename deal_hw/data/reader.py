@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -228,7 +229,8 @@ def _body(
             np.stack([absent if row is None else np.asarray(row[i], float) for row in found])
         )
     buttons = np.where(np.isfinite(columns[-1]), columns[-1], -1).astype(np.int64)
-    return BodyTrajectory(*columns[:-1], buttons)
+    names = [f.name for f in dataclasses.fields(BodyTrajectory)]
+    return BodyTrajectory(**dict(zip(names, [*columns[:-1], buttons], strict=True)))
 
 
 def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:

@@ -24,6 +24,9 @@ from deal_hw.types import FloatArray
 ENCODER_BIAS = "encoder_bias"
 """Kind of parameter that no MuJoCo field holds: reported minus true joint position."""
 
+COMMAND_DELAY = "command_delay"
+"""Kind that no MuJoCo field holds: what an actuator is sent acts later by it, on top of the latency."""
+
 
 def default_threads() -> int:
     """Return the number of CPUs this process may use."""
@@ -80,6 +83,7 @@ class ServoBatch:
             kind: np.repeat(self._default[kind][None], self.count, axis=0) for kind in SERVO_KINDS
         }
         self._bias = np.zeros((self.count, len(description.joint_names)))
+        self._delay_s: FloatArray | None = None
         for p in self.space.parameters:
             values = columns.get(p.name, np.full(self.count, p.nominal))
             for name in p.elements:
@@ -87,6 +91,10 @@ class ServoBatch:
                     self._acting[p.kind][:, self.robot.actuator_names.index(name)] = values
                 elif p.kind == ENCODER_BIAS:
                     self._bias[:, description.joint_names.index(name)] = values
+                elif p.kind == COMMAND_DELAY:
+                    if self._delay_s is None:
+                        self._delay_s = np.zeros((self.count, len(self.robot.actuator_names)))
+                    self._delay_s[:, self.robot.actuator_names.index(name)] = values
         self._biased = bool(np.any(self._bias))
         self.set_sent(
             self._default["servo_stiffness"],
@@ -101,6 +109,18 @@ class ServoBatch:
         scalable = np.isfinite(default) & (default != 0)
         factor = self._acting[kind] / np.where(scalable, default, 1.0)
         return np.where(scalable, factor, 1.0)
+
+    def lag_s(self, latency_s: FloatArray) -> FloatArray:
+        """Return by how much what is sent acts late: the latency, and each actuator's command delay on top.
+
+        Args:
+            latency_s: Total latency of each member, (N,) [s].
+
+        Returns:
+            (N,) where no parameter is a command delay, else (N, A) [s].
+        """
+        latency = np.asarray(latency_s, dtype=float)
+        return latency if self._delay_s is None else latency[:, None] + self._delay_s
 
     def _act(self, kind: str, sent: FloatArray) -> FloatArray:
         default = self._default[kind]

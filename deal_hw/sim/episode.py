@@ -13,6 +13,9 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
+SENT = ("target", "stiffness", "damping", "effort_limit", "speed_limit")
+"""Arrays of an episode that have one row a period."""
+
 
 @dataclass(frozen=True, slots=True)
 class Episode:
@@ -81,6 +84,15 @@ class Episode:
     def period_s(self) -> float:
         """Time from one sample to the next [s]."""
         return self.stride * self.step_s
+
+    def cut(self, rows: slice, periods: slice) -> Episode:
+        """Return the episode with these samples and periods only; indices and the start stay as they are."""
+        each = {name: getattr(self, name)[rows] for name in ("sample", "position", "velocity", "usable")}
+        # What is the same for all samples has no axis of samples.
+        axes = {"reported": 1, "reference": 2, "estimate_std": 2}
+        some = {n: v[rows] for n, d in axes.items() if (v := getattr(self, n)) is not None and v.ndim == d}
+        sent = {name: getattr(self, name)[periods] for name in SENT}
+        return dataclasses.replace(self, **each, **some, **sent)
 
 
 def align(trajectory: Trajectory, description: RobotDescription) -> Episode:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from deal_hw.sim.episode import Episode
-from deal_hw.types import FloatArray
 
 LEAD_S = 0.1
 """Commands kept before a part's first sample: as long as any latency reaches back [s]."""
@@ -21,33 +20,16 @@ def part(episode: Episode, first: int, last: int) -> Episode:
     Set-points without a speed limit depend on nothing older than the latency. With a limit the set-point at
     the part's beginning is taken to have reached its target.
     """
-    rows = slice(first, last)
     lead = round(LEAD_S / episode.step_s)
     origin = max(int(episode.sample[first]) - lead, 0)
     until = max(int(episode.sample[last - 1]), origin + 1)
-    steps = slice(origin, until)
     start = episode.start_setpoint if origin == 0 else episode.target[origin - 1]
-
-    def rows_of(values: FloatArray | None) -> FloatArray | None:
-        return values if values is None or values.ndim == 1 else values[rows]
-
     return dataclasses.replace(
-        episode,
-        sample=episode.sample[rows] - origin,
-        position=episode.position[rows],
-        velocity=episode.velocity[rows],
-        target=episode.target[steps],
-        stiffness=episode.stiffness[steps],
-        damping=episode.damping[steps],
-        effort_limit=episode.effort_limit[steps],
-        speed_limit=episode.speed_limit[steps],
-        usable=episode.usable[rows],
+        episode.cut(slice(first, last), slice(origin, until)),
+        sample=episode.sample[first:last] - origin,
         start_setpoint=start,
         first_row=episode.first_row + first,
         origin=episode.origin + origin,
-        reported=None if episode.reported is None else episode.reported[rows],
-        reference=None if episode.reference is None else episode.reference[rows],
-        estimate_std=rows_of(episode.estimate_std),
     )
 
 

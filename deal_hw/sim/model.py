@@ -78,7 +78,7 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
 
     Args:
         description: The robot.
-        step_s: Physics step [s]; None for the MJCF's.
+        step_s: Physics step [s]; None for the MJCF's, or for the device period where that is no multiple.
 
     Raises:
         ConfigurationError: The MJCF does not compile, or the device period is no multiple of the step.
@@ -88,8 +88,11 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
         model = mujoco.MjModel.from_xml_path(str(description.mjcf))
     except ValueError as err:
         raise ConfigurationError(f"{description.mjcf} does not compile: {err}") from err
-    if step_s is not None:
-        model.opt.timestep = step_s
+    if step_s is None:
+        # Two robots may share an MJCF whose step fits only one of them.
+        steps = 1.0 / (description.device_rate_hz * model.opt.timestep)
+        step_s = model.opt.timestep if abs(steps - round(steps)) < 1e-6 else 1.0 / description.device_rate_hz
+    model.opt.timestep = step_s
     joints = [element_id(model, "joint", name) for name in description.joint_names]
     base = None
     if description.floating_base is not None:

@@ -53,18 +53,21 @@ def delay(setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray) -
 
     Args:
         setpoint: (N, S, A).
-        latency_steps: Latency of each member in steps, (N,); may be fractional.
+        latency_steps: Latency of each member in steps, (N,), or of each of its actuators, (N, A); may be
+            fractional.
         before: Set-point before the first step, (N, A).
 
     Returns:
         The delayed set-point, (N, S, A).
     """
+    if latency_steps.ndim == 1:
+        latency_steps = latency_steps[:, None]
     whole = np.floor(latency_steps).astype(int)
-    part = (latency_steps - whole)[:, None, None]
+    part = (latency_steps - whole)[:, None]
     longest = int(whole.max(initial=0)) + 1
     padded = np.concatenate([np.repeat(before[:, None], longest, axis=1), setpoint], axis=1)
     steps = setpoint.shape[1]
-    index = longest - whole[:, None] + np.arange(steps)
-    late = np.take_along_axis(padded, index[..., None], axis=1)
-    later = np.take_along_axis(padded, index[..., None] - 1, axis=1)
+    index = longest - whole[:, None] + np.arange(steps)[:, None]
+    late = np.take_along_axis(padded, index, axis=1)
+    later = np.take_along_axis(padded, index - 1, axis=1)
     return np.asarray((1 - part) * late + part * later)

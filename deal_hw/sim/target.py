@@ -20,6 +20,7 @@ from deal_hw.sim.batch import ServoBatch
 from deal_hw.sim.episode import Episode
 from deal_hw.sim.imu_base import base_states
 from deal_hw.sim.model import RobotModel
+from deal_hw.sim.servo import delay
 from deal_hw.types import FloatArray
 
 Behaviour = Callable[[FloatArray, FloatArray, float], FloatArray]
@@ -81,7 +82,7 @@ def record_target(
         theta: Their true values, (K,).
         behaviour: What is asked of it.
         seconds: Length of the recording [s].
-        latency_s: Total latency, a whole number of physics steps [s].
+        latency_s: Total latency, as command delays a whole number of physics steps [s].
         sensing: How it is observed; exactly and wholly by default.
         rng: Draws the noise.
         start: Joint positions to start at, (J,); the default pose by default. The base starts where the model
@@ -98,20 +99,22 @@ def record_target(
         raise ConfigurationError(
             f"{description.name}: states every {stride} steps do not divide control periods of {period}"
         )
-    late = round(latency_s / step_s)
     batch = ServoBatch(robot, space, 1, threads=1)
     batch.set_parameters(np.asarray(theta, dtype=float)[None])
+    lag = np.rint(batch.lag_s(np.array([latency_s])) / step_s)
+    reach = int(lag.max())
     rest = _settle(robot, batch, start, settle_s)
     ticks = math.ceil(seconds * description.control_rate_hz)
     sensor = _Sensor(robot, sensing or Sensing(), rng)
     samples = [batch.position[0]], [batch.velocity[0]]
-    path = np.repeat(rest[None], late, axis=0)
+    sent = np.repeat(rest[None], reach, axis=0)
     targets = np.empty((ticks, len(rest)))
     for tick in range(ticks):
         seen = sensor.joints(samples[0][-1])
         targets[tick] = behaviour(seen, samples[1][-1], tick / description.control_rate_hz)
-        path = np.concatenate([path, np.repeat(targets[tick : tick + 1], period, axis=0)])
-        position, velocity = batch.advance(path[None, tick * period : (tick + 1) * period], stride)
+        sent = np.concatenate([sent, np.repeat(targets[tick : tick + 1], period, axis=0)])[-reach - period :]
+        late = delay(sent[None], lag, rest[None])[:, -period:]
+        position, velocity = batch.advance(late, stride)
         if not np.isfinite(position).all():
             raise CalibrationError(
                 f"the target {description.name} diverged after {tick / description.control_rate_hz:.2f} s"

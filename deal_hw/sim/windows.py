@@ -86,19 +86,19 @@ def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> Flo
     """Return each member's set-point over the whole episode, (N, S, A).
 
     Args:
-        batch: The members; their speed limits count.
+        batch: The members; their speed limits and command delays count.
         episode: The episode.
         latency_s: Total latency of each member, (N,) [s].
     """
     if batch.robot.description.actuation == "motor":
         # Efforts are not slewed; before the first one the motors are off.
         efforts = np.repeat(episode.target[None], batch.count, axis=0)
-        return delay(efforts, np.asarray(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
+        return delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
     factor = batch.servo_factor("servo_speed_limit")
     rate = factor[:, None] * episode.speed_limit[None] * episode.step_s
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
     path = slew(start, episode.target, rate)
-    return delay(path, np.asarray(latency_s) / episode.step_s, start)
+    return delay(path, batch.lag_s(latency_s) / episode.step_s, start)
 
 
 def predict_windows(

@@ -34,6 +34,8 @@ class RobotBench:
         silent: A driver in front of a device that says nothing.
         unplug: Pulls the cable of ``robot``.
         corrupt: Makes the next frame from ``robot``'s device arrive corrupt.
+        greets: Whether ``connect`` says something to the device; a robot that only has commands is listened
+            to.
     """
 
     robot: Robot
@@ -42,6 +44,7 @@ class RobotBench:
     silent: Robot
     unplug: Callable[[], None]
     corrupt: Callable[[], None]
+    greets: bool = True
 
 
 def default_command(robot: Robot, target: float = 0.0) -> JointCommand:
@@ -184,9 +187,16 @@ class RobotSuite:
         with bench.robot as robot:
             robot.read_state(_PATIENCE_S)
             wire = robot.take_wire()
-            assert {message.channel for message in wire} == {"rx", "tx"}
+            assert {message.channel for message in wire} == ({"rx", "tx"} if bench.greets else {"rx"})
             assert all(message.payload for message in wire)
             assert robot.take_wire() == []
+
+    def test_commands_are_on_the_wire_once(self, armed: Robot) -> None:
+        """A command is kept as it was sent; sent again without being new, it is not."""
+        armed.take_wire()
+        armed.send_command(default_command(armed))
+        armed.repeat()
+        assert [message.channel for message in armed.take_wire()].count("tx") == 1
 
 
 def _wait(robot: Robot, wanted: Callable[[RobotState], bool]) -> RobotState:

@@ -18,7 +18,7 @@ from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, LowState
 from deal_hw.drivers.go2.remote import decode_remote, parse_combination
 from deal_hw.drivers.go2.state_stream import CommandEcho, StateStream
 from deal_hw.drivers.go2.takeover import Takeover
-from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
+from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError, WrongDeviceError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
@@ -37,7 +37,11 @@ SUBSCRIBED: Final = (
 )
 _QUEUE: Final = 4096
 _ENOUGH: Final = 3
+"""New states after the first command that show that the robot is still there."""
+_GREETING: Final = 20
 """Sound states with a running clock that make a Go2."""
+_ONE_ROBOT: Final = 0.4
+"""A larger share of states that are not new, and two robots send them."""
 _TOO_MANY: Final = 20
 """Messages that are no states, without one that is: then it is no Go2."""
 
@@ -294,14 +298,20 @@ class Go2Robot(Robot):
     def _await_robot(self) -> Go2Info:
         stream = self._stream
         deadline_ns = self._clock.now_ns() + round(CONNECT_TIMEOUT_S * 1e9)
-        while stream.accepted < _ENOUGH and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
+        while stream.accepted < _GREETING and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
             if stream.errors >= _TOO_MANY and (error := stream.complaint()) is not None:
                 raise error
             with contextlib.suppress(TransportTimeoutError):
                 self._pump(left_ns * 1e-9)
         frame = self._frame
-        if frame is None or stream.accepted < _ENOUGH:
+        if frame is None or stream.accepted < _GREETING:
             raise stream.complaint() or TransportTimeoutError(self._why_silent())
+        if stream.stale > _ONE_ROBOT * stream.accepted:
+            raise WrongDeviceError(
+                f"go2: two robots send {topics.LOW_STATE}, or one twice: {stream.stale} of "
+                f"{stream.accepted + stream.stale} states were no newer than the one before."
+                f"{self._seen_writing()} Choose another interface, domain or bridge"
+            )
         stream.errors = 0
         self._states.clear()
         values = frame.values()
@@ -315,14 +325,16 @@ class Go2Robot(Robot):
                 f"{self._stream.device_ns // 1_000_000} ms; a robot that hangs (restart it), or a simulator "
                 "that leaves the tick alone?"
             )
-        writers = self._transport.writers(topics.LOW_STATE)
-        seen = f" Seen writing it: {'; '.join(writers)}." if writers else ""
         return (
-            f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{seen} Is the robot on "
-            "and booted, the cable in, the interface the one with an address 192.168.123.x (the robot is "
-            "192.168.123.161), and does the firewall let UDP through? Over Zenoh: does the bridge carry "
-            f"{topics.LOW_STATE}?"
+            f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{self._seen_writing()} Is "
+            "the robot on and booted, the cable in, the interface the one with an address 192.168.123.x (the "
+            "robot is 192.168.123.161), and does the firewall let UDP through? Over Zenoh: does the bridge "
+            f"carry {topics.LOW_STATE}?"
         )
+
+    def _seen_writing(self) -> str:
+        writers = self._transport.writers(topics.LOW_STATE)
+        return f" Seen writing it: {'; '.join(writers)}." if writers else ""
 
     def _publish(self, topic: str, payload: bytes) -> int:
         stamp_ns = self._clock.now_ns()

@@ -72,8 +72,8 @@ class StateStream:
             if step < -RESTART_MS:
                 before, self._tick = self._tick, None
                 raise TransportLostError(
-                    f"go2: the robot's clock went back from {before} to {tick} ms: it was restarted; connect "
-                    "again once it has booted"
+                    f"go2: the robot's clock went back from {before} to {tick} ms: it was restarted (connect "
+                    "again once it has booted), or a second robot is on the network"
                 )
             return None
         if self._tick is not None:

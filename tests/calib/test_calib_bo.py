@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -17,32 +17,13 @@ from deal_hw.calib.baselines.bayesian import (
 from deal_hw.calib.checkpoint import Checkpoint
 from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget, Progress
-from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.episode import Episode
 from deal_hw.testing.method_suite import MemoryStore, MethodCase, MethodSuite
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
-FREE = ("cart.frictionloss", "servo.damping")
-TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
-"""Factors of the nominal values."""
-
-
-@functools.cache
-def recorded() -> tuple[ParameterSpace, FloatArray, Episode]:
-    """Return a space with two free parameters, their true values, and 1.2 s of a noise-free recording."""
-    space = k9_space().with_ratio(5.0).with_free(FREE)
-    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
-    return space, theta, align(simulated_episode(DESCRIPTION, space, theta, seconds=1.2), DESCRIPTION)
-
-
-def small_problem() -> Problem:
-    """Return the problem of finding them, the latency given."""
-    space, _, episode = recorded()
-    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=0.0)
+Recorded = tuple[ParameterSpace, FloatArray, Episode]
 
 
 class TestBo(MethodSuite):
@@ -50,7 +31,7 @@ class TestBo(MethodSuite):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def case(cls) -> MethodCase:
+    def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
             method=BayesianOptimisation(),
@@ -132,7 +113,7 @@ def test_the_process_sees_a_bounded_number_of_points() -> None:
     np.testing.assert_array_equal(search._kept(10), [0, 1, 2, 3, 4, 35, 36, 37, 38, 39])
 
 
-def test_a_critic_scores_earlier_members_again_and_resumes() -> None:
+def test_a_critic_scores_earlier_members_again_and_resumes(small_problem: Callable[..., Problem]) -> None:
     """The paper's row: every generation has the budget's population; resumed after two, the same end."""
     budget, method = Budget(population=8, generations=3), critic_return()
     whole = method.run(small_problem(), budget, np.random.default_rng(1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,32 +11,13 @@ from deal_hw.calib.baselines.cma_es import Cma, CmaSettings, RestartedCma
 from deal_hw.calib.checkpoint import Checkpoint
 from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget
-from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.episode import Episode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
-FREE = ("cart.frictionloss", "servo.damping")
-TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
-"""Factors of the nominal values."""
-
-
-@functools.cache
-def recorded() -> tuple[ParameterSpace, FloatArray, Episode]:
-    """Return a space with two free parameters, their true values, and 1.2 s of a noise-free recording."""
-    space = k9_space().with_ratio(5.0).with_free(FREE)
-    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
-    return space, theta, align(simulated_episode(DESCRIPTION, space, theta, seconds=1.2), DESCRIPTION)
-
-
-def small_problem() -> Problem:
-    """Return the problem of finding them, the latency given."""
-    space, _, episode = recorded()
-    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=0.0)
+Recorded = tuple[ParameterSpace, FloatArray, Episode]
 
 
 class TestCma(MethodSuite):
@@ -44,7 +25,7 @@ class TestCma(MethodSuite):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def case(cls) -> MethodCase:
+    def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
             method=Cma(),
@@ -132,7 +113,7 @@ def test_diverged_members_count_as_the_worst() -> None:
     np.testing.assert_allclose(search.mean, 0.3, atol=0.35 if search.restarts else 1e-3)
 
 
-def test_keeps_to_the_budget() -> None:
+def test_keeps_to_the_budget(small_problem: Callable[..., Problem]) -> None:
     """All runs together have at most population times generations members, a row a generation."""
     settings = CmaSettings(population=4, least_step=0.2)
     budget = Budget(population=12, generations=10)
@@ -144,7 +125,7 @@ def test_keeps_to_the_budget() -> None:
     assert result.provenance["restarts"] >= 1
 
 
-def test_of_a_critic_the_best_of_the_last_generation_counts() -> None:
+def test_of_a_critic_the_best_of_the_last_generation_counts(small_problem: Callable[..., Problem]) -> None:
     """A critic's numbers of different generations do not compare: the estimate is of the last population."""
     method = Cma(CmaSettings(fitness="critic", population=6))
     result = method.run(small_problem(), Budget(population=6, generations=3), np.random.default_rng(0))

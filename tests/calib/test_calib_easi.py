@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,32 +13,13 @@ from deal_hw.calib.coordinates import Coordinates
 from deal_hw.calib.fitness import FITNESSES
 from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget
-from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.episode import Episode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
-FREE = ("cart.frictionloss", "servo.damping")
-TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
-"""Factors of the nominal values."""
-
-
-@functools.cache
-def recorded() -> tuple[ParameterSpace, FloatArray, Episode]:
-    """Return a space with two free parameters, their true values, and 1.2 s of a noise-free recording."""
-    space = k9_space().with_ratio(5.0).with_free(FREE)
-    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
-    return space, theta, align(simulated_episode(DESCRIPTION, space, theta, seconds=1.2), DESCRIPTION)
-
-
-def small_problem() -> Problem:
-    """Return the problem of finding them, the latency given."""
-    space, _, episode = recorded()
-    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=0.0)
+Recorded = tuple[ParameterSpace, FloatArray, Episode]
 
 
 class TestEasi(MethodSuite):
@@ -46,7 +27,7 @@ class TestEasi(MethodSuite):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def case(cls) -> MethodCase:
+    def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
             method=Easi(),
@@ -65,7 +46,7 @@ class TestEasiOfTrajectories(MethodSuite):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def case(cls) -> MethodCase:
+    def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
             method=Easi(EasiSettings(fitness="trajectory")),
@@ -115,7 +96,9 @@ def test_finds_the_top_of_a_hill() -> None:
     np.testing.assert_allclose(search.mean, top, atol=0.01)
 
 
-def test_with_its_critic_it_gets_nearer_than_the_centre() -> None:
+def test_with_its_critic_it_gets_nearer_than_the_centre(
+    recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]
+) -> None:
     """Mean |ln| is 0.92 for the centre and, over seeds and budgets, 0.05 to 0.65 for the critic's search."""
     theta = recorded()[1]
     result = Easi().run(small_problem(), Budget(population=24, generations=20), np.random.default_rng(1))
@@ -124,7 +107,7 @@ def test_with_its_critic_it_gets_nearer_than_the_centre() -> None:
     assert np.isfinite([row["wasserstein"] for row in result.trace]).all()
 
 
-def test_published_box_is_linear() -> None:
+def test_published_box_is_linear(small_problem: Callable[..., Problem]) -> None:
     """The middle of a range is its arithmetic mean there, and its geometric mean in our own scale."""
     coordinates, middle = Coordinates(small_problem()), np.full((1, 2), 0.5)
     space = coordinates.space
@@ -133,7 +116,7 @@ def test_published_box_is_linear() -> None:
     np.testing.assert_allclose(Box(coordinates, "own").members(middle).theta[0], space.center)
 
 
-def test_published_box_is_searched() -> None:
+def test_published_box_is_searched(small_problem: Callable[..., Problem]) -> None:
     """The linear box keeps to the range too, and its result is another one."""
     budget, ours = Budget(population=10, generations=2), Easi(EasiSettings(fitness="trajectory"))
     theirs = Easi(EasiSettings(fitness="trajectory", scale="linear"))
@@ -143,7 +126,7 @@ def test_published_box_is_searched() -> None:
 
 
 @pytest.mark.parametrize("fitness", sorted(FITNESSES))
-def test_takes_every_fitness(fitness: str) -> None:
+def test_takes_every_fitness(fitness: str, small_problem: Callable[..., Problem]) -> None:
     """Each fitness of the table can be asked for; the trace counts members that diverged."""
     result = Easi(EasiSettings(fitness=fitness)).run(
         small_problem(), Budget(population=6, generations=1), np.random.default_rng(0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,30 +13,14 @@ from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman, only
 from deal_hw.calib.checkpoint import Checkpoint
 from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget
-from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align
+from deal_hw.sim.episode import Episode
 from deal_hw.sim.model import load_model
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
-from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
-TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
-"""Factors of the nominal values."""
-
-
-@functools.cache
-def recorded() -> tuple[ParameterSpace, FloatArray, Episode]:
-    """Return a space with two free parameters, their true values, and 0.8 s of a noise-free recording."""
-    space = k9_space().with_ratio(5.0).with_free(TRUTH)
-    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
-    return space, theta, align(simulated_episode(DESCRIPTION, space, theta, seconds=0.8), DESCRIPTION)
-
-
-def problem(fixed_latency_s: float | None = 0.0) -> Problem:
-    """Return the problem of finding them."""
-    space, _, episode = recorded()
-    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s)
+Recorded = tuple[ParameterSpace, FloatArray, Episode]
 
 
 class TestEkf(MethodSuite):
@@ -44,12 +28,12 @@ class TestEkf(MethodSuite):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def case(cls) -> MethodCase:
+    def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
             method=Ekf(),
-            make_problem=problem,
-            truth=recorded()[1],
+            make_problem=lambda: small_problem(seconds=0.8),
+            truth=recorded(seconds=0.8)[1],
             budget=Budget(generations=8),
             short_budget=Budget(generations=2),
             tolerance=0.05,
@@ -129,17 +113,19 @@ def test_restart_keeps_the_parameters_and_forgets_the_rest() -> None:
     np.testing.assert_allclose(kalman.covariance, np.diag([0.01, 4 / 3]), rtol=1e-8)
 
 
-def test_latency_is_one_more_state() -> None:
+def test_latency_is_one_more_state(
+    recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]
+) -> None:
     """A latency of zero is found from the middle of its range, within 1 ms, and stated with an interval."""
-    result = Ekf().run(problem(None), Budget(), np.random.default_rng(0))
+    result = Ekf().run(small_problem(seconds=0.8, fixed_latency_s=None), Budget(), np.random.default_rng(0))
     assert result.latency_s < 1e-3
     assert 0.0 <= result.latency_interval_s[0] <= result.latency_s <= result.latency_interval_s[1]
-    assert np.mean(np.abs(np.log(result.estimate / recorded()[1]))) < 0.05
+    assert np.mean(np.abs(np.log(result.estimate / recorded(seconds=0.8)[1]))) < 0.05
 
 
-def test_a_diverged_filter_says_so() -> None:
+def test_a_diverged_filter_says_so(recorded: Callable[..., Recorded]) -> None:
     """A model that is known to have twice the right stiffness leaves innovations that nothing explains."""
-    space, _, episode = recorded()
+    space, _, episode = recorded(seconds=0.8)
     wrong = space.with_known({"servo.stiffness": 2.0 * space["servo.stiffness"].nominal})
     made = Problem(load_model(DESCRIPTION), wrong, [episode], threads=1, fixed_latency_s=0.0)
     result = Ekf(EkfSettings(passes=2)).run(made, Budget(), np.random.default_rng(0))
@@ -147,9 +133,9 @@ def test_a_diverged_filter_says_so() -> None:
     assert "diverged" in result.alarms[0]
 
 
-def test_passes_start_with_the_prior_that_a_parameter_has() -> None:
+def test_passes_start_with_the_prior_that_a_parameter_has(recorded: Callable[..., Recorded]) -> None:
     """Zero drift and a sharp prior at the wrong value: the filter hardly moves from it."""
-    space, _, episode = recorded()
+    space, _, episode = recorded(seconds=0.8)
     sharp = ParameterSpace(
         p if p.known else dataclasses.replace(p, prior_mean=p.nominal, prior_std=1e-6)
         for p in space.parameters
@@ -160,9 +146,9 @@ def test_passes_start_with_the_prior_that_a_parameter_has() -> None:
     np.testing.assert_allclose(result.estimate, sharp.nominal, rtol=1e-3)
 
 
-def test_one_window_of_several_is_that_window() -> None:
+def test_one_window_of_several_is_that_window(small_problem: Callable[..., Problem]) -> None:
     """Arrays keep their shape but for the count."""
-    data = problem().windows(3)[0]
+    data = small_problem(seconds=0.8).windows(3)[0]
     one = only(data, 4)
     assert len(one.windows) == 1
     assert one.windows.start[0] == data.windows.start[4]

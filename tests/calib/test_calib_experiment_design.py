@@ -27,7 +27,7 @@ from deal_hw.calib.trials import Scenario, TrialRunner
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan
-from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
+from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.cartpole.description import k9_space
 from deal_hw.drivers.go2.description import DESCRIPTION as GO2
@@ -238,6 +238,24 @@ def test_candidates_that_trip_are_discarded_and_counted(servo: RobotModel) -> No
         CalibrationError, match=r"none of 6 excitations keeps 'slide'.*slide came near the end"
     ):
         search_excitation(experiment, np.random.default_rng(0), SearchSettings(candidates=3))
+
+
+def test_a_trial_whose_gains_the_filter_lowers_is_discarded(servo: RobotModel) -> None:
+    """12 N·s/m would brake a slide that is faster than 0.04 m/s with more than the 0.5 N allowed."""
+    legs = LegLimits(
+        effort=(0.5,), tilt=1.0, tumble=6.0, free_fall=2.0, free_fall_s=0.1, flail_velocity=(9.0,),
+        flail_s=0.1, temperature=80.0, lost_rate=20.0, battery=0.2, battery_low=0.1, voltage=25.0,
+        command_age_s=0.1,
+    )  # fmt: skip
+    limits = dataclasses.replace(servo.description.limits, legs=legs)
+    legged = dataclasses.replace(servo, description=dataclasses.replace(servo.description, limits=limits))
+    plan = make_plan(legged.description, ExcitationDesign(seconds=1.0, low_hz=1.0))
+    scenario = Scenario(np.array([[MASS], [0.5 * MASS]]), np.zeros(2), np.zeros((2, 1)))
+    trials = TrialRunner(legged, space("mass"), scenario, 1.0, 1).run(
+        [ExcitationBehaviour(plan, legged.description) for _ in range(2)]
+    )
+    why = "a joint moved so fast that its braking would exceed the limit of effort"
+    assert [trial.tripped for trial in trials] == [why, why]
 
 
 def test_robots_that_cannot_be_designed_for_are_refused(servo: RobotModel) -> None:

@@ -86,10 +86,10 @@ def test_folds_are_disjoint_and_cover_everything(problem: Problem) -> None:
 
 
 def test_folds_keep_the_polish_where_it_helps_and_drop_it_where_not(case: Case, problem: Problem) -> None:
-    """From 10 % off the polish predicts better in every fold; what costs too much is left out with a note."""
+    """From 10 % off the polish predicts better over all; what costs too much is left out with a note."""
     off = choose(problem, At(case.theta * 1.1, case.latency_s), Budget(), 0, 40, 0)
     assert off.chosen == "polish"
-    assert all(p < s for p, s in zip(off.errors["polish"], off.errors["search"], strict=True))
+    assert np.prod(off.errors["polish"]) < 0.9 * np.prod(off.errors["search"])
     assert set(off.to_json()) == {"chosen", "errors", "window_s", "steps"}
     truth = prediction_error(problem, [(case.theta, case.latency_s), (case.theta * 1.1, case.latency_s)], 40)
     assert truth[0] < truth[1]
@@ -121,6 +121,23 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> 
     assert folds["chosen"] in ("search", "polish") and set(folds["errors"]) == {"search", "polish"}
     assert "diagnosis" in result.provenance
     assert any("does not explain" in words for words in result.alarms)
+
+
+def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(case: Case) -> None:
+    """With residuals taken to be 50 times the noise chi2 says nothing: the folds are run all the same."""
+    chosen = 50 * Problem(case.robot, case.space, [case.fit], threads=1).noise_std
+    problem = Problem(
+        case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s, known_std=chosen
+    )
+    search = At(case.theta * 1.05, case.latency_s)
+    result = PolishedMethod(search, settings=Validation(halves=False, diagnosis=False)).run(
+        problem, Budget(generations=15), np.random.default_rng(0)
+    )
+    assert result.chi2 < 0.5
+    folds = result.provenance["folds"]
+    assert set(folds["errors"]) == {"search", "polish"} and search.runs == 3
+    means = {name: np.prod(errors) for name, errors in folds["errors"].items()}
+    assert folds["chosen"] == min(means, key=lambda name: means[name])
 
 
 def test_huber_weights_by_hand() -> None:

@@ -66,7 +66,7 @@ def test_no_design_is_clipped_where_the_robot_follows(
     previous, lag = position[index], np.array(robot.stiffness) / np.maximum(robot.damping, 1e-3)
     for k in range(round(plan.seconds * robot.control_rate_hz)):
         wanted = behaviour.command(state(position), k / robot.control_rate_hz)
-        sent, clipped = gate.clip(wanted, previous, position[index])
+        sent, clipped = gate.clip(wanted, previous, position[index], np.zeros(len(index)))
         assert clipped == ()
         previous = sent.position_target
         follow = -np.expm1(-lag / robot.control_rate_hz)

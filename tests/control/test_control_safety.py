@@ -165,7 +165,7 @@ def test_targets_are_clipped_by_hand_computed_amounts(
 ) -> None:
     """Step, then distance, then the absolute limit, which always holds."""
     result, clipped = SafetyFilter(DESCRIPTION).clip(
-        command(target), np.array([previous]), np.array([measured])
+        command(target), np.array([previous]), np.array([measured]), np.zeros(1)
     )
     assert result.position_target[0] == pytest.approx(expected, abs=1e-12)
     assert clipped == names
@@ -189,7 +189,7 @@ def test_every_field_is_clipped_exactly_at_its_limits(field: str, low: float, hi
     previous = measured = np.zeros(1)
     for value in {*around(low, 0.1), *around(high, 0.1)}:
         asked = dataclasses.replace(command(), **{field: np.array([value])})
-        result, clipped = SafetyFilter(DESCRIPTION).clip(asked, previous, measured)
+        result, clipped = SafetyFilter(DESCRIPTION).clip(asked, previous, measured, np.zeros(1))
         assert getattr(result, field)[0] == min(max(value, low), high)
         assert (name in clipped) is not (low <= value <= high)
 

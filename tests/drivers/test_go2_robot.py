@@ -12,7 +12,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control.passive import make_passive
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.protocol import decode_low_command, decode_low_state
+from deal_hw.drivers.go2.protocol import decode_low_command, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
 from deal_hw.drivers.go2.scripted import RESTING, STIFF, ScriptedGo2, ScriptedTopics
 from deal_hw.errors import (
@@ -124,6 +124,24 @@ def test_a_standing_clock_is_no_robot() -> None:
     wire = Wire()
     wire.device.tick_step = 0
     with pytest.raises(TransportTimeoutError, match="stands still at 1000 ms"):
+        wire.robot.connect()
+
+
+def test_two_robots_on_one_network_are_refused() -> None:
+    """Half of what comes is old news of the other; who they are is told where discovery knows."""
+    wire = Wire()
+    wire.topics.others = {topics.LOW_STATE: ("robot one", "robot two")}
+    other = ScriptedGo2()
+    other.tick_ms = 600
+
+    def both(topic: str, payload: bytes) -> Iterable[bytes]:
+        if topic != topics.LOW_STATE:
+            return (payload,)
+        other.tick_ms += 2
+        return payload, encode_low_state(other.state())
+
+    wire.topics.tamper = both
+    with pytest.raises(WrongDeviceError, match=r"two robots.*robot one; robot two"):
         wire.robot.connect()
 
 

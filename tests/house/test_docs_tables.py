@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from deal_hw.cli.main import JOBS
+from deal_hw.control.safety_machine import SafetyFlags
 from deal_hw.data.record import CycleFlag
 from deal_hw.data.schemas import CHANNELS
 from deal_hw.types import Status
@@ -42,6 +44,13 @@ def test_topic_is_described_with_its_fields(topic: str) -> None:
 def test_bit_is_described(flag: enum.IntFlag) -> None:
     """Each bit has a row with its value and name."""
     assert re.search(rf"^\| {flag.value} `{flag.name}` \|", DATA_FORMAT, flags=re.M)
+
+
+def test_each_safety_flag_is_described() -> None:
+    """The tables of docs/safety.md have a row for each flag, and none for others."""
+    page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \|", page[page.index("## What trips") :], flags=re.M)
+    assert sorted(rows) == sorted(flag.name for flag in dataclasses.fields(SafetyFlags))
 
 
 def test_readme_shows_each_job() -> None:

@@ -36,6 +36,9 @@ KINDS: Mapping[str, Apply] = MappingProxyType(
 DEVICE_KINDS = tuple(name for name, kind in KIND_TABLE.items() if kind.apply is None)
 """Kinds that no MuJoCo field holds: what stands between simulator, commands and recording applies them."""
 
+SENSOR_NOISE = "sensor_noise"
+"""The one kind that cannot be searched: what recordings are weighed by."""
+
 SERVO_KINDS = ("servo_stiffness", "servo_damping", "servo_effort_limit", "servo_speed_limit")
 """Kinds that scale with what the robot was sent."""
 
@@ -81,6 +84,7 @@ def check_space(model: Any, space: ParameterSpace) -> None:
     for p in space.parameters:
         kind = find_kind(p.kind)
         _check_bounds(p, kind)
+        _check_searchable(p)
         for name in p.elements:
             index = element_id(model, kind.element, name)
             if kind.usable is not None:
@@ -95,6 +99,14 @@ def check_space(model: Any, space: ParameterSpace) -> None:
                 )
         if p.kind in ("geom_friction", "geom_restitution"):
             check_partners(model, p.kind, p.elements, p.low)
+
+
+def _check_searchable(p: Parameter) -> None:
+    if p.kind == SENSOR_NOISE and not p.known:
+        raise ConfigurationError(
+            f"parameter {p.name!r}: noise of a sensor changes no prediction, so no search can find it; leave it "
+            f"out (it is estimated from the recording) or give the value you measured, `known: {p.nominal:g}`"
+        )
 
 
 def _check_bounds(p: Parameter, kind: Kind) -> None:

@@ -1,4 +1,8 @@
-"""Parameter kinds of sensors: no MuJoCo field holds them; the comparison with the recording applies them."""
+"""Parameter kinds of sensors: no MuJoCo field holds them.
+
+A bias moves what the simulator reports. Noise moves no prediction, so no search can find it: a known value is
+what the recording is weighed by, and where none is given it is estimated from the recording itself.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ SENSOR_KINDS = (
     ),
     Kind(
         name="sensor_noise", element="joint", quantity="sensor_noise", unit="rad", unit_slide="m", writes=(),
-        along="standard deviation of white noise on the reported joint position", apply=None, baseline=None,
-        usable=one_dof_joint,
+        along="standard deviation of white noise on the reported joint position; `known` only", apply=None,
+        baseline=None, usable=one_dof_joint,
     ),
 )  # fmt: skip

@@ -1,0 +1,323 @@
+"""`open-loop`: calibration from recordings of a real robot, which no simulator explains to the noise.
+
+Three questions have no answer there that holds for every robot: how far a prediction may be off, whether a
+search that stops early or a fit that goes on predicts other motion better, and over which horizon to fit. So
+
+1. a fit from the model's own values over short windows says what residuals to expect;
+2. the ensemble search (:mod:`deal_hw.calib.weki`) is run with these;
+3. on inner folds of the recordings that are fitted, motion by motion, the search's estimate and fits over
+   short and long horizons (robust or not, with a latency or none) predict what they have not seen;
+4. what predicts best is fitted to all, its halves are compared, and what goes with what is said.
+
+Recordings that are held out take no part in any of this.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.stats import norm
+
+from deal_hw.calib.attempts import Attempts
+from deal_hw.calib.confounded import confounded
+from deal_hw.calib.excitation import check_excitation
+from deal_hw.calib.folds import Choice, fold_masks
+from deal_hw.calib.halves import FALSE_ALARMS, Halves, heed
+from deal_hw.calib.horizon import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
+from deal_hw.calib.identifiability import MISMATCH_CHI2, Uncertainty, uncertainty
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.report.inputs import HalvesRow
+from deal_hw.calib.weki import Weki
+from deal_hw.calibration import (
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+    StateStore,
+)
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.sim.episode_parts import spread, stretches
+from deal_hw.types import FloatArray
+
+LONG_S = 2.0
+SEARCH_S = 12.0
+"""The search is to find the neighbourhood: so much of the recordings, evenly spread, says where it is [s]."""
+
+STRETCH_S = 2.5
+SEARCHED_WINDOW_S = 0.4
+"""Starts are compared in windows of this length: even a far one does not diverge in them."""
+
+HALF_ITERATIONS = 5
+
+RECIPES: Mapping[str, Recipe] = {
+    "long": Recipe(seconds=LONG_S),
+    "long, robust": Recipe(seconds=LONG_S, robust=True),
+    "long, no latency": Recipe(seconds=LONG_S, latency=False),
+}
+
+Member = tuple[FloatArray, float]
+
+
+class OpenLoop(CalibrationMethod[Problem]):
+    """Searches, fits open-loop predictions, and takes what inner folds say predicts best.
+
+    Args:
+        search: The search; `weki` by default.
+    """
+
+    name = "open-loop"
+
+    def __init__(self, search: CalibrationMethod[Problem] | None = None) -> None:
+        self.search: CalibrationMethod[Problem] = search or Weki()
+
+    def run(
+        self,
+        problem: Problem,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
+        checkpoint: StateStore | None = None,
+    ) -> CalibrationResult:
+        """Calibrate. See :meth:`CalibrationMethod.run`.
+
+        A resumed run takes the search of all data from the checkpoint; the rest is done again, to the same
+        numbers.
+        """
+        began = time.perf_counter()
+        work = _Work(problem, self.search, budget, progress)
+        check_excitation(problem)
+        work.say("residual", "fits short windows from the model's own values")
+        first = fit_horizon(problem, problem.space.nominal, work.given_latency_s, SHORT)
+        reduced = work.reduced(problem, first)
+        attempts = Attempts(self.search, reduced, rng, checkpoint)
+        searched = attempts.run(0, budget, progress)
+        # Drawn after the search, so that a resumed run draws the same.
+        seed = int(rng.integers(2**32))
+        choice = work.choose(seed)
+        work.say("fit", f"{choice.chosen} on all recordings")
+        theta, latency_s = work.members(problem, (first.theta, first.latency_s), searched, choice.chosen)[
+            choice.chosen
+        ]
+        recipe = RECIPES.get(choice.chosen, RECIPES["long"])
+        fit = fit_horizon(problem, theta, latency_s, dataclasses.replace(recipe, latency=True), iterations=0)
+        known = _known(problem, fit)
+        halves = _halves(problem, fit, recipe, known)
+        known = heed(problem, known, theta, halves)
+        chi2 = _over_noise(problem, fit)
+        found = confounded(problem, fit.hessian / known.inflation)
+        words = tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found))))
+        provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
+            "search": searched.method,
+            "search_seconds": searched.seconds,
+            "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
+            "search_latency_s": searched.latency_s,
+            "folds": choice.to_json(),
+            "residual_std": dict(zip(problem.channel_names, map(float, first.scale), strict=True)),
+            "prediction_rmse": dict(zip(problem.channel_names, map(float, fit.scale), strict=True)),
+            "window_s": recipe.seconds,
+            "noise_std": problem.noise_std[problem.channels].tolist(),
+            "inflation": known.inflation,
+            "at_bound": [n for n, b in zip(problem.space.names, known.shape.bound, strict=True) if b != 0],
+            "halves": halves.to_json(),
+            "confounded": [pair.to_json() for pair in found],
+        }
+        return dataclasses.replace(
+            searched,
+            method=self.name,
+            estimate=theta,
+            interval=known.interval,
+            covariance=known.covariance,
+            verdicts=known.verdicts,
+            null_directions=words,
+            latency_s=latency_s,
+            latency_interval_s=known.latency_interval_s,
+            chi2=chi2,
+            alarms=(*known.alarms, *_unexplained(chi2, recipe)),
+            steps=work.steps,
+            seconds=time.perf_counter() - began + attempts.earlier_seconds,
+            provenance=provenance,
+        )
+
+
+class _Work:
+    """One run: what every fold does again.
+
+    Args:
+        problem: All recordings that are fitted.
+        search: The search.
+        budget: What it may use.
+        progress: Called now and then.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        search: CalibrationMethod[Problem],
+        budget: Budget,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self._problem, self._search, self._budget, self._progress = problem, search, budget, progress
+        self._before = problem.steps
+        self._searched: list[Problem] = []
+
+    @property
+    def given_latency_s(self) -> float:
+        """The latency where it is given; otherwise fits begin at none [s]."""
+        return self._problem.fixed_latency_s or 0.0
+
+    @property
+    def steps(self) -> int:
+        """Physics steps so far, those of the reduced problems too."""
+        return self._problem.steps - self._before + sum(p.steps for p in self._searched)
+
+    def say(self, stage: str, message: str) -> None:
+        """Report what is being done."""
+        if self._progress is not None:
+            self._progress(Progress(stage, 0, 1, message))
+
+    def reduced(self, problem: Problem, first: HorizonFit) -> Problem:
+        """Return the search's problem: part of the recordings, and residuals as large as a first fit's."""
+        parts = [p for e in problem.episodes for p in stretches(e, STRETCH_S)]
+        usable = [p for p in parts if p.usable.any()]
+        std = problem.known_std
+        if std is None:
+            std = problem.noise_std.copy()
+            std[problem.channels] = np.maximum(std[problem.channels], first.scale)
+        found = dataclasses.replace(problem, episodes=spread(usable, SEARCH_S), known_std=std)
+        self._searched.append(found)
+        return found
+
+    def choose(self, seed: int) -> Choice:
+        """Fit every candidate to the data without each fold and compare what they predict of it."""
+        problem, before = self._problem, self.steps
+        errors: dict[str, list[float]] = {}
+        masks = fold_masks(problem)
+        for fold, left_out in enumerate(masks):
+            self.say("folds", f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?")
+            train, test = problem.part([~m for m in left_out]), problem.part(left_out)
+            try:
+                first = fit_horizon(train, problem.space.nominal, self.given_latency_s, SHORT)
+                searched = self._search.run(
+                    self.reduced(train, first), self._budget, np.random.default_rng([seed, fold])
+                )
+                members = self.members(train, (first.theta, first.latency_s), searched)
+                rmse = prediction_rmse(test, list(members.values()), LONG_S)
+            except (InsufficientDataError, CalibrationError) as err:
+                return Choice("long", {}, LONG_S, note=f"a fold's data cannot be fitted: {err}")
+            for name, of_channels in zip(members, rmse, strict=True):
+                errors.setdefault(name, []).append(float(np.exp(np.mean(np.log(of_channels)))))
+        means = {name: float(np.mean(np.log(values))) for name, values in errors.items()}
+        chosen = min(means, key=lambda name: means[name])
+        return Choice(chosen, {n: tuple(v) for n, v in errors.items()}, LONG_S, self.steps - before)
+
+    def members(
+        self, problem: Problem, short: Member, searched: CalibrationResult, only: str | None = None
+    ) -> dict[str, Member]:
+        """Return what each candidate makes of a problem.
+
+        Args:
+            problem: All data, or those of a fold.
+            short: The fit over short windows.
+            searched: The search's result.
+            only: Name of the one candidate that is wanted; None for all.
+        """
+        found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
+        rmse = prediction_rmse(problem, [found["search"], short], SEARCHED_WINDOW_S)
+        near = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
+        for name, recipe in RECIPES.items():
+            if only not in (None, name):
+                continue
+            fit = fit_horizon(problem, near[0], near[1] if recipe.latency else self.given_latency_s, recipe)
+            near = found[name] = fit.theta, fit.latency_s
+        return found
+
+
+def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
+    prior = np.append(1 / problem.space.prior[1] ** 2, 0.0)
+    return uncertainty(
+        problem.space,
+        fit.theta,
+        fit.latency_s,
+        fit.hessian + np.diag(prior),
+        1.0,
+        fit.residual,
+        problem.latency_range_s,
+        fixed_latency=problem.fixed_latency_s is not None,
+        gradient=fit.gradient,
+        prior=prior,
+        rows=fit.rows,
+    )
+
+
+def _over_noise(problem: Problem, fit: HorizonFit) -> float:
+    """Return the mean squared prediction error over the noise's variance, the sensor's or as given."""
+    squares = np.sum([np.sum(r**2, axis=(0, 1)) for r in fit.residual], axis=0)
+    count = sum(r.shape[0] * r.shape[1] for r in fit.residual)
+    noise = problem.noise_std[problem.channels]
+    return float(np.mean(squares / count * (fit.scale / noise) ** 2))
+
+
+def _unexplained(chi2: float, recipe: Recipe) -> tuple[str, ...]:
+    if chi2 <= MISMATCH_CHI2:
+        return ()
+    return (
+        f"the model does not explain the recordings to their noise: predictions of {recipe.seconds:g} s are "
+        f"off by {np.sqrt(chi2):.1f} times the noise; the intervals count all of it as noise",
+    )
+
+
+def _halves(problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertainty) -> Halves:
+    """Fit two halves of the recordings, motion by motion, from the whole's estimate and compare."""
+    space, before = problem.space, problem.steps
+    estimates, stds, intervals = [], [], []
+    for mask in fold_masks(problem, 2):
+        try:
+            half = fit_horizon(
+                problem.part(mask), fit.theta, fit.latency_s, recipe, iterations=HALF_ITERATIONS
+            )
+        except InsufficientDataError as err:
+            return Halves((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
+        told = _known(problem, half)
+        estimates.append(half.theta)
+        stds.append(np.sqrt(np.diag(told.covariance)))
+        intervals.append(told.interval)
+    return compared(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)
+
+
+def compared(
+    problem: Problem,
+    theta: FloatArray,
+    known: Uncertainty,
+    estimates: list[FloatArray],
+    stds: list[FloatArray],
+    intervals: list[FloatArray],
+    steps: int,
+) -> Halves:
+    """Return whether two halves agree.
+
+    Args:
+        problem: All data.
+        theta: The estimate of all data, (K,).
+        known: What is known there; what the data cannot tell is not compared.
+        estimates: Of each half, (K,).
+        stds: Of each half, in the parameters' own scale, (K,).
+        intervals: Of each half, (K, 2).
+        steps: Physics steps that it cost.
+    """
+    space = problem.space
+
+    def three(half: int, k: int) -> tuple[float, float, float]:
+        low, high = intervals[half][k]
+        return float(estimates[half][k]), float(low), float(high)
+
+    rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
+    told = ~known.shape.blind
+    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(told.sum()), 1)))
+    scaled = space.to_scale(np.stack(estimates))
+    far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
+    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
+    return Halves(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)

@@ -1,0 +1,219 @@
+"""How lively a demonstration is: judged by what it recorded, and repeated livelier or gentler where needed.
+
+Robots differ by factors: a set-point that throws one cart against its trips does not get another one out of
+its friction. As a person at the robot would, the search looks at the recording, never at anything hidden.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.control.excitation import RichConfig, Segment
+from deal_hw.control.excitation_limits import room
+from deal_hw.control.excitation_plan import largest_factor
+from deal_hw.data.excitation import Excitation
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+
+LEAST_FOLLOWED = 0.3
+"""An actuated joint that covers less than this share of what was asked of it hardly moves."""
+
+LEAST_NOISE_RATIO = 20.0
+"""Motion below this many standard deviations of the sensor's noise says little of a joint."""
+
+LEAST_FREE_RATIO = 100.0
+"""The same for a joint without a motor: it swings once it has left its friction, or it has not."""
+
+GENTLEST, LIVELIEST = -3.0, 3.0
+LOWEST_EFFORT = 0.1
+"""Effort limits sent below this share are halved where a demonstration becomes livelier."""
+
+FINEST = 0.5
+"""Between a step that hardly moves and one that trips there may be a half step that does neither."""
+
+ATTEMPTS = 4
+
+
+def joint_noise(description: RobotDescription) -> tuple[float, ...]:
+    """Return the standard deviation of each joint's reported position by the description, (J,)."""
+    return tuple(map(float, description.sensor.position_std))
+
+
+def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, ...]:
+    """Return what hardly moved in a recording, in words; nothing where the motion suffices.
+
+    Args:
+        found: Movement and commands of the recording.
+        description: The robot.
+    """
+    words = []
+    commanded = dict(zip(description.actuated, found.target_range, strict=True))
+    for name, unit, span, noise in zip(
+        description.joint_names, description.position_units, found.position_range, joint_noise(description),
+        strict=True,
+    ):  # fmt: skip
+        asked = commanded.get(name)
+        if asked is None:
+            least, why = LEAST_FREE_RATIO * noise, f"{LEAST_FREE_RATIO:g} times the sensor's noise"
+        else:
+            least, why = LEAST_FOLLOWED * asked, f"{LEAST_FOLLOWED:.0%} of what was asked"
+            if least < LEAST_NOISE_RATIO * noise:
+                least, why = LEAST_NOISE_RATIO * noise, f"{LEAST_NOISE_RATIO:g} times the sensor's noise"
+        if span < least:
+            words.append(f"{name} moved {span:.2g} {unit}, less than {least:.2g} {unit} ({why})")
+    return tuple(words)
+
+
+def with_vigor(config: RichConfig, vigor: float, description: RobotDescription) -> RichConfig:
+    """Return the profile, livelier or gentler by some steps, inside the safety limits.
+
+    A step up: set-points half again as far and held half again as long, gains stiffer and less damped, higher
+    limits (not those sent low to be felt), half the balancing. A step down: the opposite of the first and the last two, and more damping.
+
+    Args:
+        config: The profile as it is at 0.
+        vigor: Steps up, or down where negative; half steps, too.
+        description: The robot.
+
+    Raises:
+        ConfigurationError: There are no such steps.
+    """
+    if not GENTLEST <= vigor <= LIVELIEST:
+        raise ConfigurationError(f"vigor {vigor:g}: {GENTLEST:g} to {LIVELIEST:g}, 0 is the profile itself")
+    if vigor == 0:
+        return config
+    up, down = max(vigor, 0.0), max(-vigor, 0.0)
+    amplitude = config.amplitude * 1.5**up * 0.6**down
+    most = room(description)
+    balance_s = config.balance_s * 0.5**up
+    return dataclasses.replace(
+        config,
+        # A user's own amplitude may be beyond the room already; the safety filter clips that.
+        amplitude=min(amplitude, max(float(np.min(most[most > 0])), config.amplitude)),
+        hold_s=(config.hold_s[0] * 1.5**up, config.hold_s[1] * 1.5**up),
+        balance_s=balance_s if vigor > GENTLEST and up < 2 else 0.0,
+        segments=tuple(_scaled(part, vigor, description) for part in _whole(config.segments)),
+    )
+
+
+def _whole(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
+    """Return segments that cover the whole run: what was left out has the description's own gains."""
+    return (*segments, Segment(start=0.0, stop=1.0))
+
+
+def _scaled(part: Segment, vigor: float, description: RobotDescription) -> Segment:
+    limits, up, down = description.limits, max(vigor, 0.0), max(-vigor, 0.0)
+    # A limit is sent low to be felt: raising it would hide it again, and a robot that creeps asks for little.
+    effort_up = up if part.effort_limit >= 1 else 0.0
+    lower = 0.5 if up and part.effort_limit < LOWEST_EFFORT else 1.0
+
+    def within(factor: float, now: float, default: tuple[float, ...], most: tuple[float, ...]) -> float:
+        return min(now * factor, max(largest_factor(default, most), now))
+
+    return dataclasses.replace(
+        part,
+        stiffness=within(1.6**up * 0.8**down, part.stiffness, description.stiffness, limits.stiffness),
+        damping=within(0.5**up * 1.5**down, part.damping, description.damping, limits.damping),
+        effort_limit=within(
+            lower * 2.0**effort_up * 0.7**down, part.effort_limit, description.effort_limit, limits.effort
+        ),
+        speed_limit=within(1.5**up * 0.5**down, part.speed_limit, description.speed_limit, limits.speed),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One recording and what it was worth.
+
+    Attributes:
+        vigor: How lively it was.
+        shortfalls: What hardly moved, in words.
+        tripped: Why the safety module ended it; "" where it did not.
+    """
+
+    vigor: float
+    shortfalls: tuple[str, ...]
+    tripped: str
+
+    @property
+    def enough(self) -> bool:
+        """Whether the recording is whole and moves."""
+        return not self.shortfalls and not self.tripped
+
+
+class VigorSearch:
+    """Chooses how lively to record next until a recording is whole and moves; ask (`vigor`) and tell.
+
+    Args:
+        vigor: Where to start.
+        attempts: Most recordings.
+        rearm: Whether a recording that the safety module ended may be followed by another. On a robot a
+            person has to look first.
+
+    Raises:
+        ConfigurationError: It is to start outside what there is, or never.
+    """
+
+    def __init__(self, vigor: float = 0.0, attempts: int = ATTEMPTS, *, rearm: bool = True) -> None:
+        if not GENTLEST <= vigor <= LIVELIEST:
+            raise ConfigurationError(f"vigor {vigor:g}: {GENTLEST:g} (gentlest) to {LIVELIEST:g} (liveliest)")
+        if attempts < 1:
+            raise ConfigurationError(f"{attempts} attempts at a recording: at least 1")
+        self._most, self._rearm = attempts, rearm
+        self.vigor = vigor
+        self.attempts: list[Attempt] = []
+        self.words = ""
+
+    def tell(self, found: tuple[str, ...], tripped: str = "") -> bool:
+        """Take what came of the recording at `vigor`; return whether to record again, at the new `vigor`.
+
+        `words` then says what was wrong and what is done next.
+
+        Args:
+            found: What hardly moved, from :func:`shortfalls`.
+            tripped: Why the safety module ended it; "" where it did not.
+        """
+        attempt = Attempt(self.vigor, found, tripped)
+        self.attempts.append(attempt)
+        self.words = ""
+        if attempt.enough:
+            return False
+        how = "gentler" if tripped else "livelier"
+        following = self._following(-1.0 if tripped else 1.0)
+        why = f"it was cut short ({tripped})" if tripped else f"it hardly moves: {'; '.join(found)}"
+        end = self._end(following, how, bool(tripped))
+        if not end:
+            self.vigor = following
+        self.words = f"{why}; {end or f'recording again, {how} (vigor {following:g})'}"
+        return not end
+
+    def _following(self, step: float) -> float:
+        """Return the vigor a step away, or half way to one that was tried on the way there."""
+        tried = [(a.vigor - self.vigor) * step for a in self.attempts]
+        nearest = min((t for t in tried if 0 < t <= 1), default=2.0)
+        return self.vigor + step * min(1.0, nearest / 2)
+
+    def _end(self, following: float, how: str, tripped: bool) -> str:
+        """Return why there is no further attempt, in words; "" where there is one."""
+        if not GENTLEST <= following <= LIVELIEST:
+            return "there is nothing gentler" if tripped else "the limits allow nothing livelier"
+        if abs(following - self.vigor) < FINEST:
+            return f"half a step {how} was tried before"
+        if tripped and not self._rearm:
+            return f"look at the robot, then record again with --vigor {following:g}"
+        if len(self.attempts) >= self._most:
+            return f"no more recordings are allowed here; go on with --vigor {following:g}"
+        return ""
+
+    @property
+    def best(self) -> int:
+        """Index of the recording to use: whole and moving, else moving, else whole; then the liveliest."""
+
+        def worth(index: int) -> tuple[bool, bool, float]:
+            attempt = self.attempts[index]
+            return not attempt.shortfalls, not attempt.tripped, attempt.vigor
+
+        return max(range(len(self.attempts)), key=worth)

@@ -1,0 +1,49 @@
+"""The small problem on which the searches are tested: a cart-pole with two free parameters."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.problem import Problem
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode import Episode, align
+from deal_hw.sim.model import load_model
+from deal_hw.testing.simulated_episode import simulated_episode
+from deal_hw.types import FloatArray
+
+Recorded = tuple[ParameterSpace, FloatArray, Episode]
+TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
+"""Factors of the nominal values."""
+
+
+@functools.cache
+def _recorded(seconds: float = 1.2, latency_ticks: int = 0) -> Recorded:
+    space = k9_space().with_ratio(5.0).with_free(TRUTH)
+    theta = np.array([p.nominal * TRUTH[p.name] for p in space])
+    made = simulated_episode(DESCRIPTION, space, theta, seconds=seconds, latency_ticks=latency_ticks)
+    return space, theta, align(made, DESCRIPTION)
+
+
+@pytest.fixture(scope="session")
+def recorded() -> Callable[..., Recorded]:
+    """Return what makes a space with two free parameters, their true values, and a noise-free recording.
+
+    Its arguments are the length (1.2 s) and the latency in device periods (0).
+    """
+    return _recorded
+
+
+@pytest.fixture(scope="session")
+def small_problem() -> Callable[..., Problem]:
+    """Return what makes the problem of finding them; arguments of ``recorded``, and the given latency."""
+
+    def make(seconds: float = 1.2, latency_ticks: int = 0, fixed_latency_s: float | None = 0.0) -> Problem:
+        space, _, episode = _recorded(seconds, latency_ticks)
+        return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s)
+
+    return make

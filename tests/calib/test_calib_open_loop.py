@@ -1,0 +1,222 @@
+"""Open-loop fits, folds by motion and what goes with what, on two motions of a hinge with a hidden truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import mujoco
+import numpy as np
+import pytest
+
+from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
+from deal_hw.calib.checkpoint import Checkpoint
+from deal_hw.calib.confounded import confounded
+from deal_hw.calib.folds import fold_masks, motion_numbers
+from deal_hw.calib.horizon import Recipe, expected_residual, fit_horizon, prediction_rmse
+from deal_hw.calib.open_loop import OpenLoop
+from deal_hw.calib.problem import Problem
+from deal_hw.calibration import Budget, CalibrationResult, Progress
+from deal_hw.cli.calibrate_model import Recordings, prepare_model
+from deal_hw.cli.calibrate_run import Narrowing
+from deal_hw.sim.episode import Episode
+from deal_hw.types import FloatArray
+
+HINGE = """
+<mujoco model="hinge">
+  <compiler angle="radian"/>
+  <option timestep="0.004" integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" armature="0.01" damping="{damping}" frictionloss="{friction}"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3"/>
+    </body>
+  </worldbody>
+  <actuator><position name="hinge" joint="hinge" kp="12" kv="0.1" forcerange="-20 20"/></actuator>
+</mujoco>
+"""
+PARAMETERS = """
+parameters:
+  - {kind: dof_damping, elements: hinge}
+  - {kind: dof_frictionloss, elements: hinge}
+"""
+TRUTH = np.array([0.4, 0.05])
+LATE_S = 0.012
+NOISE = 3e-4
+BUDGET = Budget(population=12, generations=6)
+
+
+def recording(phase: float, seconds: float = 5.0) -> str:
+    """Return a CSV of a motion in which commands act 12 ms late."""
+    model = mujoco.MjModel.from_xml_string(HINGE.format(damping=TRUTH[0], friction=TRUTH[1]))
+    data, rng = mujoco.MjData(model), np.random.default_rng(2)
+    time = np.arange(0.0, seconds, 0.02)
+    wave = 0.4 * np.sin(2 * np.pi * np.outer(time, (0.4, 0.9, 1.7)) + phase * np.arange(3)).sum(axis=1)
+    rows, command = ["time,hinge_pos,hinge_cmd"], wave[0]
+    data.qpos[0] = wave[0]
+    for t, wanted in zip(time, wave, strict=True):
+        rows.append(f"{t:.3f},{data.qpos[0] + NOISE * rng.standard_normal():.7f},{wanted:.7f}")
+        for step in range(5):
+            data.ctrl[0] = wanted if 0.004 * step >= LATE_S else command
+            mujoco.mj_step(model, data)
+        command = wanted
+    return "\n".join(rows) + "\n"
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    """Return two motions of the hinge, whose model has half the damping and friction."""
+    folder = tmp_path_factory.mktemp("hinge")
+    (folder / "hinge.xml").write_text(HINGE.format(damping="0.2", friction="0.025"))
+    (folder / "params.yaml").write_text(PARAMETERS)
+    for name, phase in (("first", 1.0), ("second", 2.3)):
+        (folder / f"{name}.csv").write_text(recording(phase))
+    source = Recordings(
+        model=folder / "hinge.xml",
+        data=(folder / "first.csv", folder / "second.csv"),
+        parameters=folder / "params.yaml",
+        holdout_part=0.0,
+    )
+    narrowing = Narrowing(free=(), known={}, ranges=(), xi=None)
+    work = prepare_model(source, (), narrowing, std=lambda robot: None, threads=1, quiet=True)
+    return Problem(work.robot, work.space, work.episodes, threads=1)
+
+
+def test_a_long_fit_finds_parameters_and_latency_and_says_how_far_predictions_are_off(
+    problem: Problem,
+) -> None:
+    """Damping and friction come within 2 and 10 %, the latency within 1 ms, the residual near the noise."""
+    fit = fit_horizon(problem, problem.space.nominal, 0.0, Recipe())
+    assert fit.theta[0] == pytest.approx(TRUTH[0], rel=0.02)
+    assert fit.theta[1] == pytest.approx(TRUTH[1], rel=0.1)
+    assert fit.latency_s == pytest.approx(LATE_S, abs=1e-3)
+    assert NOISE < fit.scale[0] < 2 * NOISE
+    rmse = prediction_rmse(problem, [(fit.theta, fit.latency_s), (problem.space.nominal, 0.0)], 2.0)
+    assert rmse[0, 0] == pytest.approx(fit.scale[0], rel=1e-6)
+    assert rmse[1, 0] > 20 * rmse[0, 0]
+
+
+def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem) -> None:
+    """Half a second in which the arm is held 0.2 rad off: the middle of the residuals measures them."""
+    first = problem.episodes[0]
+    held = first.position.copy()
+    held[60:85] += 0.2
+    spoilt = dataclasses.replace(
+        problem, episodes=[dataclasses.replace(first, position=held), *problem.episodes[1:]]
+    )
+    spoilt.starts = problem.starts
+    plain, robust = (
+        fit_horizon(spoilt, TRUTH, LATE_S, Recipe(seconds=1.0, robust=wanted)) for wanted in (False, True)
+    )
+    off = [np.abs(np.log(fit.theta / TRUTH)).max() for fit in (plain, robust)]
+    assert off[1] < 0.05 and off[1] < off[0]
+    assert robust.scale[0] < 0.3 * plain.scale[0]
+
+
+def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
+    """What a search is told is the residual of a first fit; of what was not measured nothing is said."""
+    std = expected_residual(problem)
+    assert problem.noise_std[0] <= std[0] < 5e-3
+
+
+@pytest.fixture(scope="module")
+def result(problem: Problem) -> CalibrationResult:
+    """Return what the whole method finds."""
+    return OpenLoop().run(problem, BUDGET, np.random.default_rng(0))
+
+
+def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationResult) -> None:
+    """Every candidate has an error in each fold, a fit wins, and the truth lies in the intervals."""
+    folds = result.provenance["folds"]
+    assert set(folds["errors"]) == {"search", "short", "long", "long, robust", "long, no latency"}
+    assert all(len(errors) == 2 for errors in folds["errors"].values())
+    assert folds["chosen"] != "long, no latency"
+    assert result.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
+    assert np.all(result.interval[:, 0] <= TRUTH) and np.all(result.interval[:, 1] >= TRUTH)
+    assert result.latency_s == pytest.approx(LATE_S, abs=2e-3)
+
+
+def test_halves_of_a_right_model_agree(problem: Problem, result: CalibrationResult) -> None:
+    """Two motions of one hinge: every parameter is compared, none is flagged."""
+    halves = result.provenance["halves"]
+    assert set(halves["parameters"]) == set(problem.space.names) and halves["flagged"] == []
+
+
+class StoppedError(Exception):
+    """Raised by a callback."""
+
+
+def test_a_stopped_run_is_resumed_to_the_same_numbers(
+    problem: Problem, result: CalibrationResult, tmp_path: Path
+) -> None:
+    """Stopped in the search, the checkpoint holds its generations; the rest is done again."""
+
+    def stop(progress: Progress) -> None:
+        if progress.stage == "search" and progress.done == 4:
+            raise StoppedError
+
+    store = Checkpoint(tmp_path / "checkpoint.npz", "a")
+    with pytest.raises(StoppedError):
+        OpenLoop().run(problem, BUDGET, np.random.default_rng(0), stop, store)
+    resumed = OpenLoop().run(problem, BUDGET, np.random.default_rng(0), None, store)
+    assert np.array_equal(resumed.estimate, result.estimate)
+    assert np.array_equal(resumed.interval, result.interval)
+
+
+def test_least_squares_from_several_starts_finds_them_too(problem: Problem) -> None:
+    """The best of three starts ends within 5 % in damping and 2 ms in latency."""
+    method = MultiStartLeastSquares(MultiStartSettings(starts=3, survivors=1))
+    found = method.run(problem, Budget(population=3, generations=10), np.random.default_rng(0))
+    assert found.estimate[0] == pytest.approx(TRUTH[0], rel=0.05)
+    assert found.latency_s == pytest.approx(LATE_S, abs=2e-3)
+    assert found.provenance["stopped"] == "best of 3 starts, 1 of them fitted to all recordings"
+
+
+def episode_at(row: int, samples: int = 10) -> Episode:
+    """Return what folds look at of an episode."""
+    return cast(
+        "Episode",
+        SimpleNamespace(first_row=row, origin=10 * row, sample=np.arange(samples), usable=np.ones(samples)),
+    )
+
+
+def test_folds_leave_out_whole_motions_where_there_are_several() -> None:
+    """Stretches of one recording follow each other; a new one begins where they do not."""
+    parts = [episode_at(row) for row in (0, 5, 9, 0, 7, 0)]
+    assert motion_numbers(parts) == [0, 0, 0, 1, 1, 2]
+    masks = fold_masks(cast("Problem", SimpleNamespace(episodes=parts)), 2)
+    assert [bool(m.all()) for m in masks[0]] == [True, True, True, False, False, True]
+    assert [bool(m.any()) for m in masks[1]] == [False, False, False, True, True, False]
+    # One motion: its stretches take turns; one stretch: its blocks do.
+    one = fold_masks(cast("Problem", SimpleNamespace(episodes=parts[:3])), 2)
+    assert [bool(m.all()) for m in one[0]] == [True, False, True]
+    single = fold_masks(cast("Problem", SimpleNamespace(episodes=[episode_at(0, 8)])), 2)
+    assert single[0][0].tolist() == [True, True, False, False, True, True, False, False]
+
+
+def space_of(kinds: tuple[str, ...]) -> Problem:
+    """Return what the comparison of kinds looks at: ranges of width 1, latencies up to 1 s."""
+
+    class Space(list[SimpleNamespace]):
+        width: FloatArray = np.ones(len(kinds))
+
+    space = Space(SimpleNamespace(kind=kind) for kind in kinds)
+    return cast("Problem", SimpleNamespace(space=space, latency_range_s=(0.0, 1.0), fixed_latency_s=None))
+
+
+def test_a_delay_that_goes_with_all_armatures_together_is_named() -> None:
+    """Only the sum of two armatures and the delay is known: the delay is sqrt(3) times narrower without one.
+
+    With a flat prior of information 12 on each and information I on the sum, the delay's variance is
+    (1/12) (12 + 2 I) / (12 + 3 I); with both armatures known it is 1 / (12 + I).
+    """
+    problem, strong = space_of(("dof_armature", "dof_armature")), 1e4
+    found = confounded(problem, strong * np.ones((3, 3)))
+    (pair,) = found
+    assert (pair.first, pair.second) == ("latency", "dof_armature")
+    expected = np.sqrt((12 + 2 * strong) / (12 + 3 * strong) / 12 * (12 + strong))
+    assert pair.factor == pytest.approx(expected)
+    assert "latency and dof_armature are confounded" in pair.words
+    assert confounded(problem, strong * np.eye(3)) == ()

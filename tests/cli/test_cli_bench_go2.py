@@ -1,0 +1,32 @@
+"""The verb `bench go2-codec`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from deal_hw.cli.bench_go2 import TARGETS_US, bench_codec
+
+
+def test_the_codec_bench_writes_medians_and_the_machine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A row for each operation, with its target where it has one; how fast it is, is no matter of a test."""
+    out = tmp_path / "codec.json"
+    bench_codec(out, batches=3)
+    values = json.loads(out.read_text())
+    rows = {row["operation"]: row for row in values["rows"]}
+    assert set(TARGETS_US) < set(rows)
+    for name, row in rows.items():
+        assert 0 < row["lowest_us"] <= row["median_us"] <= row["p99_us"]
+        assert row["target_us"] == TARGETS_US.get(name)
+    assert values["machine"]["processors"] >= 1
+    assert "encode LowCmd with CRC" in capsys.readouterr().out
+
+
+def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    """As with every bench."""
+    bench_codec(None, quiet=True, batches=1)
+    assert capsys.readouterr().out == ""

@@ -1,0 +1,104 @@
+"""Positions for motors and efforts for servos: refused with the suspected mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.data.checks import Severity
+from deal_hw.data.command_kind import command_kind
+from deal_hw.data.importing.load import load_tables
+from deal_hw.data.importing.table import Table
+from deal_hw.types import FloatArray
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
+STEP_S = 0.002
+
+
+def table(position: FloatArray, command: FloatArray) -> Table:
+    """Return a recording at 50 Hz of joints that are all commanded."""
+    names = tuple(f"joint{i}" for i in range(position.shape[1]))
+    time = np.arange(len(position)) * 0.02
+    return Table(
+        joint_names=names, actuated=names, units=("rad",) * len(names), time_s=time, position=position, velocity=None,
+        effort=None, command_s=time, target=command, orientation=None, gyro=None, source={"file": "r", "part": ""},
+    )  # fmt: skip
+
+
+def wish(seconds: float, seed: int) -> FloatArray:
+    """Return sums of sines for two joints at 50 Hz, (T, 2)."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 0.02)
+    tones, phases = rng.uniform(0.2, 1.5, (2, 5)), rng.uniform(0, 2 * np.pi, (2, 5))
+    return 0.2 * np.sin(2 * np.pi * tones[:, :, None] * time + phases[:, :, None]).sum(axis=1).T
+
+
+def play(command: FloatArray, *, servo: bool, seed: int) -> FloatArray:
+    """Simulate two joints of 0.02 kg·m² with damping and a weight, late by 10 ms; return positions at 50 Hz."""
+    x, v, seen = np.zeros(2), np.zeros(2), np.empty_like(command)
+    sent = np.repeat(command, 10, axis=0)
+    for k in range(len(sent)):
+        if k % 10 == 0:
+            seen[k // 10] = x
+        u = sent[max(k - 5, 0)]
+        torque = 20.0 * (u - x) - 0.8 * v if servo else u
+        v = v + STEP_S / 0.02 * (torque - 0.05 * v - 0.3 * np.sin(x))
+        x = x + STEP_S * v
+    return np.asarray(seen + 5e-4 * np.random.default_rng(seed).standard_normal(seen.shape))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_positions(seed: int) -> None:
+    """Fine for servos, refused for motors."""
+    command = wish(12.0, seed)
+    made = table(play(command, servo=True, seed=seed), command)
+    assert command_kind(made, servo=True).severity is Severity.OK
+    verdict = command_kind(made, servo=False)
+    assert verdict.severity is Severity.FAIL and verdict.name == "actuation"
+    assert "look like positions (joint0, joint1)" in verdict.message and "<position joint=" in verdict.message
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_torques(seed: int) -> None:
+    """Fine for motors, refused for servos; random torques as well as smooth ones."""
+    smooth = 0.6 * wish(12.0, seed)
+    rough = np.repeat(np.random.default_rng(seed).uniform(-0.3, 0.3, (60, 2)), 10, axis=0)
+    for command in (smooth, rough):
+        made = table(play(command, servo=False, seed=seed), command)
+        assert command_kind(made, servo=False).severity is Severity.OK
+        verdict = command_kind(made, servo=True)
+        assert verdict.severity is Severity.FAIL, command is smooth
+        assert "look like efforts" in verdict.message and "<motor>" in verdict.message
+
+
+def test_commands_beyond_the_ctrlrange() -> None:
+    """Outside for most of the time is a refusal, for a tenth of it a warning, with the range in words."""
+    command = wish(12.0, 0)
+    made = table(play(command, servo=True, seed=0), command)
+    narrow = np.tile([-0.05, 0.05], (2, 1))
+    verdict = command_kind(made, servo=True, limits=narrow)
+    assert verdict.severity is Severity.FAIL and "takes -0.05..0.05" in verdict.message
+    edge = float(np.quantile(np.abs(command), 0.85))
+    verdict = command_kind(made, servo=True, limits=np.tile([-edge, edge], (2, 1)))
+    assert verdict.severity is Severity.WARN and "ctrlrange" in verdict.message
+    assert command_kind(made, servo=True, limits=np.tile([-2.0, 2.0], (2, 1))).severity is Severity.OK
+
+
+def test_still_joints_say_nothing() -> None:
+    """A recording that hardly moves is neither."""
+    still = table(np.full((300, 1), 0.1), np.full((300, 1), 0.1))
+    assert command_kind(still, servo=True).severity is Severity.OK
+    assert command_kind(still, servo=False).severity is Severity.OK
+
+
+@pytest.mark.skipif(
+    not REAL.is_dir(), reason="the public recordings are not here: they are no part of the repository"
+)
+@pytest.mark.parametrize("path", sorted(REAL.glob("*/*.npz")), ids=lambda path: path.stem)
+def test_real_servos(path: Path) -> None:
+    """Recordings of real servos are positions, whatever the motion, and most joints say so to a motor."""
+    legs = [f"{leg}_{part}" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
+    (made,) = load_tables(path, joints=legs if "go2" in str(path) else None)
+    assert command_kind(made, servo=True).severity is Severity.OK
