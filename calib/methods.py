@@ -14,6 +14,7 @@ METHODS: dict[str, str] = {
     "default": "deal_hw.calib.weki:Weki",
     "weki": "deal_hw.calib.weki:Weki",
     "open-loop": "deal_hw.calib.open_loop:OpenLoop",
+    "near": "deal_hw.calib.open_loop:near",
     "deal": "deal_hw.calib.deal:Deal",
     "deal-paper": "deal_hw.calib.deal_paper:paper",
     "deal-paper-literal": "deal_hw.calib.deal_paper:literal",
@@ -37,7 +38,7 @@ METHODS: dict[str, str] = {
 NULL_METHODS = frozenset({"centre", "nominal", "deal-paper-flat"})
 """Rows that must not read the data, so they are never polished."""
 
-WHOLE_METHODS = frozenset({"open-loop"})
+WHOLE_METHODS = frozenset({"open-loop", "near"})
 """Methods that decide themselves, on inner folds, what follows their search."""
 
 

@@ -70,7 +70,12 @@ __all__ = [
 
 
 def make_robot(
-    name: str, transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
+    name: str,
+    transport_name: str,
+    port: str,
+    clock: Clock,
+    options: WireOptions | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Robot:
     """Return a robot that will be reached over a port; nothing is opened yet.
 
@@ -80,15 +85,20 @@ def make_robot(
         port: Where: a serial port, a network interface, an endpoint.
         clock: Gives the stamps.
         options: More about a transport of topics.
+        settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2.
 
     Raises:
         UnknownNameError: There is no such robot or transport.
-        ConfigurationError: The robot has a description but no driver, or it is not reached that way.
+        ConfigurationError: The robot has a description but no driver, is not reached that way, or its driver
+            has no such setting.
     """
     robot = _driver(name)
     link = make_transport(transport_name, port, clock, options)
     _check_reach(name, transport_name)
-    made: Robot = robot(link, clock)
+    try:
+        made: Robot = robot(link, clock, **(settings or {}))
+    except TypeError as error:
+        raise ConfigurationError(f"robot {name!r} has no setting of {', '.join(settings or ())}") from error
     return made
 
 

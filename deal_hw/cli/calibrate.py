@@ -41,6 +41,8 @@ __all__ = [
 
 HELDOUT_PROFILE = "chirp"
 XI = 5.0
+SAMPLES_A_PERIOD = 4
+"""States of a control period that are fitted to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +100,10 @@ class Calibrate:
     """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE
     pairs of joints; by default the sensor noise, estimated. On real robots some milliradians often serve
     better."""
+
+    sample_hz: float | None = None
+    """Fit to about so many states a second of a dataset; by default to four a control period. What was held
+    out is judged at the same rate."""
 
     population: int = 100
     """Members of the search."""
@@ -264,7 +270,7 @@ def prepare_dataset(config: Calibrate) -> Work:
                 f"episode {index} of {config.dataset} cannot be used: {'; '.join(failed)}; "
                 "record again with `deal-hw collect`"
             )
-    robot, episodes = _simulation(dataset, recordings)
+    robot, episodes = _simulation(dataset, recordings, config.sample_hz)
     return Work(
         robot=robot,
         space=space,
@@ -339,10 +345,10 @@ def make_space(robot: str, config: Calibrate) -> ParameterSpace:
 
 
 def _simulation(
-    dataset: Dataset, recordings: Mapping[int, Trajectory]
+    dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
 ) -> tuple[RobotModel, dict[int, Episode]]:
     try:
-        from deal_hw.sim.episode import align
+        from deal_hw.sim.episode import align, thin
         from deal_hw.sim.model import load_model
         from deal_hw.sim.standing import with_sensed_base
     except ModuleNotFoundError as err:
@@ -354,4 +360,5 @@ def _simulation(
         episodes[i] = align(trajectory, robot.description)
         if robot.base is not None and trajectory.body is not None:
             episodes[i] = with_sensed_base(episodes[i], robot, trajectory.body)
+        episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)
     return robot, episodes

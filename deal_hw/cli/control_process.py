@@ -88,7 +88,7 @@ def _run(
 
     plan = RunPlan.from_json(orders)
     if orders["port_fd"] is None:
-        robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire)
+        robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire, plan.robot_settings)
     else:
         robot = adopt_robot(plan.robot, plan.transport, orders["port_fd"], clock)
     source = plan.velocity_source()

@@ -27,6 +27,10 @@ class LegOptions:
     hand_back: bool = False
     """Give the robot back to its own controller at the end (Go2: the sport service)."""
 
+    stop_buttons: str = ""
+    """Buttons of the robot's remote that make it passive while held together; by default the driver's (Go2:
+    L2+B)."""
+
     posture: PostureConfig = field(default_factory=PostureConfig)
     """How long standing up and lying down take."""
 
@@ -61,6 +65,7 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions) -> dict[str, A
         "velocity": legs.velocity,
         "hand_back": legs.hand_back,
         "posture": legs.posture,
+        "robot_settings": {"stop_buttons": legs.stop_buttons} if legs.stop_buttons else {},
     }
 
 

@@ -55,6 +55,7 @@ class RunPlan:
             :func:`deal_hw.control.velocity.make_source`.
         stand: Whether to stand up first and to lie down at the end; not counted in ``seconds``.
         posture: How long that takes.
+        robot_settings: The driver's own settings.
         hand_back: Whether to return the robot to its own controller at the end.
         record_wire: Whether to record the raw bytes, too.
         realtime: Whether to ask for SCHED_FIFO and locked memory.
@@ -77,6 +78,7 @@ class RunPlan:
     velocity: str = "0,0,0"
     stand: bool = False
     posture: PostureConfig = field(default_factory=PostureConfig)
+    robot_settings: dict[str, Any] = field(default_factory=dict)
     hand_back: bool = False
     record_wire: bool = True
     realtime: bool = True

@@ -168,7 +168,7 @@ def run_episodes(
     if episodes < 1:
         raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
     plan = dataclasses.replace(plan, port=port)
-    robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire)
+    robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire, plan.robot_settings)
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     VigorSearch(plan.vigor, attempts)
     make_behaviour(plan, robot.description)

@@ -71,7 +71,8 @@ def with_vigor(config: RichConfig, vigor: float, description: RobotDescription) 
     """Return the profile, livelier or gentler by some steps, inside the safety limits.
 
     A step up: set-points half again as far and held half again as long, gains stiffer and less damped, higher
-    limits (not those sent low to be felt), half the balancing. A step down: the opposite of the first and the last two, and more damping.
+    limits (not those sent low to be felt), half the balancing. A step down: nearer set-points, softer and
+    more damped gains, lower limits.
 
     Args:
         config: The profile as it is at 0.

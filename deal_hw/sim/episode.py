@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.description import RobotDescription
-from deal_hw.errors import InsufficientDataError
+from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
 SENT = ("target", "stiffness", "damping", "effort_limit", "speed_limit")
@@ -194,6 +194,39 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
         reported=reported,
         reference=None if episode.reference is None else episode.reference[after],
         estimate_std=None if episode.estimate_std is None else whole(episode.estimate_std)[after],
+    )
+
+
+def thin(episode: Episode, rate_hz: float) -> Episode:
+    """Return the episode with about so many samples a second; what was sent stays as it is.
+
+    States come faster than the motion changes: beyond some samples a control period each costs as much as the
+    others and tells little. Every n-th one is kept on the device's grid, so that lost ones move nothing.
+
+    Args:
+        episode: The episode.
+        rate_hz: Samples a second to keep; the next whole share above is taken.
+
+    Raises:
+        ConfigurationError: The rate is not above 0.
+    """
+    if not rate_hz > 0:
+        raise ConfigurationError(f"a rate of samples is above 0 Hz, got {rate_hz:g}")
+    every = int((1.0 / rate_hz) / episode.period_s + 1e-6)
+    if every <= 1:
+        return episode
+    whole = fill_gaps(episode)
+    kept = np.flatnonzero((whole.sample - whole.sample[0]) % (every * episode.stride) == 0)
+    std = whole.estimate_std
+    return dataclasses.replace(
+        whole,
+        sample=whole.sample[kept],
+        position=whole.position[kept],
+        velocity=whole.velocity[kept],
+        usable=np.minimum.reduceat(whole.usable, kept),
+        reported=None if whole.reported is None else whole.reported[kept],
+        reference=None if whole.reference is None else whole.reference[kept],
+        estimate_std=std[kept] if std is not None and std.ndim == 2 else std,
     )
 
 

@@ -12,14 +12,16 @@ from typing import Final
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2 import suspended
 from deal_hw.drivers.go2.description import DESCRIPTION as FLOOR
-from deal_hw.drivers.go2.driven import DRIVEN, WIRE_HZ, driven_limits, hung_legs
+from deal_hw.drivers.go2.driven import DRIVEN, driven_limits, hung_legs
+
+DRIVE_HZ: Final = 1000.0
 
 DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
     DRIVEN,
     name="go2_hung",
     stiffness=suspended.DESCRIPTION.stiffness,
     damping=suspended.DESCRIPTION.damping,
-    device_rate_hz=WIRE_HZ,
+    device_rate_hz=DRIVE_HZ,
     limits=driven_limits(FLOOR.limits, hung_legs()),
     mjcf=suspended.DESCRIPTION.mjcf,
     floating_base=None,
@@ -27,6 +29,7 @@ DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
         **DRIVEN.sources,
         "stiffness": suspended.DESCRIPTION.sources["stiffness"],
         "damping": suspended.DESCRIPTION.sources["damping"],
+        "device_rate_hz": "1 kHz as the emulator's drives; the rate of the robot's own is not published",
         "legs.tilt": "no limit: the base is held",
         "legs.free_fall": "no limit: the base is held",
     },
