@@ -37,7 +37,7 @@ def check_excitation(problem: Problem) -> None:
         InsufficientDataError: They do not; the message says what was found and what to record.
     """
     seconds = sum(float(np.sum(e.usable)) * e.period_s for e in problem.episodes)
-    advice = "record again with `deal-hw collect --profile rich` (4 s are enough)"
+    advice = "record again with `deal-hw collect --profile rich` (4 s are enough; --vigor 1 to 3 is livelier)"
     if seconds < SHORTEST_S:
         raise InsufficientDataError(
             f"{seconds:.2f} s of usable samples, at least {SHORTEST_S:g} s are needed; {advice}"

@@ -68,7 +68,7 @@ def _without(names: Sequence[str], why: str) -> tuple[Advice, ...]:
 def _described(
     robot: RobotModel, result: CalibrationResult, episodes: Sequence[Episode], threads: int | None
 ) -> RobotDescription:
-    """Return the robot with the noise that is left, and where it has no limits with those of its recordings."""
+    """Return the robot with the noise that is left, and with its recordings' limits where it has none."""
     description = robot.description
     problem = Problem(robot, result.space, episodes, threads=threads)
     noise = _noise(problem, result)

@@ -170,7 +170,7 @@ class Problem:
         return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
 
     def _with_given_noise(self, std: FloatArray, channels: IntArray) -> FloatArray:
-        """Return standard deviations, (M,), with those of joints whose sensor's noise is known in their place."""
+        """Return standard deviations, (M,), with the known ones of sensors in their place."""
         joints = self.robot.description.joint_names
         first = self.coordinates - len(joints)
         given = {

@@ -43,7 +43,8 @@ class LegLimits:
     """What the safety module enforces on a robot with legs, beyond :class:`SafetyLimits`.
 
     Attributes:
-        effort: Largest predicted P-D effort of a command, (A,) [N·m]; targets are moved to keep it.
+        effort: Largest predicted P-D effort of a command, (A,) [N·m]; targets are moved, in the end gains
+            lowered, to keep it.
         tilt: Leaning further than this trips, angle between the base's z axis and the vertical [rad];
             infinite for a robot whose base is held.
         tumble: Turning faster than this trips, any axis of the base [rad/s].
@@ -144,6 +145,8 @@ class RobotDescription:
         rest_position: The pose in which a robot with legs lies and may go limp, (J,); empty: none.
         feet: Names of the model's foot geoms (spheres), in the order of ``BodyState.foot_force``; empty: no
             legs.
+        excitation_range: Where excitations may take the actuated joints' targets, (A, 2), for robots whose
+            parts hit each other (or slip) inside the limits; empty: as far as the limits.
         sources: Where each number comes from, by attribute name.
     """
 
@@ -168,6 +171,7 @@ class RobotDescription:
     passive_damping: tuple[float, ...] = ()
     rest_position: tuple[float, ...] = ()
     feet: tuple[str, ...] = ()
+    excitation_range: tuple[tuple[float, float], ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -189,6 +193,7 @@ class RobotDescription:
         for name, length in (
             ("position_units", J), ("default_position", J), ("stiffness", A), ("damping", A),
             ("effort_limit", A), ("speed_limit", A),
+            ("excitation_range", A if self.excitation_range else 0),
         ):  # fmt: skip
             if len(getattr(self, name)) != length:
                 raise ConfigurationError(
@@ -216,7 +221,7 @@ class RobotDescription:
         for name, default in (
             ("actuation", "position"), ("floating_base", None), ("repeat_rate_hz", 0.0),
             ("passive_damping", ()), ("rest_position", ()),
-            ("feet", ()),
+            ("feet", ()), ("excitation_range", ()),
         ):  # fmt: skip
             if values[name] == default:
                 del values[name]

@@ -29,11 +29,11 @@ from deal_hw.control.realtime import become_realtime
 from deal_hw.drivers.go2.protocol import (
     LowCommand,
     LowCommandEncoder,
-    LowState,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
+from deal_hw.drivers.go2.scripted import ScriptedGo2
 from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
@@ -162,20 +162,15 @@ def command_bytes() -> Callable[[int], bytes]:
     return message
 
 
-def state_bytes(cycle: int) -> bytes:
-    """Return the state of a cycle: a robot at rest."""
-    still, none = np.zeros(12), np.zeros(12, np.int64)
-    return encode_low_state(
-        LowState(
-            position=still, velocity=still, acceleration=still, effort=still,
-            temperature=none, lost=none, mode=none + 1,
-            orientation=np.array([1.0, 0.0, 0.0, 0.0]), angular_velocity=np.zeros(3),
-            specific_force=np.array([0.0, 0.0, 9.81]), rpy=np.zeros(3), imu_temperature=40,
-            foot_force=none[:4], foot_force_estimate=none[:4], tick_ms=2 * cycle, remote=bytes(40),
-            battery_percent=80, battery_current_ma=-2000, battery_status=0, battery_cycles=1,
-            cell_voltage_mv=np.full(15, 3700), voltage=29.6, current=2.0,
-        )
-    )  # fmt: skip
+def state_bytes() -> Callable[[int], bytes]:
+    """Return what gives the state of a cycle: a robot at rest."""
+    robot = ScriptedGo2()
+
+    def message(cycle: int) -> bytes:
+        robot.tick_ms = 2 * cycle
+        return encode_low_state(robot.state())
+
+    return message
 
 
 def main(config: DdsPeerSoak) -> int:
@@ -185,7 +180,7 @@ def main(config: DdsPeerSoak) -> int:
     ours = [[name, MINIMAL[name], COMPLETE[name]] for name in MINIMAL]
     became = become_realtime()
     as_user = Side(LOW_COMMAND, LOW_STATE, command_bytes())
-    as_robot = Side(LOW_STATE, LOW_COMMAND, state_bytes)
+    as_robot = Side(LOW_STATE, LOW_COMMAND, state_bytes())
     result: dict[str, Any] = {
         "machine": {
             "processors": os.cpu_count(),

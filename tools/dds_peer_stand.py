@@ -11,7 +11,6 @@ saw stands beside what only the emulator knows.
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+
+from deal_hw.cli.emulator_process import EmulatorProcess
 
 ROOT = Path(__file__).resolve().parents[1]
 PEER = ROOT / "build/dds_peer/go2_peer"
@@ -50,26 +51,19 @@ def run(phases: int, domain: int, config: DdsPeerStand) -> dict[str, Any]:
     """Run an emulator and the program's first phases; return what both tell."""
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder, "truth.json")
-        emulator = subprocess.Popen(
-            [
-                sys.executable, "-m", "deal_hw", "emulate", "go2", "--transport", "dds", "--port", "lo",
-                "--domain", str(domain), "--profile", config.profile, "--seed", str(config.seed),
-                "--duration-s", "120", "--reveal-to", str(truth),
-            ],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
+        options = (
+            "--transport", "dds", "--port", "lo", "--domain", str(domain), "--profile", config.profile,
+            "--seed", str(config.seed), "--duration-s", "120", "--reveal-to", str(truth),
         )  # fmt: skip
-        wait_until_ready(emulator)
-        peer = subprocess.run(
-            [PEER, "stand", str(domain), str(phases)],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=100,
-        )
-        emulator.send_signal(signal.SIGINT)
-        emulator.communicate(timeout=30)
+        with EmulatorProcess("go2", *options) as emulator:
+            peer = subprocess.run(
+                [PEER, "stand", str(domain), str(phases)],
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=100,
+            )
+            emulator.stop(30.0)
         known = json.loads(truth.read_text())
     return {
         "peer": json.loads(peer.stdout) if peer.stdout else {},
@@ -77,12 +71,6 @@ def run(phases: int, domain: int, config: DdsPeerStand) -> dict[str, Any]:
         "peer_warnings": peer.stderr.splitlines(),
         "emulator": {name: known[name] for name in TOLD},
     }
-
-
-def wait_until_ready(emulator: subprocess.Popen[str]) -> None:
-    """Wait for the emulator's first line."""
-    if emulator.stdout is None or not emulator.stdout.readline().startswith("port "):
-        raise SystemExit("the emulator did not start: try deal-hw emulate go2 --transport dds --port lo")
 
 
 def clean(result: dict[str, Any]) -> bool:

@@ -1,8 +1,8 @@
 """Does memory stay flat over generations? Resident memory of each search, generation by generation.
 
 Each method runs in a process of its own on a short cart-pole recording. A search that ends before the wanted
-number of generations is run again on the same problem with another seed, so that what one run leaves behind shows
-too. The growth is that of a straight line through the second half of the generations: by then libraries are
+number of generations is run again on the same problem with another seed, so that what a run leaves behind
+shows. The growth is that of a straight line through the second half of the generations: by then libraries are
 loaded and buffers have their size.
 
     python tools/measure_memory.py --out docs/measured/memory.json
@@ -114,11 +114,10 @@ def main() -> int:
         done = subprocess.run(words, check=True, capture_output=True, text=True)
         rows.append(json.loads(done.stdout.splitlines()[-1]))
         print({key: value for key, value in rows[-1].items() if key != "rss_mib"}, flush=True)
-    if config.out is not None:
-        settings = {key: getattr(config, key) for key in ("generations", "population", "seconds")}
-        config.out.write_text(
-            json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n", encoding="utf-8"
-        )
+        if config.out is not None:
+            settings = {key: getattr(config, key) for key in ("generations", "population", "seconds")}
+            text = json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n"
+            config.out.write_text(text, encoding="utf-8")
     return 0 if all(row["flat"] for row in rows) else 1
 
 

@@ -86,7 +86,7 @@ def main() -> int:
     unexplained = 0
     for mutant in sorted(name for name, verdict in found.items() if verdict in SURVIVED):
         before, after = change(mutant)
-        known = f"`{after}`" in page
+        known = f"| `{before}` | `{after}` |" in page
         unexplained += not known
         print(f"\n{'argued' if known else 'NEW'}: {mutant} ({found[mutant]})\n  - {before}\n  + {after}")
     for mutant in sorted(name for name, verdict in found.items() if verdict == "timeout"):

@@ -197,7 +197,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float
     solution = _minimise(error, 0.0, space.to_scale(space.center), ends)
     count = len(solution.fun)
     if np.isfinite(space.prior[1]).any():
-        # Residuals have no noise model here: a prior's standard deviation is weighed against their own spread.
+        # Without a noise model a prior's standard deviation is weighed against the residuals' own spread.
         spread = float(np.sqrt(solution.fun @ solution.fun / max(count - len(space), 1)))
         solution = _minimise(error, max(spread, np.finfo(float).tiny), solution.x, ends)
     theta = np.clip(space.from_scale(solution.x), space.low, space.high)
@@ -211,8 +211,8 @@ def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float
     )
 
 
-def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[str, float]) -> Any:
-    """Run scipy's trust region on the one-step error and, times a weight, on what is expected of parameters."""
+def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[str, Any]) -> Any:
+    """Run scipy's trust region on the one-step error and, times a weight, on the parameters' priors."""
     space = error.space
     mean, std = space.prior
     expected = np.isfinite(std) & (weight > 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import functools
 import json
 import os
 import platform
@@ -237,13 +236,12 @@ def _real_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
     )
 
     split = split_name(config.recordings, config.holdout)
-    # Fitted before the first cell that needs it, and once.
-    std = functools.cache(lambda: expected_std(work, config.residual_std, config.threads))
+    std = expected_std(work, config.residual_std, config.threads)
 
     def make(method: str, seed: int) -> Callable[[], dict[str, Any]]:
         polish = method == "default" or config.polish_all
         return lambda: run_cell(
-            work, task, split, method, seed, ratio, polish=polish, std=std(), threads=config.threads,
+            work, task, split, method, seed, ratio, polish=polish, std=std(method), threads=config.threads,
             budget=lambda polish: Budget(
                 population=config.population, generations=config.generations, polish=polish
             ),

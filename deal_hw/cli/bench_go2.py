@@ -15,11 +15,11 @@ from deal_hw.cli.bench import describe_machine, write_rows
 from deal_hw.drivers.go2.protocol import (
     LowCommand,
     LowCommandEncoder,
-    LowState,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
+from deal_hw.drivers.go2.scripted import ScriptedGo2
 
 BATCHES: Final = 200
 BATCH: Final = 200
@@ -63,7 +63,7 @@ def _calls() -> dict[str, Callable[[], object]]:
     rng = np.random.default_rng(0)
     parts = rng.normal(size=(5, 12))
     command = LowCommand(*parts)
-    encoder, state = LowCommandEncoder(), _state(rng)
+    encoder, state = LowCommandEncoder(), ScriptedGo2(pose=rng.normal(size=12)).state()
     command_bytes, state_bytes = encoder.encode(command), encode_low_state(state)
     return {
         "encode LowCmd with CRC": lambda: encoder.encode(command),
@@ -72,18 +72,6 @@ def _calls() -> dict[str, Callable[[], object]]:
         "encode LowState with CRC": lambda: encode_low_state(state),
         "decode LowCmd with CRC": lambda: decode_low_command(command_bytes),
     }
-
-
-def _state(rng: np.random.Generator) -> LowState:
-    return LowState(
-        position=rng.normal(size=12), velocity=rng.normal(size=12), acceleration=rng.normal(size=12),
-        effort=rng.normal(size=12), temperature=np.full(12, 40), lost=np.zeros(12, np.int64),
-        mode=np.ones(12, np.int64), orientation=np.array([1.0, 0.0, 0.0, 0.0]),
-        angular_velocity=rng.normal(size=3), specific_force=np.array([0.0, 0.0, 9.81]), rpy=np.zeros(3),
-        imu_temperature=60, foot_force=np.full(4, 20), foot_force_estimate=np.full(4, 20), tick_ms=123456,
-        remote=bytes(40), battery_percent=80, battery_current_ma=-2000, battery_status=1, battery_cycles=10,
-        cell_voltage_mv=np.full(15, 3900), voltage=29.5, current=2.0,
-    )  # fmt: skip
 
 
 def _row(operation: str, call: Callable[[], object], batches: int) -> dict[str, Any]:

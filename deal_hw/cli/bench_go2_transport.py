@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import select
-import socket
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import tyro
 
-from deal_hw.errors import ConfigurationError, TransportError
+from deal_hw.cli.bench_go2_process import SideProcess
+from deal_hw.cli.emulate_go2 import free_port
+from deal_hw.errors import ConfigurationError
 from deal_hw.transport import WireOptions
 
 _START_S: Final = 30.0
@@ -94,7 +91,7 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
     orders = {
         "parent_pid": os.getpid(),
         "transport": settings.transport,
-        "port": settings.port or _default_port(settings.transport),
+        "port": settings.port or ("lo" if settings.transport == "dds" else free_port("tcp/127.0.0.1:0")),
         "rate_hz": settings.rate,
         "cycles": round(settings.seconds * settings.rate),
     }
@@ -103,10 +100,10 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
     }
     # Zenoh needs one side that waits, and a client cannot; DDS does not care.
     robot_wire, wire = {**wire, "listen": True, "mode": "peer"}, {**wire, "listen": False}
-    with _Side("robot", {**orders, "wire": robot_wire}) as robot:
+    with SideProcess("robot", {**orders, "wire": robot_wire}) as robot:
         robot.expect("ready", _START_S)
         freeze = {"pid": robot.pid, **_freeze_cycles(settings)}
-        with _Side("controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
+        with SideProcess("controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
             controller.expect("ready", _START_S)
             controller.expect("running", _START_S)
             with _progress(f"go2-transport {settings.transport}", settings.seconds, quiet) as update:
@@ -122,91 +119,6 @@ def _freeze_cycles(settings: TransportBench) -> dict[str, int]:
     last = first + max(1, round(settings.freeze_s * settings.rate))
     cycles = round(settings.seconds * settings.rate)
     return {"first": first, "last": last, "settled": min(cycles, last + round(_SETTLE_S * settings.rate))}
-
-
-def _default_port(transport: str) -> str:
-    if transport == "dds":
-        return "lo"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-class _Side:
-    """One of the two processes; it never outlives the block."""
-
-    def __init__(self, name: str, orders: Mapping[str, Any]) -> None:
-        self._name = name
-        # A session of its own: Ctrl-C in the terminal is this process's to handle.
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "deal_hw.cli.bench_go2_sides", name],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            start_new_session=True, bufsize=0,
-        )  # fmt: skip
-        with _pipe(self._process.stdin) as orders_pipe:
-            orders_pipe.write(json.dumps(orders).encode())
-        self._process.stdin = None  # Or communicate() would flush it.
-        self._out = b""
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    def stop(self) -> None:
-        """Ask it to end and tell its result."""
-        self._process.terminate()
-
-    def expect(self, word: str, timeout_s: float) -> None:
-        """Wait for a line."""
-        line = self._line(timeout_s)
-        if line != word:
-            raise self._failed(line)
-
-    def result(self, timeout_s: float, update: Callable[[float], None] | None = None) -> dict[str, Any]:
-        """Wait for the result, telling ``update`` the seconds that have passed."""
-        values: dict[str, Any] = json.loads(self._line(timeout_s, update) or "null") or {"error": "no result"}
-        if "error" in values:
-            raise self._failed(values["error"])
-        return values
-
-    def __enter__(self) -> _Side:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        # SIGKILL ends a stopped process, too.
-        self._process.kill()
-        self._process.communicate()
-
-    def _line(self, timeout_s: float, update: Callable[[float], None] | None = None) -> str:
-        out, begun = _pipe(self._process.stdout), time.monotonic()
-        while b"\n" not in self._out:
-            passed = time.monotonic() - begun
-            if passed > timeout_s:
-                raise TransportError(f"the {self._name}'s process said nothing for {timeout_s:g} s")
-            if update is not None:
-                update(passed)
-            if select.select([out], [], [], 0.2)[0]:
-                part = out.read(65536)
-                if not part:
-                    return ""
-                self._out += part
-        line, _, self._out = self._out.partition(b"\n")
-        return line.decode()
-
-    def _failed(self, said: str) -> TransportError:
-        self._process.kill()
-        _, errors = self._process.communicate()
-        with contextlib.suppress(ValueError, TypeError, KeyError):
-            said = json.loads(said)["error"]
-        return TransportError(f"the {self._name}'s process failed: {said} {errors.decode().strip()[-2000:]}")
-
-
-def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
-    """Return the pipe that was asked for."""
-    if pipe is None:
-        raise TransportError("a process was started without its pipes")
-    return pipe
 
 
 def summary(

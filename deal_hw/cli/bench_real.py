@@ -7,6 +7,7 @@ recordings that are fitted, unless it is given.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,9 @@ from deal_hw.types import FloatArray
 KEY = ("task", "split", "method", "polish", "xi", "seed")
 METHODS = ("nominal", "open-loop", "weki", "mujoco-sysid", "least-squares-multistart")
 """Rows where nothing else is asked for."""
+
+UNTOLD = frozenset({"nominal", "open-loop"})
+"""Methods that need not be told what a prediction may be off."""
 
 
 def prepare(
@@ -63,15 +67,21 @@ def split_name(recordings: Recordings, holdout: Sequence[Path]) -> str:
     return f"last {share:.0%}"
 
 
-def expected_std(work: Work, words: Sequence[str], threads: int | None) -> FloatArray:
-    """Return what a prediction may be off, (2 C,): as it is given, or the residual of a first fit."""
+def expected_std(work: Work, words: Sequence[str], threads: int | None) -> Callable[[str], FloatArray | None]:
+    """Return what tells a method what a prediction may be off, (2 C,): as it is given, or a first fit's."""
     from deal_hw.calib.horizon import expected_residual
     from deal_hw.calib.problem import Problem
 
     given = residual_std(words, work.robot)
-    if given is not None:
-        return given
-    return expected_residual(Problem(work.robot, work.space, work.episodes, threads=threads))
+    # Fitted once, before the first cell that needs it.
+    fitted = functools.cache(
+        lambda: expected_residual(Problem(work.robot, work.space, work.episodes, threads=threads))
+    )
+
+    def std(method: str) -> FloatArray | None:
+        return given if given is not None or method in UNTOLD else fitted()
+
+    return std
 
 
 def run_cell(
@@ -84,7 +94,7 @@ def run_cell(
     *,
     polish: bool,
     budget: Callable[[bool], Budget],
-    std: FloatArray,
+    std: FloatArray | None,
     window_s: float,
     threads: int | None,
 ) -> dict[str, Any]:
@@ -99,7 +109,7 @@ def run_cell(
         xi: Ratio of the search range, for the row.
         polish: Whether the polish follows.
         budget: Makes the budget.
-        std: What a prediction may be off, (2 C,); `open-loop` finds it itself.
+        std: What a prediction may be off, (2 C,); None: the sensor noise, or what the method finds itself.
         window_s: Held-out predictions restart this often [s].
         threads: Simulation threads.
     """
@@ -111,7 +121,9 @@ def run_cell(
         result = calibrate_episodes(
             work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget(polish),
             rng=np.random.default_rng(seed), threads=threads, heldout_window_s=window_s,
-            known_std=None if method == "open-loop" else std,
+            known_std=std,
+            # A model that nobody calibrated has no latency.
+            latency_s=0.0 if method == "nominal" else None,
         )  # fmt: skip
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"

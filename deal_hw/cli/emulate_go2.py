@@ -6,11 +6,14 @@ import gc
 import re
 import socket
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import tyro
+
 from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
+from deal_hw.drivers.go2.faults import FaultPlan, Go2Faults
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.transport import TopicTransport, WireOptions
 
@@ -26,7 +29,7 @@ _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
 
 @dataclass(frozen=True, kw_only=True)
 class Go2Options:
-    """Options of ``emulate go2`` alone; times of faults count from the first stiff command."""
+    """Options of ``emulate go2`` alone."""
 
     suspended: bool = False
     """The base is held in the air: no floor, no contact."""
@@ -49,48 +52,6 @@ class Go2Options:
     tick_start_ms: int = 0
     """The robot's clock at the start [ms]; it wraps at 2**32."""
 
-    reorder: float = 0.0
-    """Share of states that come after their successor."""
-
-    wire_after_s: float | None = None
-    """When the shares --drop, --duplicate, --reorder and --corrupt begin [s]; by default at once."""
-
-    stale_after_s: float | None = None
-    """When the same state begins to be sent again and again [s]."""
-
-    lost_after_s: float | None = None
-    """When a motor gives no torque any more and counts lost commands [s]."""
-
-    lost_joint: str = "FL_calf_joint"
-    """That motor."""
-
-    sport_after_s: float | None = None
-    """When sport mode comes back [s]."""
-
-    battery_after_s: float | None = None
-    """When the battery is nearly empty [s]."""
-
-    nan_after_s: float | None = None
-    """When a joint's position and velocity become NaN [s]."""
-
-    nan_joint: str = "FL_calf_joint"
-    """That joint."""
-
-    hot_after_s: float | None = None
-    """When a motor reports 95 degrees [s]."""
-
-    hot_joint: str = "FL_calf_joint"
-    """That motor."""
-
-    stop_after_s: float | None = None
-    """When the operator presses L2 and B and holds them [s]."""
-
-    push_after_s: float | None = None
-    """When somebody pushes the base to its left [s]."""
-
-    push: float = 25.0
-    """The push's impulse, over 0.1 s [N*s]."""
-
     domain: int = 0
     """DDS domain."""
 
@@ -109,6 +70,9 @@ class Go2Options:
     key: Path | None = None
     """Zenoh over TLS: its private key (PEM)."""
 
+    faults: tyro.conf.OmitArgPrefixes[Go2Faults] = field(default_factory=Go2Faults)
+    """Faults of the Go2, which begin so long after the first stiff command."""
+
     def __post_init__(self) -> None:
         if not 0 <= self.tick_start_ms < 2**32:
             raise ConfigurationError(f"tick_start_ms is a number of 32 bits, got {self.tick_start_ms}")
@@ -122,10 +86,12 @@ class Go2Options:
 
     def given(self) -> list[str]:
         """Return the flags of options that differ from their defaults."""
+        given = vars(self) | asdict(self.faults)
+        default = vars(Go2Options()) | asdict(Go2Faults())
         return [
-            "--" + entry.name.replace("_", "-")
-            for entry in fields(self)
-            if getattr(self, entry.name) != entry.default
+            "--" + name.replace("_", "-")
+            for name, value in given.items()
+            if name != "faults" and value != default[name]
         ]
 
 
@@ -231,15 +197,12 @@ def _truth(config: Emulate) -> Truth:
 
 def _device(config: Emulate, truth: Truth) -> Go2Device:
     from deal_hw.drivers.go2.device import Go2Device
-    from deal_hw.drivers.go2.faults import FaultPlan
     from deal_hw.drivers.go2.remote_script import read_remote_script
 
     own = config.go2
-    names = {entry.name for entry in fields(FaultPlan)}
-    chosen = {entry.name: getattr(own, entry.name) for entry in fields(own) if entry.name in names}
     plan = FaultPlan(
         drop=config.drop, duplicate=config.duplicate, corrupt=config.corrupt,
-        freeze_after_s=config.freeze_after_s, **chosen,
+        freeze_after_s=config.freeze_after_s, **asdict(own.faults),
     )  # fmt: skip
     if own.no_remote and own.remote_script is not None:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")

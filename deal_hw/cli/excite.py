@@ -21,8 +21,8 @@ from deal_hw.control.excitation_plan import (
     make_plan,
 )
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import parameter_spaces, robot_description
-from deal_hw.errors import MissingExtraError, UnknownNameError
+from deal_hw.drivers import parameter_spaces, recorded_description
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 
 if TYPE_CHECKING:
@@ -41,9 +41,9 @@ class Excite:
     out: Path
     """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
 
-    family: Literal["optimal", "multisine", "chirp", "steps"] = "optimal"
+    family: Literal["optimal", "multisine", "chirp", "steps", "sway"] = "optimal"
     """optimal: the most telling of many of the others, by simulation; multisine: a sum of sines with a low
-    peak; chirp: a sweep; steps: random set-points."""
+    peak; chirp: a sweep; steps: random set-points; sway: the body moves over standing feet (go2)."""
 
     seconds: float = 4.0
     """Length of the recording [s]."""
@@ -52,10 +52,10 @@ class Excite:
     """Not for optimal: share of the largest amplitude that the safety limits allow."""
 
     low_hz: float = 0.3
-    """Not for optimal: least frequency of multisine and chirp."""
+    """Not for optimal: least frequency of multisine, chirp and sway."""
 
     high_hz: float = 5.0
-    """Not for optimal: greatest frequency of multisine and chirp."""
+    """Not for optimal: greatest frequency of multisine, chirp and sway."""
 
     effort: float = 1.0
     """Not for optimal: factor on the effort limit that is sent from SPLIT on."""
@@ -124,12 +124,14 @@ def excite(config: Excite) -> ExciteReport:
     Raises:
         DealHwError: A setting is unusable, or no candidate keeps the limits.
     """
-    description = robot_description(config.robot)
+    description = recorded_description(config.robot)
     balance = balancer(description, config.policy)
     optimum = None
     if config.family == "optimal":
         optimum = _search(config, description, balance)
         plan = optimum.plan
+    elif config.family == "sway":
+        plan = _sway(config, description)
     else:
         plan = make_plan(description, _given_design(config, balance is not None))
     plan.write(config.out)
@@ -141,9 +143,26 @@ def excite(config: Excite) -> ExciteReport:
     return ExciteReport(plan=plan, path=config.out, optimum=optimum)
 
 
+def _sway(config: Excite, description: RobotDescription) -> ExcitationPlan:
+    if description.name != "go2":
+        raise ConfigurationError(
+            f"robot {description.name!r} does not sway: that is for go2, which stands on four feet; choose "
+            "another --family"
+        )
+    try:
+        from deal_hw.drivers.go2.motions import sway_plan
+        from deal_hw.sim.model import load_model
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+    return sway_plan(
+        load_model(description), np.random.default_rng(config.seed), config.seconds,
+        (config.low_hz, config.high_hz), config.amplitude,
+    )  # fmt: skip
+
+
 def _given_design(config: Excite, balances: bool) -> ExcitationDesign:
-    if config.family == "optimal":
-        raise RuntimeError("unreachable: an optimal excitation is searched, not given")
+    if config.family in ("optimal", "sway"):
+        raise RuntimeError(f"unreachable: {config.family} has no design")
     whole = config.split <= 0
     return ExcitationDesign(
         family=config.family,

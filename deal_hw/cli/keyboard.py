@@ -22,6 +22,9 @@ HELP = "keys: w s ahead, back; a d left, right; q e turn; space stand still; p o
 def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[None]:
     """Call ``pressed`` for each key, and ``stop`` for those that make the robot passive, from a thread.
 
+    ``stop`` is called once: a key that is held repeats, and a second stop would kill the control process. It
+    is also called where the terminal goes away, for then nobody could stop the robot any more.
+
     Raises:
         ConfigurationError: Standard input is no terminal.
     """
@@ -34,18 +37,20 @@ def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[N
     end_read, end_write = os.pipe()
 
     def read() -> None:
+        stopped = False
         while True:
             ready, _, _ = select.select([fd, end_read], [], [])
             if end_read in ready:
                 return
-            text = os.read(fd, 64).decode("utf-8", "ignore")
+            text = _read(fd)
+            for key in text or STOP_KEYS[:1]:
+                if key not in STOP_KEYS:
+                    pressed(key)
+                elif not stopped:
+                    stopped = True
+                    stop()
             if not text:
                 return
-            for key in text:
-                if key in STOP_KEYS:
-                    stop()
-                else:
-                    pressed(key)
 
     thread = threading.Thread(target=read, name="keys", daemon=True)
     tty.setcbreak(fd)
@@ -58,4 +63,15 @@ def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[N
         thread.join()
         os.close(end_read)
         os.close(end_write)
-        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def _read(fd: int) -> str:
+    """Return the keys at hand; "" where the terminal is gone."""
+    try:
+        data = os.read(fd, 64)
+    except OSError:
+        return ""
+    # A byte that is no text is a key without a meaning.
+    return data.decode("utf-8", "replace")

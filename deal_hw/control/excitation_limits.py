@@ -26,6 +26,9 @@ def room(description: RobotDescription) -> FloatArray:
         ConfigurationError: No joint has any.
     """
     low, high = np.array(description.limits.target).T
+    if description.excitation_range:
+        inner = np.array(description.excitation_range).T
+        low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
     around = centre(description)
     found = np.maximum(np.minimum(around - low, high - around), 0.0)
     # While a joint does not follow at all, the set-point may be off by the offset.

@@ -33,6 +33,8 @@ RUNNING = "running"
 
 _MOST_WIRE_BYTES = 48_000
 """Raw bytes in one record: a datagram holds no more beside the rest; a cycle of a Go2 has 13 000."""
+_MOST_STATE_BYTES = 72_000
+"""The same of states: 0.2 s of a Go2's. What a longer stall brings would cost the record that says so."""
 
 
 class OperatorStop(BaseException):
@@ -172,9 +174,7 @@ class ControlLoop:
             self._blind += 1
             flags |= CycleFlag.NO_STATE
         # A policy must not see numbers that are not: its memory would carry them on.
-        if state is not None and bool(
-            np.isfinite(state.position).all() and np.isfinite(state.velocity).all()
-        ):
+        if state is not None and _is_finite(state):
             with self._cadence.section("behaviour"):
                 wanted = self._behaviour.command(state, index * self._cadence.period_ns * 1e-9)
         computed_ns = self._clock.now_ns()
@@ -246,7 +246,7 @@ class ControlLoop:
             cycle=index,
             deadline_ns=deadline_ns,
             start_ns=start_ns,
-            states=tuple(self._pending),
+            states=_newest_states(self._pending),
             action=self._behaviour.action,
             asked=asked,
             sent=sent,
@@ -342,3 +342,20 @@ def _newest(wire: Sequence[Message]) -> tuple[Message, ...]:
         if left < 0:
             return tuple(wire[len(wire) - count :])
     return tuple(wire)
+
+
+def _newest_states(states: Sequence[RobotState]) -> tuple[RobotState, ...]:
+    """Return what fits a record; what does not is the oldest, and shows as a gap in the states' numbers."""
+    if not states:
+        return ()
+    newest = states[-1]
+    numbers = 6 + 3 * newest.position.size
+    if newest.body is not None:
+        numbers += 18 + newest.body.foot_force.size + 2 * newest.body.temperature.size
+    return tuple(states[-(_MOST_STATE_BYTES // (8 * numbers)) :])
+
+
+def _is_finite(state: RobotState) -> bool:
+    """Say whether all that a behaviour computes with is a number."""
+    body = () if state.body is None else (state.body.orientation, state.body.angular_velocity)
+    return all(bool(np.isfinite(part).all()) for part in (state.position, state.velocity, *body))

@@ -88,12 +88,13 @@ class RemoteVelocity:
 class KeyboardVelocity:
     """Keys held on the operator's terminal; a key that is let go of counts for :data:`KEY_LIFE_S`.
 
-    The terminal belongs to another process, which passes keys on: :meth:`press`.
+    The terminal belongs to another process, which passes keys on: :meth:`press`. What was pressed before
+    anybody asked for a velocity, as while the robot stood up, does not count.
     """
 
     _wish: tuple[float, float, float] = (0.0, 0.0, 0.0)
     _since_s: float = -math.inf
-    _now_s: float = 0.0
+    _now_s: float = -math.inf
 
     def press(self, key: str) -> None:
         """A key was pressed, or repeats because it is held; keys without a meaning are ignored."""

@@ -31,6 +31,9 @@ GENTLEST, LIVELIEST = -3.0, 3.0
 LOWEST_EFFORT = 0.1
 """Effort limits sent below this share are halved where a demonstration becomes livelier."""
 
+HELD_FACTOR = 8.0
+"""Factor on effort limits that are sent low, from more than one step up on."""
+
 FINEST = 0.5
 """Between a step that hardly moves and one that trips there may be a half step that does neither."""
 
@@ -71,7 +74,7 @@ def with_vigor(config: RichConfig, vigor: float, description: RobotDescription) 
     """Return the profile, livelier or gentler by some steps, inside the safety limits.
 
     A step up: set-points half again as far and held half again as long, gains stiffer and less damped, higher
-    limits (not those sent low to be felt), half the balancing. A step down: nearer set-points, softer and
+    limits (those sent low to be felt apart), half the balancing. A step down: nearer set-points, softer and
     more damped gains, lower limits.
 
     Args:
@@ -107,9 +110,6 @@ def _whole(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
 
 def _scaled(part: Segment, vigor: float, description: RobotDescription) -> Segment:
     limits, up, down = description.limits, max(vigor, 0.0), max(-vigor, 0.0)
-    # A limit is sent low to be felt: raising it would hide it again, and a robot that creeps asks for little.
-    effort_up = up if part.effort_limit >= 1 else 0.0
-    lower = 0.5 if up and part.effort_limit < LOWEST_EFFORT else 1.0
 
     def within(factor: float, now: float, default: tuple[float, ...], most: tuple[float, ...]) -> float:
         return min(now * factor, max(largest_factor(default, most), now))
@@ -119,10 +119,24 @@ def _scaled(part: Segment, vigor: float, description: RobotDescription) -> Segme
         stiffness=within(1.6**up * 0.8**down, part.stiffness, description.stiffness, limits.stiffness),
         damping=within(0.5**up * 1.5**down, part.damping, description.damping, limits.damping),
         effort_limit=within(
-            lower * 2.0**effort_up * 0.7**down, part.effort_limit, description.effort_limit, limits.effort
+            _effort_factor(part.effort_limit, up, down),
+            part.effort_limit,
+            description.effort_limit,
+            limits.effort,
         ),
         speed_limit=within(1.5**up * 0.5**down, part.speed_limit, description.speed_limit, limits.speed),
     )
+
+
+def _effort_factor(sent: float, up: float, down: float) -> float:
+    """Return the factor on an effort limit that is sent at this share of the description's."""
+    if down:
+        return 0.7**down
+    if sent >= 1 or not up:
+        return float(2.0**up)
+    # A limit is sent low to be felt. What creeps asks for little effort, and the lowest is halved. What the
+    # first step does not move is held by friction, which low efforts do not overcome.
+    return (0.5 if sent < LOWEST_EFFORT else 1.0) * (HELD_FACTOR if up > 1 else 1.0)
 
 
 @dataclass(frozen=True, slots=True)

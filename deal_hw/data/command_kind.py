@@ -1,8 +1,8 @@
 """Are recorded commands what the model's actuators take: positions for servos, efforts for motors?
 
-The two look alike in a file. Positions are followed: the joint goes where its command says. Efforts are not, but
-they explain how the joint accelerates. A check that finds the one where the model has the other refuses, since every
-parameter would be fitted to nonsense.
+The two look alike in a file. Positions are followed: the joint goes where its command says. Efforts are not,
+but they explain how the joint accelerates. A check that finds the one where the model has the other refuses,
+since every parameter would be fitted to nonsense.
 """
 
 from __future__ import annotations
@@ -72,14 +72,15 @@ def _accusation(names: Sequence[str], *, servo: bool) -> str:
     if servo:
         return (
             f"commands that look like efforts ({said}): no joint goes where they say, but they explain its "
-            "acceleration, and the model's actuators take positions. If they are torques (N·m) or forces (N), put "
-            "<motor> in the place of <position> in a copy of the MJCF; if not, name the column of commanded "
-            "positions as `target`"
+            "acceleration, and the model's actuators take positions. If they are torques (N·m) or forces "
+            "(N), put <motor> in the place of <position> in a copy of the MJCF; if not, name the column of "
+            "commanded positions as `target`"
         )
     return (
-        f"commands that look like positions ({said}): the joints go where they say, and the model has motors, which "
-        "would take them as torques. Put <position joint=... kp=... kv=...> in the place of <motor> in a copy of the "
-        "MJCF, with the gains of the drives; or name the column of torques as `target`"
+        f"commands that look like positions ({said}): the joints go where they say, and the model has "
+        "motors, which would take them as torques. Put <position joint=... kp=... kv=...> in the place "
+        "of <motor> in a copy of the MJCF, with the gains of the drives; or name the column of torques "
+        "as `target`"
     )
 
 
@@ -98,7 +99,7 @@ def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> Verdict | N
     if not named:
         return None
     other = "torques for a position actuator" if servo else "positions for a motor"
-    text = f"commands outside the actuators' ctrlrange: {', '.join(named)}; {other}, another unit, or a wrong range?"
+    text = f"commands outside the actuators' ctrlrange: {', '.join(named)}; {other}, or another unit?"
     severe = float(np.max(share)) > BEYOND[1]
     return Verdict("actuation", Severity.FAIL if severe else Severity.WARN, text)
 
@@ -140,7 +141,7 @@ def _is_effort(position: FloatArray, command: FloatArray, period_s: float) -> bo
 
 
 def _following(position: FloatArray, command: FloatArray, period_s: float) -> tuple[float, float, bool]:
-    """Return how a position follows its command at the best lag: correlation, slope, and whether it is near it."""
+    """Return how a position follows its command at the best lag: correlation, slope, whether it is near."""
     found = (0, 0.0)
     for lag in range(min(round(LAG_S / period_s), len(position) // 4) + 1):
         c = float(np.corrcoef(position[lag:], command[: len(command) - lag])[0, 1])

@@ -4,14 +4,15 @@ A clock that jumps, a writer that loses rows of one file, or a column that is sh
 recording whose commands and measurements belong together at a delay that changes once and for good, or for a
 while. No model explains both parts, so every parameter pays for it.
 
-How a joint follows depends on what it is asked: a slow motion hardly lags, a fast one does. So lags of parts are
-not compared. One linear predictor a joint (all positions and speeds now, and the joint's own commands around now)
-is fitted to the whole recording, and fitted again with the commands of a part shifted in time. A slip is a shift
-that makes the error of that one predictor clearly smaller, and that most joints agree on.
+How a joint follows depends on what it is asked: a slow motion hardly lags, a fast one does. So lags of parts
+are not compared. One linear predictor a joint (all positions and speeds now, and its own commands around now)
+is fitted to the whole recording, and fitted again with the commands of a part shifted in time. A slip is a
+shift that makes the error of that one predictor clearly smaller, and that most joints agree on.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -41,7 +42,7 @@ CLEAR: Final = 0.5
 reach 0.4 for shifts of 10 ms (a noise-free cart-pole) and 0.06 to 0.22 for longer ones (real arms, the latter
 where one presses on a table); slips of 20 to 60 ms under brisk motion 0.5 to 7; slow motion shows none."""
 GLARING: Final = 1.5
-"""From here on most of what a fit leaves unexplained is the slip: such a recording is refused, not warned of."""
+"""From here on most of what a fit leaves unexplained is the slip: such a recording is refused."""
 AGREE: Final = 0.75
 """Share of the joints that must want about the same shift."""
 GAP_PERIODS: Final = 3.0
@@ -84,8 +85,9 @@ def slip_verdict(
         "slip",
         Severity.FAIL if found.clear >= GLARING else Severity.WARN,
         f"from {found.begin_s:.3g} s to {found.end_s:.3g} s measurements follow commands about "
-        f"{1e3 * abs(found.later_s):.0f} ms {side} than in the rest ({found.agree:.0%} of the joints agree): the "
-        "clocks slipped, rows were lost, or a column is shifted; leave one of the two parts out (--leave-out)",
+        f"{1e3 * abs(found.later_s):.0f} ms {side} than in the rest ({found.agree:.0%} of the joints agree): "
+        "the clocks slipped, rows were lost, or a column is shifted; leave one of the two parts out "
+        "(--leave-out)",
     )
 
 
@@ -215,7 +217,7 @@ def _gains(
         ends = rows[:, None] + grid.taps - shift
         taps = (grid.sums[ends + grid.tap, column] - grid.sums[ends, column]) / grid.tap - now[:, None]
         table = np.concatenate([grid.common, taps, change[:, None]], axis=1)
-        pieces = [table[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        pieces = [table[a:b] for a, b in itertools.pairwise(edges)]
         moments.append(np.stack([piece.T @ piece for piece in pieces]))
     found = np.stack(moments)  # Shift, part, and the products of all columns.
     unshifted = found[len(grid.shifts) // 2]
@@ -230,7 +232,7 @@ def _gains(
 
 
 def _left(moments: FloatArray) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the squared error that the best predictor leaves, (L,), from products of its columns, (L, d, d)."""
+    """Return the squared error that the best predictor leaves, (L,), from its moments, (L, d, d)."""
     d = moments.shape[-1] - 1
     a, b = moments[:, :d, :d], moments[:, :d, d]
     ridge = 1e-6 * np.trace(a, axis1=1, axis2=2) / d

@@ -51,7 +51,9 @@ def joint_facts(mjcf: Path) -> JointFacts:
         model = mujoco.MjModel.from_xml_path(str(mjcf))
     except ValueError as error:
         raise ConfigurationError(f"model {mjcf} does not compile: {error}") from error
-    names, units, limits, left_out, index_of = [], [], [], [], {}
+    names: list[str] = []
+    units, limits, left_out = [], [], []
+    index_of: dict[int, int] = {}
     for index in range(model.njnt):
         joint = model.joint(index)
         kind = mujoco.mjtJoint(int(joint.type[0]))

@@ -100,7 +100,7 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
 
 def _body(trajectory: Trajectory) -> Any:
     legs = [
-        _plot("/", f"{leg}: measured positions [rad]", [f"/joints/{joint}/position/**" for joint in joints])
+        _plot("/", f"{leg}: joint positions [rad]", [f"/joints/{joint}/position/**" for joint in joints])
         for leg, joints in _legs(trajectory.joint_names).items()
     ]
     plots = [

@@ -235,15 +235,20 @@ def log_scene(
         position = _at_samples(overlay, prediction.position, trajectory.position)
         at = None
         if base is not None and prediction.base is not None:
-            at = _at_samples(overlay, _beside(prediction.base, base[overlay.sample[:, 0]]), base)
+            at = _at_samples(overlay, _beside(prediction.base, base[overlay.sample]), base)
         poses = body_poses(robot, position, at)
         log_robot(log, scene, name, color, poses, clocks, ghost=True)
 
 
-def _beside(predicted: FloatArray, start: FloatArray) -> FloatArray:
-    """Shift predicted base poses, (W, H + 1, 7), so that each window starts where the real one is drawn."""
+def _beside(predicted: FloatArray, real: FloatArray) -> FloatArray:
+    """Return predicted base poses, (W, H + 1, 7), beside the real ones as they are drawn, (W, H + 1, 7).
+
+    Each window starts at the real height. Nobody measures how far the real robot moves along the floor, and
+    it is drawn in one place: so is its ghost, or every step ahead would look like an error.
+    """
     moved = predicted.copy()
-    moved[..., :3] += (start[:, :3] - predicted[:, 0, :3])[:, None]
+    moved[..., :2] = real[..., :2]
+    moved[..., 2] += (real[:, 0, 2] - predicted[:, 0, 2])[:, None]
     return moved
 
 

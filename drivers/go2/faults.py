@@ -16,59 +16,77 @@ MOMENTS: Final = ("wire", "freeze", "stale", "lost", "sport", "battery", "nan", 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FaultPlan:
-    """Faults and when each begins, counted from the user's first stiff command [s]; None: never.
+class Go2Faults:
+    """Faults of an emulated Go2; times count from the first stiff command."""
 
-    Attributes:
-        drop: Share of states that are lost, 0 to 1.
-        duplicate: Share that comes twice.
-        reorder: Share that comes after its successor.
-        corrupt: Share in which one byte is changed.
-        wire_after_s: When those four begin; they are there from the start by default.
-        freeze_after_s: The robot says nothing any more; it still hears.
-        stale_after_s: The same state is sent again and again.
-        lost_after_s: A motor gives no torque and counts lost commands.
-        lost_joint: Which.
-        sport_after_s: Sport mode comes back and stands the robot up.
-        battery_after_s: The battery is nearly empty.
-        nan_after_s: A joint's position and velocity become NaN.
-        nan_joint: Which.
-        hot_after_s: A motor reports 95 °C.
-        hot_joint: Which.
-        stop_after_s: L2 and B are pressed on the remote, and held.
-        push_after_s: Somebody pushes the base sideways for 0.1 s.
-        push: The push's impulse, to the left [N·s].
-    """
-
-    drop: float = 0.0
-    duplicate: float = 0.0
     reorder: float = 0.0
-    corrupt: float = 0.0
+    """Share of states that come after their successor."""
+
     wire_after_s: float | None = None
-    freeze_after_s: float | None = None
+    """When the shares --drop, --duplicate, --reorder and --corrupt begin [s]; by default at once."""
+
     stale_after_s: float | None = None
+    """When the same state begins to be sent again and again [s]."""
+
     lost_after_s: float | None = None
+    """When a motor gives no torque any more and counts lost commands [s]."""
+
     lost_joint: str = "FL_calf_joint"
+    """That motor."""
+
     sport_after_s: float | None = None
+    """When sport mode comes back and stands the robot up [s]."""
+
     battery_after_s: float | None = None
+    """When the battery is nearly empty [s]."""
+
     nan_after_s: float | None = None
+    """When a joint's position and velocity become NaN [s]."""
+
     nan_joint: str = "FL_calf_joint"
+    """That joint."""
+
     hot_after_s: float | None = None
+    """When a motor reports 95 degrees [s]."""
+
     hot_joint: str = "FL_calf_joint"
+    """That motor."""
+
     stop_after_s: float | None = None
+    """When the operator presses L2 and B and holds them [s]."""
+
     push_after_s: float | None = None
+    """When somebody pushes the base to its left [s]."""
+
     push: float = 25.0
+    """The push's impulse, over 0.1 s [N*s]."""
 
     def __post_init__(self) -> None:
-        for name in SHARES:
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ConfigurationError(f"{name} is a share from 0 to 1, got {getattr(self, name)}")
         for entry in fields(self):
             value = getattr(self, entry.name)
+            if entry.name in SHARES and not 0.0 <= value <= 1.0:
+                raise ConfigurationError(f"{entry.name} is a share from 0 to 1, got {value}")
             if entry.name.endswith("_after_s") and value is not None and not value >= 0.0:
                 raise ConfigurationError(f"{entry.name} must be 0 or more seconds, got {value}")
             if entry.name.endswith("_joint") and value not in JOINTS:
                 raise UnknownNameError("Go2 joint", value, JOINTS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultPlan(Go2Faults):
+    """All of an emulated Go2's faults: those that every emulated robot has, and its own."""
+
+    drop: float = 0.0
+    """Share of states that are lost."""
+
+    duplicate: float = 0.0
+    """Share of states that come twice."""
+
+    corrupt: float = 0.0
+    """Share of states in which one byte is changed."""
+
+    freeze_after_s: float | None = None
+    """When the robot says nothing any more; it still hears [s]."""
 
     def due(self) -> list[tuple[int, str]]:
         """Return when faults begin, in ms since the first stiff command, and which; earliest first."""

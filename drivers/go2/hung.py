@@ -7,14 +7,25 @@ The stand must hold the base still: the model's base does not move. The 200 Hz r
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Final
 
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2 import suspended
 from deal_hw.drivers.go2.description import DESCRIPTION as FLOOR
+from deal_hw.drivers.go2.description import STANDING_RAD, per_joint
 from deal_hw.drivers.go2.driven import DRIVEN, driven_limits, hung_legs
 
 DRIVE_HZ: Final = 1000.0
+REACH_RAD: Final[Mapping[str, float]] = {"hip": 0.3, "thigh": 0.4, "calf": 0.5}
+"""Excitations keep so near the standing pose; the legs then stay 3 cm apart whatever the others do."""
+
+
+def _reach() -> tuple[tuple[float, float], ...]:
+    """Return where excitations may take each joint [rad]."""
+    pose, reach = per_joint(STANDING_RAD), per_joint(REACH_RAD)
+    return tuple((middle - way, middle + way) for middle, way in zip(pose, reach, strict=True))
+
 
 DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
     DRIVEN,
@@ -25,11 +36,13 @@ DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
     limits=driven_limits(FLOOR.limits, hung_legs()),
     mjcf=suspended.DESCRIPTION.mjcf,
     floating_base=None,
+    excitation_range=_reach(),
     sources={
         **DRIVEN.sources,
         "stiffness": suspended.DESCRIPTION.sources["stiffness"],
         "damping": suspended.DESCRIPTION.sources["damping"],
         "device_rate_hz": "1 kHz as the emulator's drives; the rate of the robot's own is not published",
+        "excitation_range": "corners and draws inside it: least distance of two legs' shapes in go2.xml 3 cm",
         "legs.tilt": "no limit: the base is held",
         "legs.free_fall": "no limit: the base is held",
     },

@@ -6,6 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from deal_hw.control.excitation_limits import fit_to_limits
+from deal_hw.control.excitation_plan import ExcitationPlan
+from deal_hw.control.waveforms import Steps
 from deal_hw.drivers.go2.description import DESCRIPTION
 from deal_hw.sim.kinematics import standing_targets
 from deal_hw.sim.model import RobotModel
@@ -48,3 +51,37 @@ def sway(
         return np.asarray(targets[min(round(at_s * rate), len(targets) - 1)])
 
     return behaviour
+
+
+def sway_plan(
+    robot: RobotModel,
+    rng: np.random.Generator,
+    seconds: float,
+    band_hz: tuple[float, float] = BAND_HZ,
+    amplitude: float = 1.0,
+) -> ExcitationPlan:
+    """Return the same as a table of targets, which the robot's computer plays without a simulator.
+
+    Args:
+        robot: The Go2's model, with the description that the plan is for.
+        rng: Draws frequencies and phases.
+        seconds: Length [s].
+        band_hz: Lowest and highest frequency [Hz].
+        amplitude: Share of the largest sway that keeps the limits.
+
+    Raises:
+        ConfigurationError: A foot cannot stay where it is.
+    """
+    description = robot.description
+    pose, nobody = np.array(description.default_position), np.zeros(len(description.joint_names))
+    behaviour = sway(robot, rng, seconds, band_hz)
+    times = np.arange(round(seconds * description.control_rate_hz)) / description.control_rate_hz
+    offsets = np.stack([behaviour(nobody, nobody, t) for t in times]) - pose
+    # One factor for all joints: with one for each the feet would slip.
+    offsets *= amplitude * float(np.min(fit_to_limits(description, offsets, smooth=True)))
+    rows = tuple(tuple(map(float, row)) for row in offsets)
+    return ExcitationPlan(
+        robot=description.name, digest=description.digest(), seconds=seconds, balance_s=0.0,
+        ease_s=min(EASE_S, 0.25 * seconds), wave=Steps(begin_s=tuple(map(float, times)), value=rows),
+        words=f"{seconds:g} s of swaying over standing feet, {band_hz[0]:.2g} to {band_hz[1]:.2g} Hz",
+    )  # fmt: skip

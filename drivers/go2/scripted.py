@@ -24,9 +24,9 @@ from deal_hw.drivers.go2.protocol import (
     encode_low_state,
 )
 from deal_hw.drivers.go2.remote import Remote, encode_remote
+from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.go2.rpc import Request, Response, decode_request, encode_response
 from deal_hw.drivers.transports.virtual_topics import TopicCore, VirtualTopics
-from deal_hw.transport import Message
 from deal_hw.types import FloatArray
 
 RESTING: Final = np.array(DRIVEN.rest_position)
@@ -190,6 +190,39 @@ class ScriptedTopics(VirtualTopics):
             for arrived in self.tamper(topic, payload):
                 self._arrive(topic, arrived, tick_ns)
 
-    def _arrive(self, topic: str, payload: bytes, stamp_ns: int) -> None:
-        if topic in self._subscribe:
-            self._queue.append(Message(topic, payload, stamp_ns))
+
+class ScriptedBench:
+    """A scripted robot, its driver, and the topics between them.
+
+    Attributes:
+        clock: The clock that everybody shares.
+        device: The robot.
+        topics: The wire.
+        robot: The driver, not connected.
+
+    Args:
+        kind: The driver.
+        settings: Arguments of :class:`ScriptedGo2`.
+    """
+
+    def __init__(self, kind: type[Go2Robot] = Go2Robot, **settings: Any) -> None:
+        self.clock = VirtualClock(5_000_000_000)
+        self.device = ScriptedGo2(**settings)
+        self.topics = ScriptedTopics(self.device, self.clock)
+        self.robot = kind(self.topics, self.clock)
+
+    def armed(self) -> Go2Robot:
+        """Return the driver, connected, homed and armed."""
+        self.robot.connect()
+        self.robot.home(10.0)
+        self.robot.arm(1.0)
+        return self.robot
+
+    def spoil_once(self, change: Callable[[bytes], Iterable[bytes]]) -> None:
+        """Let the next state arrive changed."""
+        pending = [True]
+
+        def tamper(topic: str, payload: bytes) -> Iterable[bytes]:
+            return change(payload) if topic == topics.LOW_STATE and pending and pending.pop() else (payload,)
+
+        self.topics.tamper = tamper

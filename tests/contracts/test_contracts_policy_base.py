@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +18,7 @@ from deal_hw.policy import (
     PolicySpec,
     base_features,
     in_base_frame,
+    rotation_vector,
 )
 
 J = len(DESCRIPTION.joint_names)
@@ -48,6 +49,35 @@ def test_vectors_turn_as_scipy_turns_them(values: list[float]) -> None:
     turn, vector = np.array(values[:3]), np.array(values[3:])
     wanted = Rotation.from_rotvec(turn).inv().apply(vector)
     np.testing.assert_allclose(in_base_frame(turn, vector), wanted, atol=1e-9)
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), st.floats(0.999, 1.001))
+def test_rotation_vectors_are_scipys(values: list[float], size: float) -> None:
+    """Any orientation, both signs, half a turn included; a unit quaternion as a wire rounds it."""
+    quaternion = np.array(values)
+    norm = np.linalg.norm(quaternion)
+    assume(norm > 1e-3)
+    quaternion /= norm
+    got = rotation_vector(size * quaternion)
+    wanted = Rotation.from_quat(quaternion, scalar_first=True).as_rotvec()
+    # At half a turn both directions are right: what they do to vectors is compared, too.
+    assert np.linalg.norm(got) <= np.pi + 1e-9
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(got).as_matrix(), Rotation.from_rotvec(wanted).as_matrix(), atol=1e-9
+    )
+    if np.linalg.norm(wanted) < 3.1:
+        np.testing.assert_allclose(got, wanted, atol=1e-9)
+
+
+def test_rotation_vectors_by_hand() -> None:
+    """None, a quarter turn left, and a turn so small that its sine is lost in the cosine's rounding."""
+    half = np.sqrt(0.5)
+    np.testing.assert_array_equal(rotation_vector(np.array([1.0, 0, 0, 0])), np.zeros(3))
+    np.testing.assert_array_equal(rotation_vector(np.array([-1.0, 0, 0, 0])), np.zeros(3))
+    np.testing.assert_allclose(rotation_vector(np.array([half, 0, 0, half])), [0, 0, np.pi / 2])
+    np.testing.assert_allclose(rotation_vector(np.array([-half, 0, 0, -half])), [0, 0, np.pi / 2])
+    np.testing.assert_allclose(rotation_vector(np.array([1.0, 1e-12, 0, 0])), [2e-12, 0, 0])
+    assert np.isnan(rotation_vector(np.full(4, np.nan))).all()
 
 
 def test_features_by_hand() -> None:

@@ -11,25 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.control.safety_filter import SafetyFilter, is_finite, keep_effort
-from deal_hw.description import LegLimits
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.go2.driven import LEG_LIMITS
 from deal_hw.types import FloatArray, JointCommand
 
-LEGS = LegLimits(
-    effort=(10.0,),
-    tilt=0.8,
-    tumble=6.0,
-    free_fall=3.0,
-    free_fall_s=0.1,
-    flail_velocity=(4.0, 5.0),
-    flail_s=0.06,
-    temperature=80.0,
-    lost_rate=50.0,
-    battery=0.3,
-    battery_low=0.15,
-    voltage=26.0,
-    command_age_s=0.1,
-)
+LEGS = dataclasses.replace(LEG_LIMITS, effort=(10.0,), flail_velocity=(4.0, 5.0))
 LEGGED = dataclasses.replace(DESCRIPTION, limits=dataclasses.replace(DESCRIPTION.limits, legs=LEGS))
 
 

@@ -21,40 +21,22 @@ T0 = 50_000_000_000
 """Host time at arming; the device's clock runs 7 s behind."""
 BEHIND = 7_000_000_000
 LEGS = LegLimits(
-    effort=(10.0,),
-    tilt=0.8,
-    tumble=6.0,
-    free_fall=3.0,
-    free_fall_s=0.1,
-    flail_velocity=(4.0, 5.0),
-    flail_s=0.06,
-    temperature=80.0,
-    lost_rate=50.0,
-    battery=0.3,
-    battery_low=0.15,
-    voltage=26.0,
-    command_age_s=0.1,
-    arm_voltage=27.0,
-)
+    effort=(10.0,), tilt=0.8, tumble=6.0, free_fall=3.0, free_fall_s=0.1, flail_velocity=(4.0, 5.0),
+    flail_s=0.06, temperature=80.0, lost_rate=50.0, battery=0.3, battery_low=0.15, voltage=26.0,
+    command_age_s=0.1, arm_voltage=27.0,
+)  # fmt: skip
 
 
 def robot(legs: LegLimits | None = LEGS) -> RobotDescription:
     """Return a leg of two joints; only the second is actuated, so that a wrong index shows."""
     limits = dataclasses.replace(
-        DESCRIPTION.limits,
-        legs=legs,
-        trip_position=((-9.0, 9.0), (-9.0, 9.0)),
-        trip_velocity=(60.0, 60.0),
+        DESCRIPTION.limits, legs=legs, trip_position=((-9.0, 9.0), (-9.0, 9.0)), trip_velocity=(60.0, 60.0),
         state_age_s=0.06,
-    )
+    )  # fmt: skip
     return dataclasses.replace(
-        DESCRIPTION,
-        name="leg",
-        joint_names=("hip", "knee"),
-        actuated=("knee",),
-        position_units=("rad", "rad"),
-        limits=limits,
-    )
+        DESCRIPTION, name="leg", joint_names=("hip", "knee"), actuated=("knee",),
+        position_units=("rad", "rad"), limits=limits,
+    )  # fmt: skip
 
 
 def leaning(angle: float, turn: float = 0.0) -> FloatArray:

@@ -54,9 +54,11 @@ def test_a_step_up_by_hand() -> None:
     low = up.segments[0]
     # 2.5 times 80 N/m is what may be sent at most, and so are 3 m/s.
     assert (low.stiffness, low.damping, low.effort_limit, low.speed_limit) == (2.5, 0.25, 0.15, 3.0)
-    # What creeps asks for little effort: the lowest limit is halved, once.
+    # What creeps asks for little effort: the lowest limit is halved.
     assert up.segments[1].effort_limit == 0.025
-    assert with_vigor(RichConfig(), 2, DESCRIPTION).segments[1].effort_limit == 0.025
+    # What still does not move is held by friction: 8 times 0.15 and 8 times half of 0.05.
+    held = with_vigor(RichConfig(), 2, DESCRIPTION).segments
+    assert [part.effort_limit for part in held] == pytest.approx([1.2, 0.2, 2.0])
 
 
 def test_steps_down_are_slower_and_nearer() -> None:

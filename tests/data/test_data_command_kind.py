@@ -22,8 +22,9 @@ def table(position: FloatArray, command: FloatArray) -> Table:
     names = tuple(f"joint{i}" for i in range(position.shape[1]))
     time = np.arange(len(position)) * 0.02
     return Table(
-        joint_names=names, actuated=names, units=("rad",) * len(names), time_s=time, position=position, velocity=None,
-        effort=None, command_s=time, target=command, orientation=None, gyro=None, source={"file": "r", "part": ""},
+        joint_names=names, actuated=names, units=("rad",) * len(names), time_s=time, position=position,
+        velocity=None, effort=None, command_s=time, target=command, orientation=None, gyro=None,
+        source={"file": "r", "part": ""},
     )  # fmt: skip
 
 
@@ -36,7 +37,7 @@ def wish(seconds: float, seed: int) -> FloatArray:
 
 
 def play(command: FloatArray, *, servo: bool, seed: int) -> FloatArray:
-    """Simulate two joints of 0.02 kg·m² with damping and a weight, late by 10 ms; return positions at 50 Hz."""
+    """Simulate two joints of 0.02 kg·m², damped, with a weight, 10 ms late; return positions at 50 Hz."""
     x, v, seen = np.zeros(2), np.zeros(2), np.empty_like(command)
     sent = np.repeat(command, 10, axis=0)
     for k in range(len(sent)):

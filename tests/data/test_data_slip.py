@@ -18,7 +18,7 @@ REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 
 
 def arm(seconds: float = 20.0, noise: float = 5e-4, seed: int = 0) -> Recording:
-    """Return two second-order servos at 50 Hz that follow 8 sines each, 30 ms late: stamps, positions, commands."""
+    """Return stamps, positions and commands of two servos at 50 Hz that follow 8 sines each, 30 ms late."""
     rng = np.random.default_rng(seed)
     step = 0.002
     time = np.arange(0.0, seconds, step)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
+from random import SystemRandom
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,8 @@ from deal_hw.drivers.go2.rpc import Request, Response, decode_response, encode_r
 from deal_hw.drivers.go2.sport_controller import LYING, STANDING
 from deal_hw.drivers.go2.truth import nominal_truth
 from deal_hw.types import FloatArray
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def servo(position: FloatArray, stiffness: float = 60.0, damping: float = 5.0) -> LowCommand:
@@ -87,3 +92,20 @@ def make_go2() -> Callable[..., Go2Bench]:
     """Return what makes an emulated Go2 in virtual time with a client, from the device's options."""
     pytest.importorskip("mujoco", reason="pip install 'deal-hw[sim]'")
     return Go2Bench
+
+
+@pytest.fixture(scope="session")
+def dds_peer() -> Path:
+    """The C program on Cyclone DDS 0.10.2; packages are only installed by `make dds-peer`."""
+    built = subprocess.run(
+        [ROOT / "tools/build_dds_peer.sh", "--no-install"], capture_output=True, text=True, check=False
+    )
+    if built.returncode != 0:
+        pytest.skip(f"make dds-peer, or: {built.stderr.strip().splitlines()[-1]}")
+    return ROOT / "build/dds_peer/go2_peer"
+
+
+@pytest.fixture
+def dds_domain() -> int:
+    """A domain that other runs on this machine hardly use at the same time."""
+    return SystemRandom().randrange(10, 100)

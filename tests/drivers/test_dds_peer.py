@@ -8,7 +8,6 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from random import SystemRandom
 from typing import Any
 
 import numpy as np
@@ -18,52 +17,18 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2.protocol import (
     LowCommand,
     LowCommandEncoder,
-    LowState,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
+from deal_hw.drivers.go2.scripted import ScriptedGo2
 from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
 from deal_hw.transport import Message, WireOptions
 
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
-ROOT = Path(__file__).resolve().parents[2]
 MESSAGES = 300
-
-
-@pytest.fixture(scope="module")
-def peer() -> Path:
-    """The C program; it is built here, but packages are only installed by `make dds-peer`."""
-    built = subprocess.run(
-        [ROOT / "tools/build_dds_peer.sh", "--no-install"], capture_output=True, text=True, check=False
-    )
-    if built.returncode != 0:
-        pytest.skip(f"make dds-peer, or: {built.stderr.strip().splitlines()[-1]}")
-    return ROOT / "build/dds_peer/go2_peer"
-
-
-@pytest.fixture
-def domain() -> int:
-    """A domain that other runs on this machine hardly use at the same time."""
-    return SystemRandom().randrange(10, 100)
-
-
-def state_bytes(tick_ms: int) -> bytes:
-    """Return a state of a robot at rest."""
-    still, none = np.zeros(12), np.zeros(12, np.int64)
-    return encode_low_state(
-        LowState(
-            position=still, velocity=still, acceleration=still, effort=still,
-            temperature=none, lost=none, mode=none + 1,
-            orientation=np.array([1.0, 0.0, 0.0, 0.0]), angular_velocity=np.zeros(3),
-            specific_force=np.array([0.0, 0.0, 9.81]), rpy=np.zeros(3), imu_temperature=40,
-            foot_force=none[:4], foot_force_estimate=none[:4], tick_ms=tick_ms, remote=bytes(40),
-            battery_percent=80, battery_current_ma=-2000, battery_status=0, battery_cycles=1,
-            cell_voltage_mv=np.full(15, 3700), voltage=29.6, current=2.0,
-        )
-    )  # fmt: skip
 
 
 class Running:
@@ -93,21 +58,21 @@ def running(peer: Path, *arguments: object) -> Iterator[Running]:
             told.report = json.loads(said)
 
 
-def test_idlc_0102_gives_our_type_hashes(peer: Path) -> None:
+def test_idlc_0102_gives_our_type_hashes(dds_peer: Path) -> None:
     """Types written in IDL and hashed by the robot's version of Cyclone are those we declare in Python."""
-    told = subprocess.run([peer, "hashes"], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run([dds_peer, "hashes"], capture_output=True, text=True, check=True).stdout
     assert [line.split() for line in told.splitlines()] == [
         [name, MINIMAL[name], COMPLETE[name]] for name in MINIMAL
     ]
 
 
-def test_a_0102_robot_and_we_exchange_commands_and_states(peer: Path, domain: int) -> None:
+def test_a_0102_robot_and_we_exchange_commands_and_states(dds_peer: Path, dds_domain: int) -> None:
     """It takes our commands with a right CRC, and its states decode; it sees no warning and ends well."""
-    wire = DdsTransport("lo", MonotonicClock(), WireOptions(domain=domain))
+    wire = DdsTransport("lo", MonotonicClock(), WireOptions(domain=dds_domain))
     wire.declare(publish=[LOW_COMMAND], subscribe=[LOW_STATE])
     encoder, values = LowCommandEncoder(), np.linspace(-1.0, 1.0, 12)
     ticks = []
-    with wire, running(peer, "robot", domain, 60) as robot:
+    with wire, running(dds_peer, "robot", dds_domain, 60) as robot:
         while len(ticks) < MESSAGES:
             state = decode_low_state(wire.receive(10.0).payload)
             ticks.append(state.tick_ms)
@@ -130,17 +95,18 @@ def test_a_0102_robot_and_we_exchange_commands_and_states(peer: Path, domain: in
     assert survey.complaints == ()
 
 
-def test_a_0102_user_and_we_as_robot_exchange_commands_and_states(peer: Path, domain: int) -> None:
+def test_a_0102_user_and_we_as_robot_exchange_commands_and_states(dds_peer: Path, dds_domain: int) -> None:
     """The other way round, as our emulator serves a client of the vendor's SDK."""
-    wire = DdsTransport("127.0.0.1", MonotonicClock(), WireOptions(domain=domain))
+    wire = DdsTransport("127.0.0.1", MonotonicClock(), WireOptions(domain=dds_domain))
     wire.declare(publish=[LOW_STATE], subscribe=[LOW_COMMAND])
-    received = 0
-    with wire, running(peer, "user", domain, 60) as user:
+    scripted, received = ScriptedGo2(), 0
+    with wire, running(dds_peer, "user", dds_domain, 60) as user:
         while received < MESSAGES:
             command = decode_low_command(wire.receive(10.0).payload)
             assert command.stiffness.max() == 0.0
             received += 1
-            wire.send(Message(LOW_STATE, state_bytes(2 * received), 0))
+            scripted.tick_ms = 2 * received
+            wire.send(Message(LOW_STATE, encode_low_state(scripted.state()), 0))
     assert user.returncode == 0
     assert user.warnings == ""
     assert user.report["received"] > MESSAGES // 10

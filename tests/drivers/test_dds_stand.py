@@ -3,61 +3,29 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from random import SystemRandom
 
 import pytest
 
+from deal_hw.cli.emulator_process import EmulatorProcess
+
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 pytest.importorskip("mujoco", reason="pip install 'deal-hw[sim]'")
-ROOT = Path(__file__).resolve().parents[2]
-DOMAIN = SystemRandom().randrange(10, 100)
-
-
-@pytest.fixture
-def peer() -> Path:
-    """The C program; packages are only installed by `make dds-peer`."""
-    built = subprocess.run(
-        [ROOT / "tools/build_dds_peer.sh", "--no-install"], capture_output=True, text=True, check=False
-    )
-    if built.returncode != 0:
-        pytest.skip(f"make dds-peer, or: {built.stderr.strip().splitlines()[-1]}")
-    return ROOT / "build/dds_peer/go2_peer"
-
-
-@pytest.fixture
-def _emulated_go2() -> Iterator[None]:
-    """An emulated Go2 on loopback."""
-    process = subprocess.Popen(
-        [
-            sys.executable, "-m", "deal_hw", "emulate", "go2", "--transport", "dds", "--port", "lo",
-            "--domain", str(DOMAIN), "--profile", "realistic", "--duration-s", "100",
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("port ")
-        yield
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 0
-    finally:
-        process.kill()
-        process.communicate()
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_emulated_go2")
-def test_a_0102_program_releases_sport_mode_stands_the_robot_up_and_lays_it_down(peer: Path) -> None:
+def test_a_0102_program_releases_sport_mode_stands_the_robot_up_and_lays_it_down(
+    dds_peer: Path, dds_domain: int
+) -> None:
     """The SDK's low-level example: CheckMode and ReleaseMode by RPC, then targets at 500 Hz, kp 60, kd 5."""
-    ran = subprocess.run(
-        [peer, "stand", str(DOMAIN), "4"], capture_output=True, text=True, check=False, timeout=90
-    )
+    options = ("--transport", "dds", "--port", "lo", "--domain", str(dds_domain), "--duration-s", "100")
+    with EmulatorProcess("go2", *options) as emulator:
+        ran = subprocess.run(
+            [dds_peer, "stand", str(dds_domain), "4"], capture_output=True, text=True, check=False, timeout=90
+        )
+        _, summary = emulator.stop(30.0)
+    assert "sport mode: released" in summary
     assert (ran.returncode, ran.stderr) == (0, "")
     told = json.loads(ran.stdout)
     phases = {phase["phase"]: phase for phase in told["phases"]}

@@ -18,6 +18,7 @@ from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.device import Go2Device
 from deal_hw.drivers.go2.emulator import Go2Emulator
+from deal_hw.drivers.go2.faults import Go2Faults
 from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, decode_low_state
 from deal_hw.drivers.go2.rpc import Request, decode_response, encode_request
 from deal_hw.drivers.go2.sport_controller import STANDING
@@ -181,7 +182,7 @@ def test_wrong_options_are_refused_before_anything_opens() -> None:
     with pytest.raises(UnknownNameError, match="robot to emulate 'spot'; known: cartpole, go2"):
         Emulate(robot="spot")
     with pytest.raises(ConfigurationError, match="emulate cartpole has no --suspended, --push, --port"):
-        Emulate(go2=Go2Options(suspended=True, push=5.0), port="lo")
+        Emulate(go2=Go2Options(suspended=True, faults=Go2Faults(push=5.0)), port="lo")
     with pytest.raises(ConfigurationError, match="emulate go2 has no --link, --vanish-after-s"):
         Emulate(robot="go2", link=Path("x"), vanish_after_s=1.0)
     with pytest.raises(ConfigurationError, match="tick_start_ms is a number of 32 bits, got -1"):

@@ -164,24 +164,15 @@ class SportModeShort(IdlStruct):
     foot_speed_body: array[float32, 12]
 
 
-@dataclass
-class SportModeLong(IdlStruct):
-    stamp: TimeSpec
-    error_code: uint32
-    imu_state: ImuState
-    mode: uint8
-    progress: float32
-    gait_type: uint8
-    foot_raise_height: float32
-    position: array[float32, 3]
-    body_height: float32
-    velocity: array[float32, 3]
-    yaw_speed: float32
-    range_obstacle: array[float32, 4]
-    foot_force: array[int16, 4]
-    foot_position_body: array[float32, 12]
-    foot_speed_body: array[float32, 12]
-    path_point: array[PathPoint, 10]
+# pycdr2 knows no inheritance.
+SportModeLong = dataclasses.make_dataclass(
+    "SportModeLong",
+    [
+        *((part.name, part.type) for part in dataclasses.fields(SportModeShort)),
+        ("path_point", array[PathPoint, 10]),
+    ],
+    bases=(IdlStruct,),
+)
 
 
 @dataclass

@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from deal_hw.clock import VirtualClock
 from deal_hw.control.passive import make_passive
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.driven import DRIVEN
 from deal_hw.drivers.go2.protocol import decode_low_command, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import RESTING, STIFF, ScriptedGo2, ScriptedTopics
+from deal_hw.drivers.go2.scripted import RESTING, STIFF, ScriptedBench, ScriptedGo2
 from deal_hw.errors import (
     FrameError,
     SafetyError,
@@ -30,32 +29,6 @@ from deal_hw.types import RobotState, Status
 MS = 1_000_000
 
 
-class Wire:
-    """A scripted robot, the driver, and the topics between them."""
-
-    def __init__(self, kind: type[Go2Robot] = Go2Robot, **settings: object) -> None:
-        self.clock = VirtualClock(5_000_000_000)
-        self.device = ScriptedGo2(**settings)  # type: ignore[arg-type]
-        self.topics = ScriptedTopics(self.device, self.clock)
-        self.robot = kind(self.topics, self.clock)
-
-    def armed(self) -> Go2Robot:
-        """Return the driver, connected, homed and armed."""
-        self.robot.connect()
-        self.robot.home(10.0)
-        self.robot.arm(1.0)
-        return self.robot
-
-    def spoil_once(self, change: Callable[[bytes], Iterable[bytes]]) -> None:
-        """Let the next state arrive changed."""
-        pending = [True]
-
-        def tamper(topic: str, payload: bytes) -> Iterable[bytes]:
-            return change(payload) if topic == topics.LOW_STATE and pending and pending.pop() else (payload,)
-
-        self.topics.tamper = tamper
-
-
 def flip(payload: bytes) -> list[bytes]:
     """Change a byte of a joint's position."""
     return [payload[:90] + bytes([payload[90] ^ 0x55]) + payload[91:]]
@@ -63,7 +36,7 @@ def flip(payload: bytes) -> list[bytes]:
 
 def scripted(change: Callable[[bytes], Iterable[bytes]]) -> Go2Robot:
     """Return a driver in front of a robot all of whose states are changed."""
-    wire = Wire()
+    wire = ScriptedBench()
     wire.topics.tamper = lambda topic, payload: change(payload) if topic == topics.LOW_STATE else (payload,)
     return wire.robot
 
@@ -71,7 +44,7 @@ def scripted(change: Callable[[bytes], Iterable[bytes]]) -> Go2Robot:
 class TestGo2Robot(RobotSuite):
     @pytest.fixture
     def bench(self) -> RobotBench:
-        wire, silent = Wire(), Wire()
+        wire, silent = ScriptedBench(), ScriptedBench()
         silent.device.talks = False
         return RobotBench(
             robot=wire.robot,
@@ -89,7 +62,7 @@ class TestGo2Robot(RobotSuite):
 
 def test_connecting_sends_nothing_and_learns_of_battery_and_firmware() -> None:
     """Whoever only looks, changes nothing."""
-    wire = Wire()
+    wire = ScriptedBench()
     wire.robot.connect()
     assert wire.robot.info is not None
     assert (wire.robot.info.battery, wire.robot.info.voltage) == (0.77, 30.5)
@@ -112,7 +85,7 @@ def test_a_c_struct_is_named_as_such() -> None:
 
 def test_silence_comes_with_advice() -> None:
     """Cable, interface, firewall, bridge; and who discovery sees."""
-    wire = Wire()
+    wire = ScriptedBench()
     wire.device.talks = False
     wire.topics.others = {topics.LOW_STATE: ("Cyclone DDS 01ab",)}
     with pytest.raises(TransportTimeoutError, match=r"Cyclone DDS 01ab.*192\.168\.123.*firewall.*bridge"):
@@ -121,7 +94,7 @@ def test_silence_comes_with_advice() -> None:
 
 def test_a_standing_clock_is_no_robot() -> None:
     """States whose tick never moves are no sign of life."""
-    wire = Wire()
+    wire = ScriptedBench()
     wire.device.tick_step = 0
     with pytest.raises(TransportTimeoutError, match="stands still at 1000 ms"):
         wire.robot.connect()
@@ -129,7 +102,7 @@ def test_a_standing_clock_is_no_robot() -> None:
 
 def test_two_robots_on_one_network_are_refused() -> None:
     """Half of what comes is old news of the other; who they are is told where discovery knows."""
-    wire = Wire()
+    wire = ScriptedBench()
     wire.topics.others = {topics.LOW_STATE: ("robot one", "robot two")}
     other = ScriptedGo2()
     other.tick_ms = 600
@@ -147,7 +120,7 @@ def test_two_robots_on_one_network_are_refused() -> None:
 
 def test_a_failed_connect_closes_the_transport() -> None:
     """Another attempt starts afresh."""
-    wire = Wire()
+    wire = ScriptedBench()
     wire.device.talks = False
     with pytest.raises(TransportTimeoutError):
         wire.robot.connect()
@@ -160,7 +133,7 @@ def test_a_failed_connect_closes_the_transport() -> None:
 
 def test_nothing_works_before_connecting() -> None:
     """Each says what is missing."""
-    robot = Wire().robot
+    robot = ScriptedBench().robot
     for call in (lambda: robot.home(1.0), lambda: robot.arm(1.0)):
         with pytest.raises(SafetyError, match="connect"):
             call()
@@ -189,7 +162,7 @@ def drained(robot: Go2Robot, count: int) -> list[RobotState]:
 )
 def test_broken_states_are_counted(change: Callable[[bytes], list[bytes]], errors: int) -> None:
     """A corrupt state counts twice, itself and its gap; none reaches the caller, time goes on growing."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     wire.robot.read_state(0.1)
     wire.spoil_once(change)
@@ -202,7 +175,7 @@ def test_broken_states_are_counted(change: Callable[[bytes], list[bytes]], error
 
 def test_an_overtaken_state_is_dropped() -> None:
     """Two states that come in the wrong order: the older one is late, and old news."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     kept: list[bytes] = []
 
@@ -221,7 +194,7 @@ def test_an_overtaken_state_is_dropped() -> None:
 
 def test_a_clock_that_stops_ends_in_a_timeout_that_says_so() -> None:
     """The robot repeats its last state: none of that is fresh."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     wire.robot.read_state(0.1)
     wire.device.tick_step = 0
@@ -233,7 +206,7 @@ def test_a_clock_that_stops_ends_in_a_timeout_that_says_so() -> None:
 
 def test_the_clock_may_wrap() -> None:
     """After 49.7 days, 32 bits of milliseconds begin at 0 again."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.device.tick_ms = 2**32 - 20
     wire.robot.connect()
     states = drained(wire.robot, 20)
@@ -243,7 +216,7 @@ def test_the_clock_may_wrap() -> None:
 
 def test_a_robot_that_was_restarted_is_lost() -> None:
     """Its clock begins again, and so does sport mode: nobody may go on as if nothing were."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     wire.device.tick_ms = 0
     with pytest.raises(TransportLostError, match="restarted"):
@@ -253,7 +226,7 @@ def test_a_robot_that_was_restarted_is_lost() -> None:
 
 def test_a_state_with_nan_passes() -> None:
     """It is sound as a message; what to do about it is the safety module's decision."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     wire.device.pose[4] = np.nan
     assert np.isnan(drained(wire.robot, 2)[-1].position[4])
@@ -264,7 +237,7 @@ def test_a_state_with_nan_passes() -> None:
 
 def test_checksums_can_be_left_alone() -> None:
     """For a robot whose firmware makes others."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = Go2Robot(wire.topics, wire.clock, check_crc=False)
     wire.topics.tamper = lambda topic, payload: [payload[:-1] + b"\x55"]
     robot.connect()
@@ -276,7 +249,7 @@ def test_checksums_can_be_left_alone() -> None:
 
 def test_arming_damps_and_says_so() -> None:
     """The first thing that the motors hear is damping at the measured pose."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     _, command = wire.device.heard[0]
     assert not command.stiffness.any() and (command.damping == 5.0).all() and (command.mode == 1).all()
@@ -287,7 +260,7 @@ def test_arming_damps_and_says_so() -> None:
 
 def test_a_silent_robot_is_not_armed() -> None:
     """States must follow the first command."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     wire.robot.home(5.0)
     wire.device.talks = False
@@ -297,7 +270,7 @@ def test_a_silent_robot_is_not_armed() -> None:
 
 def test_nothing_is_sent_before_arming() -> None:
     """Neither commands nor repeats."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     wire.robot.repeat()
     with pytest.raises(SafetyError, match="arm"):
@@ -308,7 +281,7 @@ def test_nothing_is_sent_before_arming() -> None:
 
 def test_a_command_reaches_the_motors_as_it_was() -> None:
     """All five parts, in model order, each with its own numbers; limits are the description's."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     wish = dataclasses.replace(
         default_command(robot), position_target=np.arange(12) / 7, velocity_target=np.arange(12) / 11,
@@ -330,7 +303,7 @@ def test_a_command_reaches_the_motors_as_it_was() -> None:
 
 def test_repeats_are_the_same_bytes_and_no_new_command() -> None:
     """500 times a second the drives hear what they heard before; number and age go by the first."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot, target=0.5))
     drained(robot, 5)
@@ -348,7 +321,7 @@ def test_repeats_are_the_same_bytes_and_no_new_command() -> None:
 
 def test_a_state_names_the_command_before_it() -> None:
     """Not one that went out when the state was already under way, as it is on a slow link."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     first = robot.read_state(0.1)
     wire.clock.advance_ns(7 * MS)
@@ -363,7 +336,7 @@ def test_a_state_names_the_command_before_it() -> None:
 
 def test_absurd_numbers_are_not_sent() -> None:
     """Finite is not enough: 1e30 rad is nobody's wish."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     with pytest.raises(SafetyError, match="finite"):
         robot.send_command(default_command(robot, target=1e30))
@@ -375,7 +348,7 @@ def test_absurd_numbers_are_not_sent() -> None:
 
 def test_passive_is_damping_sent_three_times() -> None:
     """The robot holds it for ever, and messages get lost."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot))
     robot.passive()
@@ -389,7 +362,7 @@ def test_passive_is_damping_sent_three_times() -> None:
 
 def test_passive_is_confirmed_by_efforts_not_by_hope() -> None:
     """A robot that pushes on after 10 ms is still armed; one whose drives brake is not."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot))
     drained(robot, 5)
@@ -409,7 +382,7 @@ def test_passive_is_confirmed_by_efforts_not_by_hope() -> None:
 
 def test_make_passive_reports_what_the_robot_shows() -> None:
     """True where the efforts fall, false where they stay."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot))
     drained(robot, 5)
@@ -423,7 +396,7 @@ def test_make_passive_reports_what_the_robot_shows() -> None:
 
 def test_another_process_can_make_it_passive() -> None:
     """The supervisor's own driver, connected long ago, whose queue was left alone, damps within a tick."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     wire.robot.connect()
     wire.topics.say(topics.LOW_COMMAND, STIFF, 0.5)
     wire.clock.advance_ns(1_000_000_000)
@@ -434,7 +407,7 @@ def test_another_process_can_make_it_passive() -> None:
 
 def test_the_hung_robot_is_another_description() -> None:
     """Same wire; no floor, no tilt limit, the gains of the suspended recording."""
-    wire = Wire(Go2HungRobot, mode="")
+    wire = ScriptedBench(Go2HungRobot, mode="")
     robot = wire.armed()
     assert robot.description.name == "go2_hung"
     assert robot.description.floating_base is None
@@ -444,7 +417,7 @@ def test_the_hung_robot_is_another_description() -> None:
 
 def test_recorded_bytes_can_be_decoded_again() -> None:
     """Raw messages of both directions, as they were on the wire."""
-    wire = Wire(mode="")
+    wire = ScriptedBench(mode="")
     robot = wire.armed()
     robot.take_wire()
     robot.send_command(default_command(robot, target=0.25))

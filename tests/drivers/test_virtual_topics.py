@@ -89,15 +89,21 @@ def test_a_closed_or_cut_wire_is_lost(wire: VirtualTopics) -> None:
         wire.open()
 
 
-def test_the_driver_stands_the_emulated_robot_up() -> None:
-    """Connect, release, arm, ease to the default pose, hold, damp: over the robot's own messages."""
+def armed(profile: str) -> tuple[Go2Device, Go2Robot]:
+    """Return an emulated robot, and its driver: connected, homed and armed."""
     clock = VirtualClock(10**9)
-    device = Go2Device(draw_truth("realistic", 2))
+    device = Go2Device(draw_truth(profile, 2))
     robot = Go2Robot(VirtualTopics(device, clock), clock)
     robot.connect()
     robot.home(15.0)
-    assert device.sport_name == ""
     robot.arm(1.0)
+    return device, robot
+
+
+def test_the_driver_stands_the_emulated_robot_up() -> None:
+    """Connect, release, arm, ease to the default pose, hold, damp: over the robot's own messages."""
+    device, robot = armed("realistic")
+    assert device.sport_name == ""
     state = robot.read_state(0.1)
     first, goal = state.position, np.array(robot.description.default_position)
     command = default_command(robot)
@@ -117,12 +123,7 @@ def test_the_driver_stands_the_emulated_robot_up() -> None:
 
 def test_the_driver_notices_that_sport_mode_returns() -> None:
     """Its commands on rt/lowcmd are somebody else's: a fault."""
-    clock = VirtualClock(10**9)
-    device = Go2Device(draw_truth("ideal", 2))
-    robot = Go2Robot(VirtualTopics(device, clock), clock)
-    robot.connect()
-    robot.home(15.0)
-    robot.arm(1.0)
+    device, robot = armed("ideal")
     assert robot.fault == ""
     device.begin_fault("sport")
     for _ in range(5):

@@ -23,16 +23,22 @@ BASE_MODULES = (
     "deal_hw.cli.collect",
     "deal_hw.cli.data",
     "deal_hw.cli.deploy",
+    "deal_hw.cli.doctor",
     "deal_hw.cli.replay",
     "deal_hw.drivers",
     "deal_hw.drivers.cartpole.description",
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
+    "deal_hw.drivers.go2.checkup",
+    "deal_hw.drivers.go2.driven",
+    "deal_hw.drivers.go2.hung",
+    "deal_hw.drivers.go2.robot",
 )
 EXTRAS = (
     "torch", "mujoco", "scipy", "rerun", "gymnasium", "stable_baselines3", "onnx", "onnxscript", "matplotlib",
-    "psutil", "pytest", "hypothesis",
+    "psutil", "pytest", "hypothesis", "cyclonedds", "zenoh",
 )  # fmt: skip
+"""Zenoh comes with the base install, but only a robot that is reached over it needs it loaded."""
 
 IMPORT_BASE = """
 import importlib, json, sys

@@ -104,8 +104,9 @@ def check_space(model: Any, space: ParameterSpace) -> None:
 def _check_searchable(p: Parameter) -> None:
     if p.kind == SENSOR_NOISE and not p.known:
         raise ConfigurationError(
-            f"parameter {p.name!r}: noise of a sensor changes no prediction, so no search can find it; leave it "
-            f"out (it is estimated from the recording) or give the value you measured, `known: {p.nominal:g}`"
+            f"parameter {p.name!r}: noise of a sensor changes no prediction, so no search can find it; "
+            "leave it out (it is estimated from the recording) or give the value you measured, "
+            f"`known: {p.nominal:g}`"
         )
 
 

@@ -1,0 +1,90 @@
+"""What virtual wires share: a device and a clock that stay together."""
+
+from __future__ import annotations
+
+import abc
+from collections import deque
+from typing import Generic, Protocol, TypeVar
+
+from deal_hw.clock import VirtualClock
+from deal_hw.errors import TransportLostError, TransportTimeoutError
+from deal_hw.transport import Message, Transport
+
+
+class TickingCore(Protocol):
+    """A device whose time passes in ticks."""
+
+    @property
+    def device_ns(self) -> int:
+        """Device time at which the next tick runs [ns]."""
+        ...
+
+
+CoreT = TypeVar("CoreT", bound=TickingCore)
+
+
+class VirtualWire(Transport, Generic[CoreT]):
+    """Couples a device core to a virtual clock.
+
+    The device lives on while nobody looks: whatever moves the clock, the next call lets the device catch up.
+    Waiting in :meth:`receive` moves the clock, one device tick after the other, until a message comes out or
+    the time has passed. Messages carry the time at which the device sent them.
+
+    Args:
+        device: The device; its time 0 is the clock's time now.
+        clock: The clock that everybody shares.
+        queue_size: Messages kept for a host that does not read; the oldest go first, as in a full buffer.
+    """
+
+    def __init__(self, device: CoreT, clock: VirtualClock, queue_size: int = 4096) -> None:
+        self.device = device
+        self._clock = clock
+        self._origin_ns = clock.now_ns() - device.device_ns
+        self._queue: deque[Message] = deque(maxlen=queue_size)
+        self._is_open = self._unplugged = False
+
+    def open(self) -> None:
+        """Open the wire and forget what the device had sent before."""
+        if self._unplugged:
+            raise TransportLostError("virtual wire: the device was unplugged")
+        if not self._is_open:
+            self._catch_up()
+            self._queue.clear()
+            self._is_open = True
+
+    def close(self) -> None:
+        """Close the wire; the device lives on."""
+        self._is_open = False
+
+    def unplug(self) -> None:
+        """Pull the cable: every later call fails as if the device had vanished."""
+        self._unplugged = True
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the oldest message, moving the clock up to ``timeout_s`` if there is none yet."""
+        self._check()
+        self._catch_up()
+        deadline_ns = self._clock.now_ns() + max(0, round(timeout_s * 1e9))
+        while not self._queue:
+            tick_ns = self._origin_ns + self.device.device_ns
+            if tick_ns > deadline_ns:
+                self._clock.sleep_until_ns(deadline_ns)
+                raise TransportTimeoutError(f"virtual wire: nothing arrived within {timeout_s:g} s")
+            self._clock.sleep_until_ns(tick_ns)
+            self._run_tick(tick_ns)
+        return self._queue.popleft()
+
+    def _catch_up(self) -> None:
+        now_ns = self._clock.now_ns()
+        while (tick_ns := self._origin_ns + self.device.device_ns) <= now_ns:
+            self._run_tick(tick_ns)
+
+    @abc.abstractmethod
+    def _run_tick(self, tick_ns: int) -> None:
+        """Run one tick of the device and queue what it sends, stamped with that time [ns]."""
+
+    def _check(self) -> None:
+        if self._unplugged:
+            raise TransportLostError("virtual wire: the device vanished")
+        if not self._is_open:
+            raise TransportLostError("virtual wire: not open")

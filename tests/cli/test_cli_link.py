@@ -1,0 +1,49 @@
+"""Options of collect, deploy and replay that depend on the robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
+from deal_hw.cli.run_plan import RunPlan
+from deal_hw.control.posture import PostureConfig
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.transport import WireOptions
+
+
+@pytest.mark.parametrize(
+    ("robot", "transport", "stand"),
+    [("cartpole", "serial", False), ("go2", "dds", True), ("go2_hung", "dds", False)],
+)
+def test_defaults_follow_from_the_robot(robot: str, transport: str, stand: bool) -> None:
+    """A robot on legs stands up first, unless it hangs in the air; each is reached its usual way."""
+    plan = RunPlan(**plan_options(robot, LinkOptions(), LegOptions()))
+    assert (plan.robot, plan.transport, plan.stand) == (robot, transport, stand)
+    assert plan == RunPlan(robot=robot, transport=transport, stand=stand)
+
+
+def test_what_is_given_wins() -> None:
+    """Every option reaches the plan."""
+    wire = WireOptions(domain=7, listen=True, insecure=True, ca=Path("ca.pem"))
+    posture = PostureConfig(fold_s=1.0)
+    plan = RunPlan(
+        **plan_options(
+            "go2",
+            LinkOptions(transport="zenoh", record_wire=False, wire=wire),
+            LegOptions(stand=False, velocity="remote", hand_back=True, posture=posture, stop_buttons="R2+A"),
+        )
+    )
+    assert plan == RunPlan(
+        robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=False, velocity="remote",
+        hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A"},
+    )  # fmt: skip
+
+
+def test_a_robot_without_a_driver_is_refused() -> None:
+    """It has a description only; one that nobody knows is unknown."""
+    with pytest.raises(ConfigurationError, match="has no driver"):
+        plan_options("so101", LinkOptions(), LegOptions())
+    with pytest.raises(UnknownNameError, match="go3"):
+        plan_options("go3", LinkOptions(), LegOptions())

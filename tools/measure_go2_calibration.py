@@ -1,0 +1,213 @@
+#!/usr/bin/env python3
+"""Calibration of the emulated suspended Go2 over its wire, against a truth that is revealed afterwards.
+
+For each seed an emulator, `deal-hw collect` (a multisine to fit, a motion of another family to judge by) and
+`deal-hw calibrate` run as processes of their own, over a real wire. The emulator writes its truth when it
+ends; it is read after the calibration has written its result.
+
+    python tools/measure_go2_calibration.py --transport zenoh --seeds 1000-1004 --out FILE.json
+
+What each parameter is compared with: stiffness with what the drive makes of the kp that is sent; damping with
+what it makes of the kd that is sent plus the joint's viscous friction; the others with themselves. The
+latency that a recording shows is the emulator's own plus the way over the wire there and back, rounded up to
+the drives' next millisecond.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.cli.bench import describe_machine
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.drivers.go2.hung import DESCRIPTION
+from deal_hw.drivers.go2.truth import Truth
+
+PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
+PATIENCE_S = 1800.0
+GAINS = ("stiffness", "damping")
+
+
+def main() -> int:
+    """Measure each seed and write the rows."""
+    options = _options()
+    result: dict[str, Any] = {
+        "argv": sys.argv[1:],
+        "machine": describe_machine(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "rows": [],
+    }
+    for seed in options.seeds:
+        row = measure(options, seed)
+        result["rows"].append(row)
+        print(json.dumps({k: v for k, v in row.items() if k != "parameters"}), flush=True)
+        result["summary"] = summary(result["rows"])
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(result["summary"], indent=1))
+    return 0 if all("error" not in row for row in result["rows"]) else 1
+
+
+def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
+    """Return the row of one seed; what failed is kept in it."""
+    row: dict[str, Any] = {"seed": seed, "profile": options.profile, "transport": options.transport}
+    with tempfile.TemporaryDirectory(dir=options.keep) as folder:
+        run = Path(folder)
+        try:
+            began = time.monotonic()
+            row["collect"] = record(options, seed, run)
+            row["collect_s"] = round(time.monotonic() - began, 1)
+            # The first episode is fitted, the second only judges.
+            verb("calibrate", str(run / "dataset"), "--holdout", "1", "--no-report", "--no-advise",
+                 "--out", str(run), *options.calibrate.split())  # fmt: skip
+            result = json.loads((run / "calibration" / "result.json").read_text(encoding="utf-8"))
+            truth = Truth.from_json(json.loads((run / "truth.json").read_text(encoding="utf-8")))
+            row |= judge(result, truth)
+        except RuntimeError as error:
+            row["error"] = str(error)
+    return row
+
+
+def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
+    """Record both episodes from a new emulator; return what `collect` said of them."""
+    wire = (
+        "--transport",
+        options.transport,
+        *(("--domain", str(options.domain)) * (options.transport == "dds")),
+    )
+    said = []
+    with EmulatorProcess(
+        "go2", *wire, "--port", PORTS[options.transport], "--suspended", "--profile", options.profile,
+        "--seed", str(seed), "--reveal-to", str(run / "truth.json"),
+    ) as emulator:  # fmt: skip
+        for excite, seconds in (("multisine", options.seconds), (options.heldout, options.heldout_seconds)):
+            plan = excite
+            if excite not in ("multisine", "chirp"):
+                plan = str(run / "heldout.json")
+                verb("excite", DESCRIPTION.name, "--family", excite, "--seconds", str(seconds),
+                     "--seed", str(seed), "--out", plan)  # fmt: skip
+            words = ("--excite", plan, "--seconds", str(seconds), "--seed", str(seed), "--out", str(run))
+            said.append(verb("collect", DESCRIPTION.name, *wire, "--port", emulator.port, *words))
+    return said
+
+
+def verb(*words: str) -> str:
+    """Run a verb of deal-hw as a process of its own; return what it printed.
+
+    Raises:
+        RuntimeError: It failed; the text holds what it said.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "deal_hw", *words],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    if done.returncode:
+        said = (done.stdout + done.stderr).strip()[-2000:]
+        raise RuntimeError(f"{' '.join(words)}: {done.returncode}: {said}")
+    return done.stdout.strip()
+
+
+def judge(result: dict[str, Any], truth: Truth) -> dict[str, Any]:
+    """Return how far a calibration's result is from the truth."""
+    true = truth.parameters(DESCRIPTION.stiffness[0], DESCRIPTION.damping[0])
+    rows: dict[str, dict[str, Any]] = {}
+    for name, found in result["parameters"].items():
+        rows[name] = {
+            "true": true[name],
+            **{key: found[key] for key in ("nominal", "estimate", "low", "high", "verdict")},
+            "inside": found["low"] <= true[name] <= found["high"],
+        }
+    kinds = list(dict.fromkeys(name.partition(".")[2] for name in rows))
+    rmse = result["provenance"]["heldout_rmse"]["mean"]
+    return {
+        "heldout_rmse_nominal": rmse["nominal"],
+        "heldout_rmse_calibrated": rmse["calibrated"],
+        "heldout_ratio": rmse["calibrated"] / rmse["nominal"],
+        "gains_inside": share(rows, GAINS),
+        "inside": {kind: share(rows, (kind,)) for kind in kinds},
+        "median_error": {kind: error(rows, kind, "estimate") for kind in kinds},
+        "median_error_nominal": {kind: error(rows, kind, "nominal") for kind in kinds},
+        "latency_true_ms": truth.latency_ms,
+        "latency_found_ms": 1e3 * result["latency_s"],
+        "latency_interval_ms": [1e3 * v for v in result["latency_interval_s"]],
+        "chi2": result["chi2"],
+        "alarms": result["alarms"],
+        "method": result["method"],
+        "calibrate_s": result["seconds"],
+        "parameters": rows,
+    }
+
+
+def share(rows: dict[str, dict[str, Any]], kinds: Sequence[str]) -> float:
+    """Return the share of parameters of these kinds whose truth lies in its 90 % interval."""
+    return float(np.mean([row["inside"] for name, row in rows.items() if name.partition(".")[2] in kinds]))
+
+
+def error(rows: dict[str, dict[str, Any]], kind: str, which: str) -> float:
+    """Return the median distance from the truth: a ratio, for encoder biases rad."""
+    chosen = [row for name, row in rows.items() if name.partition(".")[2] == kind]
+    if kind == "encoder_bias":
+        return float(np.median([abs(row[which] - row["true"]) for row in chosen]))
+    return float(np.median([abs(row[which] / row["true"] - 1.0) for row in chosen]))
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what all seeds say together."""
+    good = [row for row in rows if "error" not in row]
+    if not good:
+        return {"seeds": len(rows), "failed": len(rows)}
+    kinds = list(dict.fromkeys(kind for row in good for kind in row["inside"]))
+    late = [row["latency_found_ms"] - row["latency_true_ms"] for row in good]
+    return {
+        "seeds": len(rows),
+        "failed": len(rows) - len(good),
+        "heldout_ratio_median": float(np.median([row["heldout_ratio"] for row in good])),
+        "heldout_ratio_worst": max(row["heldout_ratio"] for row in good),
+        "gains_inside": float(np.mean([row["gains_inside"] for row in good])),
+        "inside": {kind: float(np.mean([row["inside"].get(kind, np.nan) for row in good])) for kind in kinds},
+        "median_error": {
+            kind: float(np.median([row["median_error"].get(kind, np.nan) for row in good])) for kind in kinds
+        },
+        "latency_beyond_emulator_ms": [min(late), max(late)],
+        "calibrate_s_median": float(np.median([row["calibrate_s"] for row in good])),
+        "flagged": sum(bool(row["alarms"]) for row in good),
+    }
+
+
+def _seeds(text: str) -> list[int]:
+    low, _, high = text.partition("-")
+    return list(range(int(low), int(high or low) + 1))
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--transport", choices=tuple(PORTS), default="zenoh")
+    parser.add_argument("--domain", type=int, default=77, help="DDS domain")
+    parser.add_argument("--seeds", type=_seeds, default=[1000], help="such as 1000-1004")
+    parser.add_argument("--profile", default="sensor", help="profile of the emulator")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the recording to fit")
+    parser.add_argument("--heldout", default="steps", help="family of the held-out motion")
+    parser.add_argument("--heldout-seconds", type=float, default=6.0)
+    parser.add_argument("--calibrate", default="--method near", help="further options of calibrate")
+    parser.add_argument("--keep", type=Path, default=None, help="folder for the runs' temporary folders")
+    parser.add_argument("--out", type=Path, required=True)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
