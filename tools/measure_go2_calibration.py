@@ -35,6 +35,7 @@ from deal_hw.drivers.go2.truth import Truth
 
 PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
 PATIENCE_S = 1800.0
+ATTEMPTS = 3
 GAINS = ("stiffness", "damping")
 
 
@@ -62,10 +63,9 @@ def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
     """Return the row of one seed; what failed is kept in it."""
     row: dict[str, Any] = {"seed": seed, "profile": options.profile, "transport": options.transport}
     with tempfile.TemporaryDirectory(dir=options.keep) as folder:
-        run = Path(folder)
         try:
             began = time.monotonic()
-            row["collect"] = record(options, seed, run)
+            run, row["collect"], row["failed_recordings"] = recorded(options, seed, Path(folder))
             row["collect_s"] = round(time.monotonic() - began, 1)
             # The first episode is fitted, the second only judges.
             verb("calibrate", str(run / "dataset"), "--holdout", "1", "--no-report", "--no-advise",
@@ -76,6 +76,26 @@ def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
         except RuntimeError as error:
             row["error"] = str(error)
     return row
+
+
+def recorded(options: argparse.Namespace, seed: int, folder: Path) -> tuple[Path, list[str], list[str]]:
+    """Record both episodes, again where a run ended early: on a busy machine states come too late at times.
+
+    Returns:
+        The run folder, what `collect` said of both, and what it said of recordings that ended early.
+
+    Raises:
+        RuntimeError: Each attempt ended early.
+    """
+    failed: list[str] = []
+    for attempt in range(ATTEMPTS):
+        run = folder / str(attempt)
+        run.mkdir()
+        try:
+            return run, record(options, seed, run), failed
+        except RuntimeError as error:
+            failed.append(str(error))
+    raise RuntimeError(f"{ATTEMPTS} recordings ended early: {'; '.join(failed)}")
 
 
 def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
@@ -183,6 +203,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         },
         "latency_beyond_emulator_ms": [min(late), max(late)],
         "calibrate_s_median": float(np.median([row["calibrate_s"] for row in good])),
+        "failed_recordings": sum(len(row["failed_recordings"]) for row in good),
         "flagged": sum(bool(row["alarms"]) for row in good),
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import resource
@@ -17,10 +16,10 @@ from deal_hw.control.realtime import FIFO_PRIORITY
 from deal_hw.findings import Finding, Level
 
 PACKAGES: Final = (
-    ("eclipse-zenoh", "zenoh", ""), ("cyclonedds", "cyclonedds", "dds"), ("mujoco", "mujoco", "sim"),
-    ("torch", "torch", "calib"), ("rerun-sdk", "rerun", "viz"), ("onnxruntime", "onnxruntime", ""),
+    ("eclipse-zenoh", ""), ("cyclonedds", "dds"), ("mujoco", "sim"), ("torch", "calib"), ("rerun-sdk", "viz"),
+    ("onnxruntime", ""),
 )  # fmt: skip
-"""Distribution, module, extra that installs it ("": the base install)."""
+"""Distribution, extra that installs it ("": the base install)."""
 _LEAST_LOCK_BYTES: Final = 512 << 20
 _COARSE_S: Final = 1e-5
 _LEAST_RECEIVE_BYTES: Final = 200_000
@@ -45,14 +44,21 @@ def _system() -> Finding:
 
 
 def _packages() -> Iterator[Finding]:
-    for name, module, extra in PACKAGES:
-        if importlib.util.find_spec(module) is not None:
-            yield Finding("packages", Level.OK, f"{name} {importlib.metadata.version(name)}")
+    for name, extra in PACKAGES:
+        if version := _version(name):
+            yield Finding("packages", Level.OK, f"{name} {version}")
         elif extra:
             hint = f"pip install 'deal-hw[{extra}]', if this computer needs it"
             yield Finding("packages", Level.NOTE, f"{name} is not installed", hint)
         else:
             yield Finding("packages", Level.FAIL, f"{name} is not installed", "pip install deal-hw")
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
 
 
 def _scheduling() -> Finding:

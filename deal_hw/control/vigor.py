@@ -131,7 +131,7 @@ def _scaled(part: Segment, vigor: float, description: RobotDescription) -> Segme
 def _effort_factor(sent: float, up: float, down: float) -> float:
     """Return the factor on an effort limit that is sent at this share of the description's."""
     if down:
-        return 0.7**down
+        return float(0.7**down)
     if sent >= 1 or not up:
         return float(2.0**up)
     # A limit is sent low to be felt. What creeps asks for little effort, and the lowest is halved. What the

@@ -14,21 +14,20 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2 import hung, topics
 from deal_hw.drivers.go2.body import body_state, is_damped
 from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, LowStateFrame
+from deal_hw.drivers.go2.greeting import await_robot
+from deal_hw.drivers.go2.protocol import LowStateFrame
 from deal_hw.drivers.go2.remote import decode_remote, parse_combination
-from deal_hw.drivers.go2.state_stream import CommandEcho, StateStream
+from deal_hw.drivers.go2.sending import PASSIVE_COPIES, CommandSender
+from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.takeover import Takeover
-from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError, WrongDeviceError
+from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
-CONNECT_TIMEOUT_S: Final = 5.0
 STOP_BUTTONS: Final = "L2+B"
 PASSIVE_DELAY_NS: Final = 10_000_000
 """States that were sensed sooner after the passive command say nothing about it [ns]."""
-PASSIVE_COPIES: Final = 3
-"""Messages get lost, and the last command must not: it is held for ever."""
 PUBLISHED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES))
 SUBSCRIBED: Final = (
     topics.LOW_STATE,
@@ -38,12 +37,6 @@ SUBSCRIBED: Final = (
 _QUEUE: Final = 4096
 _ENOUGH: Final = 3
 """New states after the first command that show that the robot is still there."""
-_GREETING: Final = 20
-"""Sound states with a running clock that make a Go2."""
-_ONE_ROBOT: Final = 0.4
-"""A larger share of states that are not new, and two robots send them."""
-_TOO_MANY: Final = 20
-"""Messages that are no states, without one that is: then it is no Go2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,30 +88,25 @@ class Go2Robot(Robot):
     ) -> None:
         self._transport, self._clock = transport, clock
         self._stop_text, self._stop_mask = stop_buttons, parse_combination(stop_buttons)
-        self._stream, self._echo = StateStream(check_crc), CommandEcho()
-        self._encoder = LowCommandEncoder()
-        self._damping = np.array(self.description.passive_damping)
-        self._effort_limit = np.array(self.description.effort_limit)
-        self._speed_limit = np.array(self.description.speed_limit)
+        self._stream = StateStream(check_crc)
         self._states: deque[RobotState] = deque(maxlen=_QUEUE)
         self._wire: deque[Message] = deque(maxlen=_QUEUE)
+        self._sender = CommandSender(transport, clock, self.description, self._wire.append)
         self._forget()
 
     def _forget(self) -> None:
         """Be as new; an open transport still serves to make the robot passive."""
         self.info: Go2Info | None = None
         self._stream.reset()
-        self._echo.reset()
+        self._sender.reset()
         self._states.clear()
         self._takeover = Takeover(
-            self._transport, self._clock, self._publish, self._pump, self._motion,
+            self._transport, self._clock, self._sender.publish, self._pump, self._motion,
             None if self.description.floating_base is None else np.array(self.description.rest_position),
         )  # fmt: skip
         self._frame: LowStateFrame | None = None
         self._armed = self._homed = self._in_charge = False
-        self._in_force = b""
         self._passive_ns: int | None = None
-        self._sequence = -1
         self._fault = self._operator_stop = ""
 
     def connect(self) -> None:
@@ -130,7 +118,10 @@ class Go2Robot(Robot):
         try:
             self._forget()
             self._wire.clear()
-            self.info = self._await_robot()
+            await_robot(self._transport, self._clock, self._stream, self._pump)
+            self._stream.errors = 0
+            self._states.clear()
+            self.info = self._read_info()
         except BaseException:
             self._transport.close()
             raise
@@ -163,7 +154,7 @@ class Go2Robot(Robot):
         """
         if self._armed:
             raise SafetyError("go2: make the robot passive before it is handed back")
-        self._homed, self._in_force, self._passive_ns = False, b"", None
+        self._homed, self._sender.in_force, self._passive_ns = False, b"", None
         self._takeover.hand_back(timeout_s)
 
     def arm(self, timeout_s: float) -> None:
@@ -184,7 +175,7 @@ class Go2Robot(Robot):
         if self._operator_stop:
             raise SafetyError(f"go2: {self._operator_stop}; let go and call home() again")
         self._fault = ""
-        self._command_damping()
+        self._sender.damp(self._motion()[0])
         seen = self._stream.accepted
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while self._stream.accepted < seen + _ENOUGH:
@@ -218,36 +209,11 @@ class Go2Robot(Robot):
         Raises:
             SafetyError: A value is not finite, or the robot was never armed.
         """
-        low = LowCommand(
-            command.position_target,
-            command.velocity_target,
-            command.stiffness,
-            command.damping,
-            command.effort,
-        )
-        try:
-            payload = self._encoder.encode(low)
-        except FrameError as error:
-            raise SafetyError(f"go2: {error}") from error
-        if not self._armed:
-            if not self._in_force:
-                raise SafetyError("go2: not armed; call arm() before the first command")
-            low = self._damping_command()
-            payload = self._encoder.encode(low)
-        stamp_ns = self._publish(topics.LOW_COMMAND, payload)
-        self._in_force = payload
-        self._sequence += 1
-        self._echo.note(self._sequence, stamp_ns)
-        q, dq, kp, kd, tau = (
-            part.astype(np.float32).astype(np.float64)
-            for part in (low.position, low.velocity, low.stiffness, low.damping, low.effort)
-        )
-        return JointCommand(q, dq, kp, kd, tau, self._effort_limit.copy(), self._speed_limit.copy())
+        return self._sender.send(command, damp_at=None if self._armed else self._motion()[0])
 
     def repeat(self) -> None:
         """Send the command in force again, the same bytes; nothing before the first."""
-        if self._in_force:
-            self._transport.send(Message(topics.LOW_COMMAND, self._in_force, self._clock.now_ns()))
+        self._sender.repeat()
 
     def passive(self) -> None:
         """Damp all joints; works on an open transport whatever happened before, and never waits.
@@ -258,10 +224,10 @@ class Go2Robot(Robot):
         """
         self._armed = False
         self._states.clear()
-        if self._in_charge and not self._in_force:
+        if self._in_charge and not self._sender.in_force:
             return
         self._passive_ns = self._clock.now_ns()
-        self._command_damping()
+        self._sender.damp(self._motion()[0])
         for _ in range(PASSIVE_COPIES - 1):
             self.repeat()
 
@@ -278,7 +244,7 @@ class Go2Robot(Robot):
     @property
     def last_sequence(self) -> int:
         """Number of the last new command; -1 before the first."""
-        return self._sequence
+        return self._sender.sequence
 
     @property
     def link_errors(self) -> int:
@@ -295,62 +261,11 @@ class Go2Robot(Robot):
         self._wire.clear()
         return wire
 
-    def _await_robot(self) -> Go2Info:
-        stream = self._stream
-        deadline_ns = self._clock.now_ns() + round(CONNECT_TIMEOUT_S * 1e9)
-        while stream.accepted < _GREETING and (left_ns := deadline_ns - self._clock.now_ns()) > 0:
-            if stream.errors >= _TOO_MANY and (error := stream.complaint()) is not None:
-                raise error
-            with contextlib.suppress(TransportTimeoutError):
-                self._pump(left_ns * 1e-9)
-        frame = self._frame
-        if frame is None or stream.accepted < _GREETING:
-            raise stream.complaint() or TransportTimeoutError(self._why_silent())
-        if stream.stale > _ONE_ROBOT * stream.accepted:
-            raise WrongDeviceError(
-                f"go2: two robots send {topics.LOW_STATE}, or one twice: {stream.stale} of "
-                f"{stream.accepted + stream.stale} states were no newer than the one before."
-                f"{self._seen_writing()} Choose another interface, domain or bridge"
-            )
-        stream.errors = 0
-        self._states.clear()
-        values = frame.values()
+    def _read_info(self) -> Go2Info | None:
+        if self._frame is None:
+            return None
+        values = self._frame.values()
         return Go2Info(values.battery_percent / 100, values.voltage, values.serial, values.version)
-
-    def _why_silent(self) -> str:
-        where = getattr(self._transport, "port", type(self._transport).__name__)
-        if self._stream.stale:
-            return (
-                f"go2 on {where}: states come, but their clock stands still at "
-                f"{self._stream.device_ns // 1_000_000} ms; a robot that hangs (restart it), or a simulator "
-                "that leaves the tick alone?"
-            )
-        return (
-            f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{self._seen_writing()} Is "
-            "the robot on and booted, the cable in, the interface the one with an address 192.168.123.x (the "
-            "robot is 192.168.123.161), and does the firewall let UDP through? Over Zenoh: does the bridge "
-            f"carry {topics.LOW_STATE}?"
-        )
-
-    def _seen_writing(self) -> str:
-        writers = self._transport.writers(topics.LOW_STATE)
-        return f" Seen writing it: {'; '.join(writers)}." if writers else ""
-
-    def _publish(self, topic: str, payload: bytes) -> int:
-        stamp_ns = self._clock.now_ns()
-        self._transport.send(Message(topic, payload, stamp_ns))
-        self._wire.append(Message("tx", payload, stamp_ns))
-        return stamp_ns
-
-    def _damping_command(self) -> LowCommand:
-        zero = np.zeros(len(self._damping))
-        pose = self._motion()[0]
-        return LowCommand(pose if np.isfinite(pose).all() else zero, zero, zero, self._damping, zero)
-
-    def _command_damping(self) -> None:
-        """Send the passive command; it is none of the behaviour's, so it has no number."""
-        self._in_force = self._encoder.encode(self._damping_command())
-        self._publish(topics.LOW_COMMAND, self._in_force)
 
     def _drain(self) -> None:
         with contextlib.suppress(TransportTimeoutError):
@@ -375,7 +290,7 @@ class Go2Robot(Robot):
         if remote is not None and remote.holds(self._stop_mask):
             self._operator_stop = f"{self._stop_text} was pressed on the remote"
         stream = self._stream
-        sequence, age_ns = self._echo.at(stream.device_ns, stream.offset_ns)
+        sequence, age_ns = self._sender.echo.at(stream.device_ns, stream.offset_ns)
         self._states.append(
             RobotState(
                 position=frame.position, velocity=frame.velocity, effort=frame.effort, receive_ns=receive_ns,
@@ -388,7 +303,7 @@ class Go2Robot(Robot):
         if self._passive_ns is not None:
             sensed_ns = self._stream.device_ns + self._stream.offset_ns
             if sensed_ns - self._passive_ns >= PASSIVE_DELAY_NS and is_damped(
-                frame, self._damping, self._effort_limit
+                frame, self._sender.damping, self._sender.effort_limit
             ):
                 self._passive_ns = None
         status = Status.HOMED if self._homed else Status.NONE
@@ -399,7 +314,8 @@ class Go2Robot(Robot):
     def _motion(self) -> tuple[FloatArray, FloatArray]:
         """Return newest positions and velocities; zeros before the first state."""
         if self._frame is None:
-            return np.zeros(len(self._damping)), np.zeros(len(self._damping))
+            zero = np.zeros(len(self.description.joint_names))
+            return zero, zero
         return self._frame.position, self._frame.velocity
 
     def _check_connected(self) -> None:

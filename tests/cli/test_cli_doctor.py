@@ -56,7 +56,7 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "waitpid", lambda pid, options: (pid, 256))
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda which: (8 << 20, 8 << 20))
-    monkeypatch.setattr(machine, "PACKAGES", (("no-such", "no_such_module", "dds"), ("none", "no_such", "")))
+    monkeypatch.setattr(machine, "PACKAGES", (("no-such", "dds"), ("none", "")))
     monkeypatch.setattr(
         machine, "_read", lambda path: {"rmem_max": "1000"}.get(path.rpartition("/")[2], "acpi_pm")
     )

@@ -32,7 +32,7 @@ CONFINED = {
     "pyarrow": {"data"},
     "stable_baselines3": {"policies"},
     "gymnasium": {"policies"},
-    "onnx": {"policies"},
+    "onnx": {"policies", "testing"},
     "onnxscript": {"policies"},
     "onnxruntime": {"policies"},
     "mujoco": {"sim"},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -11,11 +13,16 @@ from pathlib import Path
 import onnx
 import pytest
 
+from deal_hw.cli.emulate_go2 import free_port
+from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 
-EXTRAS = ("torch", "mujoco", "scipy", "rerun", "gymnasium", "stable_baselines3", "onnx", "matplotlib")
+EXTRAS = (
+    "torch", "mujoco", "scipy", "rerun", "gymnasium", "stable_baselines3", "onnx", "matplotlib", "pyarrow",
+    "cyclonedds",
+)  # fmt: skip
 REFUSE = f"""
 import sys
 
@@ -27,6 +34,44 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 """
 FINISHED, TRIPPED = 0, 3
+
+REACH_GO2 = """
+import json, sys
+
+from deal_hw.cli import collect, control_process, deploy, doctor, supervised
+from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.loop import ControlLoop, LoopConfig
+from deal_hw.control.safety import Safety
+from deal_hw.drivers import make_robot, make_transport
+from deal_hw.drivers.go2.checkup import Checkup
+from deal_hw.errors import DealHwError
+from deal_hw.transport import WireOptions
+
+transport, port, domain = sys.argv[1], sys.argv[2], int(sys.argv[3])
+options = WireOptions(domain=domain, listen=transport == "zenoh")
+
+def loaded():
+    return sorted({name.partition(".")[0] for name in sys.modules})
+
+clock = MonotonicClock()
+plan = RunPlan(robot="go2", transport=transport, port=port, profile="hold", stand=True, wire=options)
+robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire)
+behaviour = make_behaviour(plan, robot.description)
+ControlLoop(robot, behaviour, Safety(robot.description), clock, bool, LoopConfig(duration_s=plan.total_s))
+Checkup(make_transport(transport, port, clock, options), clock, 0.5)
+made = loaded()
+link = make_transport(transport, port, clock, options)
+link.declare(publish=["rt/lowcmd"], subscribe=["rt/lowstate"])
+try:
+    link.open()
+except DealHwError as error:
+    print(error, file=sys.stderr)
+finally:
+    link.close()
+print(json.dumps({"made": made, "opened": loaded()}))
+"""
+"""Makes all that collect, deploy and doctor make of a Go2, opens the path to it, tells what was loaded."""
 
 
 @pytest.fixture(scope="module")
@@ -117,3 +162,50 @@ def test_deploy_runs_without_extras(tmp_path: Path, port: str, policy: Path) -> 
     again = run_bare(tmp_path, "replay", "run/dataset/episodes/000000.mcap", *robot)
     assert again.returncode in {FINISHED, TRIPPED}, again.stderr
     assert (tmp_path / "run" / "dataset" / "episodes" / "000001.mcap").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("transport", "port", "own"),
+    [("zenoh", "tcp/127.0.0.1:0", "zenoh"), ("dds", "lo", "cyclonedds")],
+)
+def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, port: str, own: str) -> None:
+    """Neither torch, mujoco nor scipy; of the two networks the one that was asked for, when it is opened."""
+    if importlib.util.find_spec(own) is None:
+        pytest.skip(f"{own} is not installed")
+    done = subprocess.run(
+        [sys.executable, "-c", REACH_GO2, transport, free_port(port), "97"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    told = json.loads(done.stdout)
+    networks = {"zenoh", "cyclonedds"}
+    heavy = set(EXTRAS) - networks
+    assert not set(told["made"]) & (heavy | networks)
+    assert not set(told["opened"]) & heavy
+    assert set(told["opened"]) & networks == {own}
+
+
+@pytest.mark.slow
+def test_go2_runs_without_extras(tmp_path: Path) -> None:
+    """Collect and doctor reach a Go2 over Zenoh with the base install: all processes of a run included."""
+    options = ("--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--profile", "ideal", "--nominal")
+    posture = ("--fold-s", "0.3", "--rise-s", "0.6", "--lie-s", "0.6")
+    with EmulatorProcess("go2", *options) as emulator:
+        reach = ("go2", "--transport", "zenoh", "--port", emulator.port)
+        done = run_bare(
+            tmp_path, "collect", *reach, "--profile", "hold", "--seconds", "0.4", "--out", "run", *posture
+        )
+        assert done.returncode in {FINISHED, TRIPPED}, done.stderr
+        told = run_bare(tmp_path, "doctor", *reach, "--seconds", "1")
+    assert "refused" not in done.stderr + told.stdout + told.stderr
+    assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
+    assert told.returncode in {0, 1}, told.stderr
+    assert "Traceback" not in told.stderr
+    assert "rt/lowstate" in told.stdout
+
+
+def test_dds_without_its_package_names_the_extra(tmp_path: Path) -> None:
+    """One line that says what to install; no process was started for it."""
+    done = run_bare(tmp_path, "collect", "go2", "--port", "lo", "--profile", "hold", "--out", "run")
+    assert done.returncode == 2
+    assert "pip install 'deal-hw[dds]'" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,215 @@
+"""The suspended Go2 from its wire to a calibration, in virtual time; excitations that keep its legs apart."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.excite import Excite, excite
+from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.clock import VirtualClock
+from deal_hw.control.excitation_limits import room
+from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
+from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
+from deal_hw.control.safety import Safety
+from deal_hw.data.dataset import Dataset
+from deal_hw.data.record import CycleRecord
+from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.drivers import parameter_spaces
+from deal_hw.drivers.go2.description import DESCRIPTION as SIMULATED
+from deal_hw.drivers.go2.description import LEGS
+from deal_hw.drivers.go2.device import Go2Device
+from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.hung import DESCRIPTION
+from deal_hw.drivers.go2.robot import Go2HungRobot
+from deal_hw.drivers.go2.truth import Truth, draw_truth
+from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.errors import ConfigurationError
+
+HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness", "damping"))
+
+
+def record(device: Go2Device, dataset: Dataset, plan: RunPlan) -> None:
+    """Record a run of an emulated robot in virtual time."""
+    clock = VirtualClock(10**9)
+    robot = Go2HungRobot(VirtualTopics(device, clock), clock)
+    path = dataset.next_episode_path()
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {"profile": plan.profile}, clock) as recorder:
+
+        def sink(cycle: CycleRecord) -> bool:
+            recorder.write(cycle)
+            return True
+
+        loop = ControlLoop(
+            robot, make_behaviour(plan, DESCRIPTION), Safety(DESCRIPTION), clock, sink,
+            LoopConfig(duration_s=plan.seconds),
+        )  # fmt: skip
+        report = loop.run()
+    assert report.outcome is Outcome.FINISHED, report.reason
+    dataset.note_episode(path)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    """Return hidden parameters whose hips alone differ from the model."""
+    drawn = draw_truth("sensor", 5)
+    hip = np.arange(12) % 3 == 0
+    ones = np.ones(12)
+    return dataclasses.replace(
+        drawn,
+        stiffness=tuple(np.where(hip, drawn.stiffness, ones)),
+        damping=tuple(np.where(hip, drawn.damping, ones)),
+        joint_damping=(0.6,) * 12,
+        frictionloss=(0.2,) * 12,
+        armature=(0.01,) * 12,
+        latency_ms=6,
+    )
+
+
+@pytest.fixture(scope="module")
+def dataset(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset with a multisine and a chirp of the suspended robot."""
+    folder = tmp_path_factory.mktemp("run") / "dataset"
+    with Dataset.create_or_open(folder, DESCRIPTION.to_json()) as store:
+        for kind, seconds in (("multisine", 4.0), ("chirp", 2.4)):
+            device = Go2Device(truth, suspended=True, sport="")
+            plan = RunPlan(robot="go2_hung", profile="excite", excite=kind, seconds=seconds)
+            record(device, store, plan)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibrated(dataset: Path) -> CalibrateReport:
+    """Calibrate the hips."""
+    config = Calibrate(
+        dataset=dataset, holdout=(1,), method="near", sample_hz=100.0, free=HIPS, threads=1, report=False,
+        advise=False, quiet=True,
+    )  # fmt: skip
+    return calibrate(config)
+
+
+def test_the_recording_has_states_at_500_hz_and_commands_at_50(dataset: Path) -> None:
+    """Every state knows its command; the driver fills in what the wire does not say."""
+    trajectory = Dataset.open(dataset).read(0).trajectory
+    assert np.median(np.diff(trajectory.device_s)) == pytest.approx(2e-3)
+    assert len(trajectory.sent_sequence) == 200
+    numbers, counts = np.unique(trajectory.command_sequence[20:-20], return_counts=True)
+    assert np.median(counts) == 10
+    assert (np.diff(numbers) == 1).all()
+
+
+def test_hidden_gains_and_latency_are_found_over_the_wire(calibrated: CalibrateReport, truth: Truth) -> None:
+    """Gains to 3 %; the latency is the emulator's 6 ms plus the millisecond in which a message waits."""
+    result = calibrated.result
+    true = truth.parameters(DESCRIPTION.stiffness[0], DESCRIPTION.damping[0])
+    wanted = np.array([true[name] for name in result.space.names])
+    assert set(result.space.names) == set(HIPS)
+    assert np.max(np.abs(result.estimate / wanted - 1.0)) < 0.03
+    assert 0.0055 <= result.latency_s <= 0.0075
+
+
+def test_held_out_motion_is_predicted_four_times_better(calibrated: CalibrateReport) -> None:
+    """The chirp was not fitted."""
+    rmse = calibrated.result.provenance["heldout_rmse"]["mean"]
+    assert rmse["calibrated"] < 0.25 * rmse["nominal"]
+
+
+def test_parameter_sets_of_the_suspended_robot() -> None:
+    """Gains, friction and armature of each joint; encoder biases on request; shared by the parts of legs."""
+    counts = {name: len(make()) for name, make in parameter_spaces("go2_hung").items()}
+    assert counts == {"default": 48, "biased": 60, "shared": 12}
+
+
+def leg_distance(joints: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    """Return the least distance between shapes of two legs [m]."""
+    model = mujoco.MjModel.from_xml_path(str(SIMULATED.mjcf))
+    data = mujoco.MjData(model)
+    for name, value in zip(SIMULATED.joint_names, joints, strict=True):
+        data.joint(name).qpos[0] = value
+    mujoco.mj_kinematics(model, data)
+    of_leg: dict[str, list[int]] = {leg: [] for leg in LEGS}
+    for geom in range(model.ngeom):
+        body = model.body(model.geom_bodyid[geom]).name
+        if body[:2] in of_leg:
+            of_leg[body[:2]].append(geom)
+    pairs = [(a, b) for i, one in enumerate(LEGS) for other in LEGS[i + 1 :]
+             for a in of_leg[one] for b in of_leg[other]]  # fmt: skip
+    return min(mujoco.mj_geomDistance(model, data, a, b, 0.5, None) for a, b in pairs)
+
+
+def test_legs_stay_apart_wherever_an_excitation_takes_them() -> None:
+    """Corners of the range: at least 2.5 cm; beyond it, both hips inwards by 0.9 rad, legs cross."""
+    low, high = np.array(DESCRIPTION.excitation_range).T
+    rng = np.random.default_rng(0)
+    corners = [np.where(rng.integers(0, 2, 12) == 1, high, low) for _ in range(80)]
+    assert min(leg_distance(c) for c in corners) > 0.025
+    crossed = np.array(SIMULATED.default_position)
+    crossed[[0, 3]] = -0.9, 0.9
+    assert leg_distance(crossed) < 0
+
+
+@pytest.mark.parametrize("family", ["multisine", "chirp", "steps"])
+@pytest.mark.parametrize("seed", range(3))
+def test_all_families_keep_the_range(family: str, seed: int) -> None:
+    """All twelve joints at once."""
+    design = ExcitationDesign(family=family, seconds=8.0, seed=seed)  # type: ignore[arg-type]
+    plan = make_plan(DESCRIPTION, design)
+    targets = np.array(DESCRIPTION.default_position) + plan.offsets(np.arange(0.0, 8.0, 0.02))
+    low, high = np.array(DESCRIPTION.excitation_range).T
+    assert ((low <= targets) & (targets <= high)).all()
+    assert (np.ptp(targets, axis=0) > 0.1).all()
+
+
+def test_a_range_beyond_the_limits_does_not_count() -> None:
+    """The limits hold whatever the range."""
+    wide = dataclasses.replace(DESCRIPTION, excitation_range=((-9.0, 9.0),) * 12)
+    assert np.array_equal(room(wide), room(dataclasses.replace(DESCRIPTION, excitation_range=())))
+
+
+def test_a_range_of_the_wrong_length_is_refused() -> None:
+    """One pair for each actuated joint."""
+    with pytest.raises(ConfigurationError, match="excitation_range has 2 entries, expected 12"):
+        dataclasses.replace(DESCRIPTION, excitation_range=((-1.0, 1.0),) * 2)
+
+
+def test_swaying_is_planned_for_the_driven_robot_and_keeps_its_limits(tmp_path: Path) -> None:
+    """The file fits the robot on the wire; feet would slip if joints were scaled one by one."""
+    path = tmp_path / "sway.json"
+    excite(Excite(robot="go2", out=path, family="sway", seconds=3.0, high_hz=3.0, quiet=True))
+    plan = read_plan(path)
+    plan.check_fits(DRIVEN)
+    targets = np.array(DRIVEN.default_position) + plan.offsets(np.arange(0.0, 3.0, 0.02))
+    low, high = np.array(DRIVEN.limits.target).T
+    assert ((low <= targets) & (targets <= high)).all()
+    assert np.ptp(targets, axis=0).min() > 0.02
+    assert np.abs(np.diff(targets, axis=0)).max() < np.array(DRIVEN.limits.target_step).min()
+
+
+def test_only_the_go2_sways(tmp_path: Path) -> None:
+    """A suspended robot has no standing feet."""
+    with pytest.raises(ConfigurationError, match="for go2, which stands"):
+        excite(Excite(robot="go2_hung", out=tmp_path / "x.json", family="sway", quiet=True))
+
+
+def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
+    """The robot's computer reads a table."""
+    path = tmp_path / "sway.json"
+    excite(Excite(robot="go2", out=path, family="sway", seconds=1.0, quiet=True))
+    code = (
+        "import json, sys\n"
+        "from deal_hw.cli.run_plan import RunPlan, make_behaviour\n"
+        "from deal_hw.drivers.go2.driven import DRIVEN\n"
+        f"plan = RunPlan(robot='go2', profile='excite', excite={str(path)!r}, seconds=1.0)\n"
+        "make_behaviour(plan, DRIVEN)\n"
+        "print(json.dumps([n for n in ('mujoco', 'torch', 'scipy') if n in sys.modules]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == []
