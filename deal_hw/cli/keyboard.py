@@ -18,6 +18,18 @@ STOP_KEYS = ("\x1b", "p")
 HELP = "keys: w s ahead, back; a d left, right; q e turn; space stand still; p or Esc passive"
 
 
+def check_terminal() -> None:
+    """Check that there are keys to read.
+
+    Raises:
+        ConfigurationError: Standard input is no terminal.
+    """
+    if not sys.stdin.isatty():
+        raise ConfigurationError(
+            "--velocity keyboard needs a terminal as standard input; use remote, x,y,yaw or a script"
+        )
+
+
 @contextlib.contextmanager
 def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[None]:
     """Call ``pressed`` for each key, and ``stop`` for those that make the robot passive, from a thread.
@@ -28,10 +40,7 @@ def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[N
     Raises:
         ConfigurationError: Standard input is no terminal.
     """
-    if not sys.stdin.isatty():
-        raise ConfigurationError(
-            "--velocity keyboard needs a terminal as standard input; use remote, x,y,yaw or a script"
-        )
+    check_terminal()
     fd = sys.stdin.fileno()
     before = termios.tcgetattr(fd)
     end_read, end_write = os.pipe()

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw import __version__, errors
-from deal_hw.cli.keyboard import keys
+from deal_hw.cli.keyboard import check_terminal, keys
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.cadence import CadenceReport
@@ -168,6 +168,8 @@ def run_episodes(
     if episodes < 1:
         raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
     plan = dataclasses.replace(plan, port=port)
+    if plan.velocity == "keyboard":
+        check_terminal()
     robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire, plan.robot_settings)
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     VigorSearch(plan.vigor, attempts)

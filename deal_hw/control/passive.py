@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from deal_hw.clock import Clock
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.robot import Robot
@@ -27,8 +29,10 @@ def make_passive(robot: Robot, clock: Clock, attempts: int = ATTEMPTS, confirm_s
     """
     for _ in range(attempts):
         try:
-            # A sample that waited since before the run also says "not armed": only what comes now counts.
-            _drain(robot)
+            # A sample that waited since before the run also says "not armed": only what comes now counts. A
+            # path that cannot be read may still be written.
+            with contextlib.suppress(Exception):
+                _drain(robot)
             robot.passive()
             if _confirmed(robot, clock, confirm_s):
                 return True

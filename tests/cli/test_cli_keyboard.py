@@ -9,10 +9,13 @@ import queue
 import termios
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 
 from deal_hw.cli.keyboard import HELP, keys
+from deal_hw.cli.run_plan import RunPlan
+from deal_hw.cli.supervised import run_episodes
 from deal_hw.errors import ConfigurationError
 
 PATIENCE_S = 20.0
@@ -119,3 +122,14 @@ def test_without_a_terminal_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(ConfigurationError, match=r"--velocity keyboard needs a terminal .*; use remote"):
         with keys(lambda key: None, lambda: None):
             pytest.fail("there is no terminal")
+
+
+def test_a_run_without_a_terminal_does_not_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It is said before the port is opened, and before there is a recorder or a dataset."""
+    monkeypatch.setattr("sys.stdin", io.StringIO("w"))
+    plan = RunPlan(robot="cartpole", profile="hold", velocity="keyboard")
+    with pytest.raises(ConfigurationError, match="needs a terminal"):
+        run_episodes(
+            plan, port=str(tmp_path / "no-port"), dataset=tmp_path / "data", episodes=1, purpose="collect"
+        )
+    assert not list(tmp_path.iterdir())

@@ -88,8 +88,8 @@ def test_standing_up_is_wrapped_around_the_profile() -> None:
     assert behaviour.duration_s == plan.total_s
     lying = np.array(DRIVEN.rest_position)
     state = RobotState(lying, np.zeros(12), np.zeros(12), 0, 0, 0, -1, -1, Status.ARMED)
-    wanted = [behaviour.command(state, t).position_target for t in (0.0, 4.0, plan.total_s)]
-    np.testing.assert_allclose(wanted, [lying, DRIVEN.default_position, lying], atol=1e-12)
+    for time_s, wanted in ((0.0, lying), (4.0, np.array(DRIVEN.default_position)), (plan.total_s, lying)):
+        np.testing.assert_allclose(behaviour.command(state, time_s).position_target, wanted, atol=1e-12)
     assert isinstance(make_behaviour(dataclasses.replace(plan, stand=False), DRIVEN), HoldBehaviour)
 
 

@@ -20,7 +20,7 @@ from deal_hw.types import BodyState, FloatArray, RobotState, Status
 
 AXES = ("x", "y", "z")
 SENSED = tuple(
-    ObservationTerm(quantity, axis, 1.0)  # type: ignore[arg-type]
+    ObservationTerm(quantity, axis, 1.0)
     for quantity in ("gravity", "angular_velocity", "command")
     for axis in AXES
 )

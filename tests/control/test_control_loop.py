@@ -18,7 +18,7 @@ from deal_hw.data.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
+from deal_hw.errors import ConfigurationError, DatasetError, TransportLostError, TransportTimeoutError
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.testing.linear_policy import LinearPolicy, feedback_spec
 from deal_hw.types import FloatArray, JointCommand, RobotState
@@ -338,6 +338,32 @@ def test_only_what_comes_after_the_passive_command_confirms_it(rig: Any) -> None
     tick = rig.device.tick
     rig.device.tick = lambda: tick()[:0]
     assert make_passive(rig.robot, rig.clock, attempts=2) is False
+
+
+@pytest.mark.parametrize("error", [TransportLostError("the read side is gone"), ZeroDivisionError("a bug")])
+def test_a_path_that_cannot_be_read_is_still_written(rig: Any, error: Exception) -> None:
+    """Nothing confirms it, but the passive command goes out with the first attempt and the motor stops."""
+
+    class Mute(FaultyTransport):
+        broken = False
+
+        def receive(self, timeout_s: float) -> Any:
+            if self.broken:
+                raise error
+            return super().receive(timeout_s)
+
+    transport = Mute(rig.transport)
+    robot = CartpoleRobot(transport, rig.clock)
+    robot.connect()
+    robot.home(10.0)
+    robot.arm(1.0)
+    assert rig.device.armed
+    transport.broken = True
+    assert make_passive(robot, rig.clock, attempts=1) is False
+    rig.device.advance_to(rig.clock.now_ns())
+    for _ in range(5):
+        rig.device.tick()
+    assert not rig.device.armed
 
 
 def test_the_heartbeat_names_each_phase(rig: Any) -> None:

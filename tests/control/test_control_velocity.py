@@ -117,3 +117,12 @@ def test_a_key_counts_while_it_is_held() -> None:
     source.press("?")
     np.testing.assert_array_equal(source.velocity(state(), 0.99 + KEY_LIFE_S), KEYS["w"])
     np.testing.assert_array_equal(source.velocity(state(), 1.01 + KEY_LIFE_S), np.zeros(3))
+
+
+def test_a_key_from_before_the_walk_does_not_count() -> None:
+    """While the robot stands up nobody asks for a velocity, and a key pressed then must not start it off."""
+    source = KeyboardVelocity()
+    source.press("w")
+    np.testing.assert_array_equal(source.velocity(state(), 0.0), np.zeros(3))
+    source.press("a")
+    np.testing.assert_array_equal(source.velocity(state(), 0.02), KEYS["a"])

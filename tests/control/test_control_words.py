@@ -98,11 +98,13 @@ class Run:
         if not self._told:
             self._told = True
             # As the thread that reads the keys does.
-            thread = threading.Thread(
-                target=lambda: [self.supervisor.tell(word) for word in ("w", "a", "end")]
-            )
+            thread = threading.Thread(target=self._speak)
             thread.start()
             thread.join()
+
+    def _speak(self) -> None:
+        for word in ("w", "a", "end"):
+            self.supervisor.tell(word)
 
     def result(self) -> tuple[ChildEnd, dict[str, Any]]:
         """Run to the end; return how it ended and what the process said."""

@@ -91,11 +91,10 @@ def send_until_heard(sender: ZenohTransport, receiver: ZenohTransport) -> None:
 
 
 def test_a_client_hears_a_second_controller_and_a_peer_does_not(endpoint: str) -> None:
-    """Commands of one controller reach the other through the robot's side where one of them is a client."""
+    """Commands of one controller reach the other through the robot's side where both are clients."""
     with opened(ZenohTransport(endpoint, options=LISTEN), STATE, COMMAND) as robot:
         for mode, heard in (("client", True), ("peer", False)):
-            first = ZenohTransport(endpoint, options=WireOptions(mode=mode))
-            second = ZenohTransport(endpoint)
+            first, second = (ZenohTransport(endpoint, options=WireOptions(mode=mode)) for _ in range(2))
             with opened(first, STATE, COMMAND), opened(second, COMMAND, STATE):
                 meet(TopicPair(near=robot, far=second, down=STATE, up=COMMAND, payload=payload))
                 for _ in range(20):
@@ -173,7 +172,7 @@ def test_a_client_takes_the_end_point_that_answers_and_a_peer_needs_all(endpoint
         with ZenohTransport(f"{dead}, {endpoint}", options=WireOptions(mode="client")):
             pass
         with pytest.raises(PortNotFoundError, match=dead):
-            ZenohTransport(f"{dead},{endpoint}").open()
+            ZenohTransport(f"{dead},{endpoint}", options=WireOptions(mode="peer")).open()
 
 
 def test_a_taken_port_and_a_foreign_address_are_told_apart(endpoint: str) -> None:
