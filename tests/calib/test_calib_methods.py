@@ -157,7 +157,7 @@ def test_unknown_method_lists_the_names() -> None:
     """The error of a mistyped name helps."""
     for call in (check_method, make_method):
         with pytest.raises(
-            UnknownNameError, match="unknown calibration method 'dael'; known: default, weki, open-loop"
+            UnknownNameError, match="unknown calibration method 'dael'; known: default, weki, deal"
         ):
             call("dael")
 

@@ -22,13 +22,14 @@ from deal_hw.drivers.go2.command_log import DAMPING, STIFF, kind_of
 from deal_hw.drivers.go2.device import Go2Device
 from deal_hw.drivers.go2.driven import DRIVEN
 from deal_hw.drivers.go2.faults import FaultPlan
+from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
 from deal_hw.drivers.go2.protocol import (
     LowState,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.robot import Go2Robot
+from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
 from deal_hw.drivers.go2.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.transport import Message
@@ -350,6 +351,35 @@ def test_a_policy_never_sees_an_orientation_that_is_no_number() -> None:
     seen = [state.body for state in behaviour.seen if state.body is not None]
     assert len(seen) == 4
     assert all(np.isfinite(body.orientation).all() for body in seen)
+
+
+def test_a_dry_run_sends_nothing_at_all() -> None:
+    """Sport mode keeps the robot: no motor command, no request; commands are computed and recorded."""
+    rig = LegRig()
+    report = rig.loop(dry_run=True, hand_back=True, duration_s=0.5).run()
+    assert (report.outcome, report.cycles_sent) == (Outcome.FINISHED, 0)
+    assert rig.tap.heard == []
+    assert rig.device.sport_name == "normal"
+    assert all(record.asked is not None and record.sent is None for record in rig.records[:-1])
+
+
+def test_a_robot_that_hangs_needs_no_standing_up() -> None:
+    """Its legs go to the default pose in the air, without a floor, and are damped at the end."""
+    clock = VirtualClock(10**9)
+    device = Go2Device(nominal_truth("ideal"), suspended=True)
+    robot = Go2HungRobot(VirtualTopics(device, clock), clock)
+    records: list[CycleRecord] = []
+
+    def sink(record: CycleRecord) -> bool:
+        records.append(record)
+        return True
+
+    hold, safety = HoldBehaviour(HUNG), Safety(HUNG)
+    report = ControlLoop(robot, hold, safety, clock, sink, LoopConfig(duration_s=2.5)).run()
+    assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True), report.reason
+    last = records[-2].states[-1]
+    np.testing.assert_allclose(last.position, HUNG.default_position, atol=0.12)
+    assert device.log.changes[-1][2] == DAMPING
 
 
 @given(st.lists(st.integers(0, 60_000), max_size=12))
