@@ -39,7 +39,7 @@ NULL_METHODS = frozenset({"centre", "nominal", "deal-paper-flat"})
 """Rows that must not read the data, so they are never polished."""
 
 WHOLE_METHODS = frozenset({"open-loop", "near"})
-"""Methods that decide themselves, on inner folds, what follows their search."""
+"""Methods that decide themselves what follows their search; the polish does not."""
 
 
 def check_method(name: str) -> None:

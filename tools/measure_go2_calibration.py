@@ -117,7 +117,8 @@ def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
                 verb("excite", DESCRIPTION.name, "--family", excite, "--seconds", str(seconds),
                      "--seed", str(seed), "--out", plan)  # fmt: skip
             words = ("--excite", plan, "--seconds", str(seconds), "--seed", str(seed), "--out", str(run))
-            said.append(verb("collect", DESCRIPTION.name, *wire, "--port", emulator.port, *words))
+            report = verb("collect", DESCRIPTION.name, *wire, "--port", emulator.port, *words)
+            said.append(report.replace(str(run), "RUN"))
     return said
 
 

@@ -6,7 +6,8 @@ one thing go wrong while the robot stands, and asks three witnesses: the emulato
 after the fault, on the machine's monotonic clock that all processes share), the operator's terminal, and the
 dataset. The state-age limit of the description stands in the file for comparison.
 
-    python tools/measure_go2_faults.py --transport zenoh --out faults.json
+    python tools/measure_go2_faults.py --transport zenoh --out zenoh.json
+    python tools/measure_go2_faults.py --table faults.md zenoh.json dds.json
 """
 
 from __future__ import annotations
@@ -294,6 +295,58 @@ def dataset(folder: Path) -> dict[str, Any]:
     return {"dataset": "whole" if states else "empty", "states": states}
 
 
+def page(results: list[dict[str, Any]]) -> str:
+    """Return the fault table as a page, one column of times a transport."""
+    wires = [result["rows"][0]["transport"] for result in results]
+    by_fault = {
+        row["fault"]: [
+            next((r for r in result["rows"] if r["fault"] == row["fault"]), None) for result in results
+        ]
+        for row in results[0]["rows"]
+    }
+    worst = [max(row["damping_ms"] or 0.0 for row in result["rows"]) for result in results]
+    loads = ", ".join(f"{r['machine']['load'][0]:.1f}" for r in results)
+    first = results[0]
+    machine = f"{first['machine']['platform']}, {first['machine']['processors']} processors, load {loads}"
+    heads = " | ".join(f"{wire} [ms]" for wire in wires)
+    lines = [
+        "# Go2: from a fault to damping",
+        "",
+        "By `tools/measure_go2_faults.py` on the emulated robot, profile `sensor`, over real wires on one "
+        f"machine ({machine}).",
+        "Times are from the fault to the first damping command that the robot received.",
+        "",
+        f"Worst: {', '.join(f'{w} {t:.0f} ms' for w, t in zip(wires, worst, strict=True))}. The limit on the "
+        f"age of a state is {first['state_age_limit_ms']:.0f} ms, judged every 20 ms; that",
+        f"on a silent control process {first['silence_limit_ms']:.0f} ms.",
+        "",
+        f"| fault | {heads} | exit code | recording | the operator sees |",
+        "|---|" + "---:|" * len(wires) + "---|---|---|",
+    ]
+    for fault, rows in by_fault.items():
+        known = [row for row in rows if row is not None]
+        times = [cell(row) for row in rows]
+        codes = ", ".join(dict.fromkeys(str(row["exit_code"]) for row in known))
+        data = ", ".join(dict.fromkeys(row["dataset"] for row in known))
+        lines.append(
+            f"| {fault} | {' | '.join(times)} | {codes} | {data} | {known[0]['operator'] or '(nothing)'} |"
+        )
+    bad = [
+        f"{row['transport']}: {row['fault']}" for r in results for row in r["rows"] if not row["as_expected"]
+    ]
+    lines += ["", "Not as expected: " + ("; ".join(bad) if bad else "none") + "."]
+    return "\n".join(lines) + "\n"
+
+
+def cell(row: dict[str, Any] | None) -> str:
+    """Return a row's time as the page shows it."""
+    if row is None:
+        return "not run"
+    if row["expected"] == "goes on":
+        return "goes on" if row["as_expected"] else "stopped"
+    return "never" if row["damping_ms"] is None else f"{row['damping_ms']:.0f}"
+
+
 def main() -> int:
     """Run the table; return 1 where something was not as expected."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -301,7 +354,14 @@ def main() -> int:
     parser.add_argument("--domain", type=int, default=91, help="DDS domain, away from real robots")
     parser.add_argument("--only", default="", help="rows whose name contains this")
     parser.add_argument("--out", type=Path, default=None)
+    parser.add_argument("--table", type=Path, nargs="+", default=None, metavar="FILE",
+                        help="write a page (first) from results (others), and measure nothing")  # fmt: skip
     given = parser.parse_args()
+    if given.table is not None:
+        given.table[0].write_text(
+            page([json.loads(p.read_text()) for p in given.table[1:]]), encoding="utf-8"
+        )
+        return 0
     limits = DRIVEN.limits
     rows = []
     for case in CASES:

@@ -161,7 +161,7 @@ def _sway(config: Excite, description: RobotDescription) -> ExcitationPlan:
 
 
 def _given_design(config: Excite, balances: bool) -> ExcitationDesign:
-    if config.family in ("optimal", "sway"):
+    if config.family == "optimal" or config.family == "sway":
         raise RuntimeError(f"unreachable: {config.family} has no design")
     whole = config.split <= 0
     return ExcitationDesign(

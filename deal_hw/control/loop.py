@@ -110,7 +110,7 @@ class ControlLoop:
             # First of all, and before anything that might fail: the robot.
             self._raise_on_stop = False
             confirmed = self._make_passive()
-            if confirmed and self._config.hand_back and outcome in (Outcome.FINISHED, Outcome.STOPPED):
+            if confirmed and outcome in (Outcome.FINISHED, Outcome.STOPPED):
                 self._hand_back()
             self._close(reason)
         return LoopReport(
@@ -305,6 +305,8 @@ class ControlLoop:
         )
 
     def _hand_back(self) -> None:
+        if not self._config.hand_back or self._config.dry_run or not self._connected:
+            return
         timeout_s = self._config.hand_back_timeout_s
         self._phase("handing back", timeout_s + 2.0)
         try:

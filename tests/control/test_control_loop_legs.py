@@ -359,6 +359,7 @@ def test_a_dry_run_sends_nothing_at_all() -> None:
     report = rig.loop(dry_run=True, hand_back=True, duration_s=0.5).run()
     assert (report.outcome, report.cycles_sent) == (Outcome.FINISHED, 0)
     assert rig.tap.heard == []
+    assert "handing back" not in dict(rig.beats), "nothing was taken"
     assert rig.device.sport_name == "normal"
     assert all(record.asked is not None and record.sent is None for record in rig.records[:-1])
 
