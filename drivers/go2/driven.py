@@ -19,6 +19,7 @@ RESTING_RAD: Final[Mapping[str, float]] = {"hip": 0.0, "thigh": 1.36, "calf": -2
 PASSIVE_DAMPING_NMS_RAD: Final = 5.0
 TRIP_MARGIN_RAD: Final = 0.15
 EFFORT_NM: Final = 23.5
+TARGET_STEP_RAD: Final = 0.6
 FLAIL_RAD_S: Final[Mapping[str, float]] = {"hip": 20.0, "thigh": 20.0, "calf": 10.5}
 
 LEG_LIMITS: Final = LegLimits(
@@ -72,6 +73,7 @@ def driven_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyL
         limits,
         trip_position=trip,
         effort=go2.per_joint(go2.EFFORT_LIMIT_NM),
+        target_step=(TARGET_STEP_RAD,) * 12,
         silence_s=0.2,
         legs=legs,
     )
@@ -96,6 +98,7 @@ DRIVEN: Final[RobotDescription] = dataclasses.replace(
             + "; measured positions may be 0.15 rad outside: lying calves at -2.81 rad in "
             "motor_state_data_example_sit.py of hanlinniu/unitree_sdk2_python @ 4becdb1"
         ),
+        "target_step": "the way of a hip or thigh at its top speed, 30.1 rad/s, in a control period of 20 ms",
         "silence_s": "assumed: ten control periods; the robot holds its last target meanwhile",
         **LEG_SOURCES,
     },
