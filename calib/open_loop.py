@@ -5,8 +5,9 @@ search that stops early or a fit that goes on predicts other motion better, and 
 
 1. a fit from the model's own values over short windows says what residuals to expect;
 2. the ensemble search (:mod:`deal_hw.calib.weki`) is run with these;
-3. on inner folds of the recordings that are fitted, motion by motion, the search's estimate and fits over
-   short and long horizons (robust or not, with a latency or none) predict what they have not seen;
+3. on inner folds of the recordings that are fitted, motion by motion, the search's estimate, fits over short
+   and long horizons (robust or not, with a latency or none, held to the model's own values or hardly) and the
+   mean of fits over several horizons predict what they have not seen;
 4. what predicts best is fitted to all, its halves are compared, and what goes with what is said.
 
 Recordings that are held out take no part in any of this.
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.stats import norm
@@ -41,7 +42,7 @@ from deal_hw.calibration import (
     StateStore,
 )
 from deal_hw.errors import CalibrationError, InsufficientDataError
-from deal_hw.sim.episode_parts import spread, stretches
+from deal_hw.sim.episode_parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
 LONG_S = 2.0
@@ -54,8 +55,14 @@ SEARCHED_WINDOW_S = 0.4
 
 HALF_ITERATIONS = 5
 
-RECIPES: Mapping[str, Recipe] = {
-    "long": Recipe(seconds=LONG_S),
+HORIZONS_S = (0.4, 0.8, 1.2, LONG_S)
+"""What the model lacks pulls each horizon's fit elsewhere; their mean may be nearer than any of them."""
+
+PRIORS: Mapping[str, float] = {"": Recipe().prior_std, ", wide prior": 1.0}
+"""How far the model's own values hold, as a share of the range: as far as the range itself, or hardly."""
+
+LONG = Recipe(seconds=LONG_S)
+VARIANTS: Mapping[str, Recipe] = {
     "long, robust": Recipe(seconds=LONG_S, robust=True),
     "long, no latency": Recipe(seconds=LONG_S, latency=False),
 }
@@ -94,6 +101,7 @@ class OpenLoop(CalibrationMethod[Problem]):
         numbers.
         """
         began = time.perf_counter()
+        problem = _whole(problem)
         work = _Work(problem, self.search, budget, progress)
         check_excitation(problem)
         work.say("residual", "fits short windows from the model's own values")
@@ -108,7 +116,7 @@ class OpenLoop(CalibrationMethod[Problem]):
         theta, latency_s = work.members(problem, (first.theta, first.latency_s), searched, choice.chosen)[
             choice.chosen
         ]
-        recipe = RECIPES.get(choice.chosen, RECIPES["long"])
+        recipe = _recipe(choice.chosen)
         fit = fit_horizon(problem, theta, latency_s, dataclasses.replace(recipe, latency=True), iterations=0)
         known = _known(problem, fit)
         halves = _halves(problem, fit, recipe, known)
@@ -156,6 +164,14 @@ def near() -> OpenLoop:
     twentieth of a search. What its residual does not explain it says like `open-loop`.
     """
     return OpenLoop(Nominal(), folds=False, name="near")
+
+
+def _whole(problem: Problem) -> Problem:
+    """Return the problem with stretches that follow each other in one piece, so that long windows fit."""
+    episodes = joined(problem.episodes)
+    return (
+        problem if len(episodes) == len(problem.episodes) else dataclasses.replace(problem, episodes=episodes)
+    )
 
 
 class _Work:
@@ -224,7 +240,7 @@ class _Work:
             except (InsufficientDataError, CalibrationError) as err:
                 return Choice("long", {}, LONG_S, note=f"a fold's data cannot be fitted: {err}")
             for name, of_channels in zip(members, rmse, strict=True):
-                errors.setdefault(name, []).append(float(np.exp(np.mean(np.log(of_channels)))))
+                errors.setdefault(name, []).append(_error(problem, of_channels))
         means = {name: float(np.mean(np.log(values))) for name, values in errors.items()}
         chosen = min(means, key=lambda name: means[name])
         return Choice(chosen, {n: tuple(v) for n, v in errors.items()}, LONG_S, self.steps - before)
@@ -242,13 +258,51 @@ class _Work:
         """
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
         rmse = prediction_rmse(problem, [found["search"], short], SEARCHED_WINDOW_S)
-        near = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
-        for name, recipe in RECIPES.items():
-            if only not in (None, name):
+        start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
+        for words, prior_std in PRIORS.items():
+            if only is not None and words != _prior_words(only):
                 continue
-            fit = fit_horizon(problem, near[0], near[1] if recipe.latency else self.given_latency_s, recipe)
-            near = found[name] = fit.theta, fit.latency_s
+            horizons = [start]
+            for seconds in HORIZONS_S:
+                recipe = Recipe(seconds=seconds, prior_std=prior_std)
+                horizons.append(_member(fit_horizon(problem, *horizons[-1], recipe)))
+            found["long" + words] = horizons[-1]
+            found["mean of horizons" + words] = _mean(problem, horizons[1:])
+        for name, recipe in VARIANTS.items():
+            if only in (None, name):
+                theta, latency_s = found["long"]
+                latency_s = latency_s if recipe.latency else self.given_latency_s
+                found[name] = _member(fit_horizon(problem, theta, latency_s, recipe))
         return found
+
+
+def _prior_words(name: str) -> str:
+    """Return which of the priors a candidate's name ends with."""
+    return next((words for words in PRIORS if words and name.endswith(words)), "")
+
+
+def _recipe(name: str) -> Recipe:
+    """Return how a candidate's residuals are weighed, for intervals and halves."""
+    return VARIANTS.get(name, dataclasses.replace(LONG, prior_std=PRIORS[_prior_words(name)]))
+
+
+def _error(problem: Problem, rmse: FloatArray) -> float:
+    """Return one number for the errors of all channels, (M,): their mean, of different units the geometric."""
+    C, units = problem.coordinates, problem.robot.coordinate_units
+    if len({units[c % C] + "/s" * int(c >= C) for c in problem.channels}) == 1:
+        return float(np.mean(rmse))
+    return float(np.exp(np.mean(np.log(rmse))))
+
+
+def _member(fit: HorizonFit) -> Member:
+    return fit.theta, fit.latency_s
+
+
+def _mean(problem: Problem, members: Sequence[Member]) -> Member:
+    """Return the mean of estimates, parameters in their own scale."""
+    scaled = [problem.space.to_scale(theta) for theta, _ in members]
+    theta = problem.space.from_scale(np.mean(scaled, axis=0))
+    return theta, float(np.mean([latency_s for _, latency_s in members]))
 
 
 def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:

@@ -94,7 +94,7 @@ def recorded(options: argparse.Namespace, seed: int, folder: Path) -> tuple[Path
         try:
             return run, record(options, seed, run), failed
         except RuntimeError as error:
-            failed.append(str(error))
+            failed.append(str(error).replace(str(run), "RUN"))
     raise RuntimeError(f"{ATTEMPTS} recordings ended early: {'; '.join(failed)}")
 
 

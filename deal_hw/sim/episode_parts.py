@@ -8,10 +8,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.episode import SENT, Episode
 
 LEAD_S = 0.1
 """Commands kept before a part's first sample: as long as any latency reaches back [s]."""
+
+
+SAMPLED = {
+    "sample": 1, "position": 2, "velocity": 2, "usable": 1, "reported": 1, "reference": 2, "estimate_std": 2,
+}  # fmt: skip
+"""Axes of what an episode has for each sample; what is the same for all samples has fewer."""
 
 
 def part(episode: Episode, first: int, last: int) -> Episode:
@@ -39,6 +45,41 @@ def stretches(episode: Episode, seconds: float) -> list[Episode]:
     count = max(int(np.ceil((T - 1) * episode.period_s / seconds)), 1)
     edges = np.linspace(0, T - 1, count + 1).round().astype(int)
     return [part(episode, int(a), int(b) + 1) for a, b in itertools.pairwise(edges) if b > a]
+
+
+def joined(parts: Sequence[Episode]) -> list[Episode]:
+    """Return parts with those put together again that follow each other: the reverse of `stretches`."""
+    found: list[Episode] = []
+    for after in parts:
+        if found and _follows(found[-1], after):
+            found[-1] = _joined(found[-1], after)
+        else:
+            found.append(after)
+    return found
+
+
+def _follows(before: Episode, after: Episode) -> bool:
+    """Say whether a part begins with the sample that another ends with."""
+    return (
+        after.first_row == before.first_row + len(before.sample) - 1
+        and after.origin + int(after.sample[0]) == before.origin + int(before.sample[-1])
+        and 0 <= after.origin - before.origin <= before.steps
+        and np.array_equal(after.position[0], before.position[-1])
+    )
+
+
+def _joined(before: Episode, after: Episode) -> Episode:
+    shift = after.origin - before.origin
+    samples = {
+        name: np.concatenate([first[:-1], second])
+        for name in SAMPLED
+        if (first := getattr(before, name)) is not None
+        and (second := getattr(after, name)) is not None
+        and first.ndim == SAMPLED[name]
+    }
+    samples["sample"] = np.concatenate([before.sample[:-1], after.sample + shift])
+    sent = {name: np.concatenate([getattr(before, name)[:shift], getattr(after, name)]) for name in SENT}
+    return dataclasses.replace(before, **samples, **sent)
 
 
 def split_last(episode: Episode, share: float) -> tuple[Episode, Episode]:

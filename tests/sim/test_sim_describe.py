@@ -14,8 +14,8 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.batch import ServoBatch
 from deal_hw.sim.describe import compile_model, describe, sampling
 from deal_hw.sim.droop import droop
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.episode_parts import part, split_last, spread, stretches
+from deal_hw.sim.episode import SENT, Episode
+from deal_hw.sim.episode_parts import joined, part, split_last, spread, stretches
 from deal_hw.sim.model import RobotModel, load_model
 
 ARM = """
@@ -153,6 +153,14 @@ def test_parts_keep_samples_and_commands_together(tmp_path: Path) -> None:
     assert sum(len(p.sample) - 1 for p in parts) == 99 and len(parts) == 4
     assert [p.first_row for p in spread(parts, 1.0)] == [parts[1].first_row, parts[3].first_row]
     assert spread(parts, 9.0) == parts
+    (again,) = joined(parts)
+    for name in ("sample", "position", "usable", *SENT):
+        assert np.array_equal(getattr(again, name), getattr(whole, name))
+    middle = joined([parts[1], parts[2], parts[0]])
+    assert [(e.first_row, len(e.sample)) for e in middle] == [
+        (parts[1].first_row, len(parts[1].sample) + len(parts[2].sample) - 1),
+        (0, len(parts[0].sample)),
+    ]
 
 
 def test_gravity_tells_a_gain_and_its_sign(tmp_path: Path) -> None:
