@@ -101,8 +101,9 @@ class OpenLoop(CalibrationMethod[Problem]):
         numbers.
         """
         began = time.perf_counter()
-        problem = _whole(problem)
-        work = _Work(problem, self.search, budget, progress)
+        if self.folds:
+            problem = _whole(problem)
+        work = _Work(problem, self.search, budget, progress, HORIZONS_S if self.folds else (LONG_S,))
         check_excitation(problem)
         work.say("residual", "fits short windows from the model's own values")
         first = fit_horizon(problem, problem.space.nominal, work.given_latency_s, SHORT)
@@ -169,9 +170,9 @@ def near() -> OpenLoop:
 def _whole(problem: Problem) -> Problem:
     """Return the problem with stretches that follow each other in one piece, so that long windows fit."""
     episodes = joined(problem.episodes)
-    return (
-        problem if len(episodes) == len(problem.episodes) else dataclasses.replace(problem, episodes=episodes)
-    )
+    if len(episodes) < len(problem.episodes):
+        return dataclasses.replace(problem, episodes=episodes)
+    return problem
 
 
 class _Work:
@@ -182,6 +183,7 @@ class _Work:
         search: The search.
         budget: What it may use.
         progress: Called now and then.
+        horizons_s: Horizons that are fitted, one from where the one before ended [s].
     """
 
     def __init__(
@@ -190,7 +192,9 @@ class _Work:
         search: CalibrationMethod[Problem],
         budget: Budget,
         progress: ProgressCallback | None,
+        horizons_s: Sequence[float],
     ) -> None:
+        self._horizons_s = horizons_s
         self._problem, self._search, self._budget, self._progress = problem, search, budget, progress
         self._before = problem.steps
         self._searched: list[Problem] = []
@@ -263,7 +267,7 @@ class _Work:
             if only is not None and words != _prior_words(only):
                 continue
             horizons = [start]
-            for seconds in HORIZONS_S:
+            for seconds in self._horizons_s:
                 recipe = Recipe(seconds=seconds, prior_std=prior_std)
                 horizons.append(_member(fit_horizon(problem, *horizons[-1], recipe)))
             found["long" + words] = horizons[-1]
@@ -287,7 +291,7 @@ def _recipe(name: str) -> Recipe:
 
 
 def _error(problem: Problem, rmse: FloatArray) -> float:
-    """Return one number for the errors of all channels, (M,): their mean, of different units the geometric."""
+    """Return the mean error of channels, (M,); the geometric one where their units differ."""
     C, units = problem.coordinates, problem.robot.coordinate_units
     if len({units[c % C] + "/s" * int(c >= C) for c in problem.channels}) == 1:
         return float(np.mean(rmse))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -70,15 +71,15 @@ def _follows(before: Episode, after: Episode) -> bool:
 
 def _joined(before: Episode, after: Episode) -> Episode:
     shift = after.origin - before.origin
-    samples = {
-        name: np.concatenate([first[:-1], second])
-        for name in SAMPLED
-        if (first := getattr(before, name)) is not None
-        and (second := getattr(after, name)) is not None
-        and first.ndim == SAMPLED[name]
+    samples: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name)[:-1], getattr(after, name)])
+        for name, axes in SAMPLED.items()
+        if np.ndim(getattr(before, name)) == np.ndim(getattr(after, name)) == axes
     }
     samples["sample"] = np.concatenate([before.sample[:-1], after.sample + shift])
-    sent = {name: np.concatenate([getattr(before, name)[:shift], getattr(after, name)]) for name in SENT}
+    sent: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name)[:shift], getattr(after, name)]) for name in SENT
+    }
     return dataclasses.replace(before, **samples, **sent)
 
 
