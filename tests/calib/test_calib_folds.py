@@ -89,7 +89,7 @@ def test_folds_keep_the_polish_where_it_helps_and_drop_it_where_not(case: Case, 
     """From 10 % off the polish predicts better over all; what costs too much is left out with a note."""
     off = choose(problem, At(case.theta * 1.1, case.latency_s), Budget(), 0, 40, 0)
     assert off.chosen == "polish"
-    assert np.prod(off.errors["polish"]) < 0.9 * np.prod(off.errors["search"])
+    assert np.prod(off.errors["polish"]) < 0.75 * np.prod(off.errors["search"])
     assert set(off.to_json()) == {"chosen", "errors", "window_s", "steps"}
     truth = prediction_error(problem, [(case.theta, case.latency_s), (case.theta * 1.1, case.latency_s)], 40)
     assert truth[0] < truth[1]
