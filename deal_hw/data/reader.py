@@ -225,9 +225,7 @@ def _body(
     columns = []
     for i in range(2, len(table[0])):
         absent = np.full(np.shape(table[0][i]), np.nan)
-        columns.append(
-            np.stack([absent if row is None else np.asarray(row[i], float) for row in found])
-        )
+        columns.append(np.stack([absent if row is None else np.asarray(row[i], float) for row in found]))
     buttons = np.where(np.isfinite(columns[-1]), columns[-1], -1).astype(np.int64)
     names = [f.name for f in dataclasses.fields(BodyTrajectory)]
     return BodyTrajectory(**dict(zip(names, [*columns[:-1], buttons], strict=True)))
