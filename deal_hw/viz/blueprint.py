@@ -7,23 +7,27 @@ from typing import Any
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.types import Trajectory
+from deal_hw.types import FloatArray, Trajectory
 from deal_hw.viz.backend import rrb
 from deal_hw.viz.columns import DEVICE_TIMELINE
 
-_STANDING_M = 0.2
-"""What is looked at of a robot that stands on the floor [m]."""
 _STACKED_JOINTS = 3
 """Robots with more joints get a grid of small plots instead of a stack."""
 
 
-def inspect_blueprint(trajectory: Trajectory, description: RobotDescription, sets: tuple[str, ...]) -> Any:
+def inspect_blueprint(
+    trajectory: Trajectory,
+    description: RobotDescription,
+    sets: tuple[str, ...],
+    bodies: FloatArray | None = None,
+) -> Any:
     """Return the layout.
 
     Args:
         trajectory: The recording.
         description: The robot.
         sets: Names of the parameter sets that are shown beside it.
+        bodies: Where the robot's bodies are at the beginning, to look at, (B, 3) [m]; None: at the origin.
     """
     tabs = [
         _motion(trajectory, description, sets),
@@ -35,7 +39,7 @@ def inspect_blueprint(trajectory: Trajectory, description: RobotDescription, set
         tabs.insert(0, _body(trajectory))
     right = rrb.Tabs(*tabs, active_tab=0)
     left = rrb.Vertical(
-        _robot(trajectory, description),
+        _robot(description, bodies),
         rrb.TextDocumentView(origin="/summary", name="Summary"),
         row_shares=[4, 7],
     )
@@ -122,19 +126,23 @@ def _legs(joints: tuple[str, ...]) -> dict[str, list[str]]:
     return found
 
 
-def _robot(trajectory: Trajectory, description: RobotDescription) -> Any:
-    """Return the 3D view, looking along +y from far enough to see what sliding joints cover."""
+def _robot(description: RobotDescription, bodies: FloatArray | None) -> Any:
+    """Return the 3D view, looking along +y from far enough to see the robot and what sliding joints cover."""
     slides = [
         high
         for (_, high), unit in zip(description.limits.trip_position, description.position_units, strict=True)
         if unit == "m" and np.isfinite(high)
     ]
     reach = max([0.4, *slides])
-    height = _STANDING_M if description.floating_base is not None else 0.04 * reach
+    center = np.array([0.0, 0.0, 0.04 * reach])
+    if bodies is not None and not slides:
+        # Halfway between the outermost bodies; links reach somewhat beyond their frames.
+        center = 0.5 * (bodies.min(axis=0) + bodies.max(axis=0))
+        reach = max(reach, 1.3 * float(np.linalg.norm(bodies - center, axis=1).max()))
     eye = rrb.EyeControls3D(
         kind=rrb.components.Eye3DKind.Orbital,
-        position=(0.12 * reach, -2.1 * reach, 0.5 * reach),
-        look_target=(0.0, 0.0, height),
+        position=tuple(center + reach * np.array([0.12, -2.1, 0.46])),
+        look_target=tuple(center),
         eye_up=(0.0, 0.0, 1.0),
     )
     return rrb.Spatial3DView(

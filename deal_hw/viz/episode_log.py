@@ -28,7 +28,7 @@ import numpy as np
 from deal_hw.calibration import CalibrationResult
 from deal_hw.data.reader import CycleTable
 from deal_hw.description import RobotDescription
-from deal_hw.sim.model import load_model
+from deal_hw.sim.model import RobotModel, load_model
 from deal_hw.sim.overlay import Overlay
 from deal_hw.sim.scene import body_poses, read_scene
 from deal_hw.sim.standing import sensed_base
@@ -73,9 +73,11 @@ def write_episode(
     sets = () if overlay is None else tuple(overlay.predictions)
     with rr.RecordingStream(APPLICATION, send_properties=False) as stream:
         stream.save(path)
-        stream.send_blueprint(
-            inspect_blueprint(trajectory, description, sets), make_active=True, make_default=True
-        )
+        robot = load_model(description)
+        base = sensed_base(robot, trajectory)
+        poses = body_poses(robot, trajectory.position, base)
+        layout = inspect_blueprint(trajectory, description, sets, _first_known(poses[0]))
+        stream.send_blueprint(layout, make_active=True, make_default=True)
         stream.send_recording_name(name or str(trajectory.metadata.get("purpose", "episode")))
         log = Log(stream)
         log_samples(log, trajectory, description)
@@ -88,7 +90,7 @@ def write_episode(
         log_events(log, trajectory)
         if overlay is not None:
             log_overlay(log, trajectory, overlay)
-        log_scene(log, trajectory, description, overlay)
+        log_scene(log, trajectory, robot, base, poses, overlay)
         text = summary_markdown(trajectory, description, overlay, result, note)
         stream.log("/summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
         stream.disconnect()
@@ -217,16 +219,33 @@ def _broken_times(window_s: FloatArray, recording_s: FloatArray) -> FloatArray:
     return np.concatenate([recording_s[:1], flat.ravel(), recording_s[-1:] + 3 * _BREAK_S])
 
 
+def _first_known(positions: FloatArray) -> FloatArray | None:
+    """Return where the bodies but the world, (B - 1, 3), are at the first sample that says so."""
+    known = np.flatnonzero(np.isfinite(positions).all(axis=(1, 2)))
+    return positions[known[0], 1:] if known.size else None
+
+
 def log_scene(
-    log: Log, trajectory: Trajectory, description: RobotDescription, overlay: Overlay | None
+    log: Log,
+    trajectory: Trajectory,
+    robot: RobotModel,
+    base: FloatArray | None,
+    poses: tuple[FloatArray, FloatArray],
+    overlay: Overlay | None,
 ) -> None:
-    """Write the robot in 3D: the real one, and a ghost for each parameter set."""
-    robot = load_model(description)
+    """Write the robot in 3D: the real one, and a ghost for each parameter set.
+
+    Args:
+        log: Where to.
+        trajectory: The recording.
+        robot: The robot's model.
+        base: Sensed poses of a floating base, (T, 7); None for a fixed one.
+        poses: Of the real robot's bodies, as :func:`~deal_hw.sim.scene.body_poses` returns them.
+        overlay: Predictions to show beside it.
+    """
     scene = read_scene(robot)
     clocks = trajectory.device_s, trajectory.receive_s
     log_surroundings(log, scene)
-    base = sensed_base(robot, trajectory)
-    poses = body_poses(robot, trajectory.position, base)
     log_robot(log, scene, "real", palette.REAL, poses, clocks, ghost=False)
     if overlay is None:
         return
