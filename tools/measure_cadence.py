@@ -20,7 +20,6 @@ import platform
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ import numpy as np
 import tyro
 
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.control.realtime import become_realtime
+from deal_hw.cli.witness import Account, witnesses
 from deal_hw.data.dataset import Dataset
 from deal_hw.data.reader import Episode
 
@@ -51,47 +50,7 @@ class MeasureCadence:
     """What the robot does meanwhile; balance includes the policy's network."""
 
 
-_WITNESS_PERIOD_NS = 1_000_000
 _PAUSE_NS = 3_000_000
-_TOP_PRIORITY = 99
-
-
-def witness(processor: int) -> None:
-    """Print for each time this processor's most urgent thread woke late when it was due and woke [ns]."""
-    os.sched_setaffinity(0, {processor})
-    become_realtime()
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_TOP_PRIORITY))
-    print("ready", flush=True)
-    due = time.monotonic_ns()
-    while True:
-        due += _WITNESS_PERIOD_NS
-        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
-        now = time.monotonic_ns()
-        if now - due > _PAUSE_NS:
-            print(processor, due, now, flush=True)
-            due = now
-
-
-@contextlib.contextmanager
-def _witnesses() -> Iterator[list[dict[str, int]]]:
-    """Watch every processor; the list is filled at the end."""
-    pauses: list[dict[str, int]] = []
-    with contextlib.ExitStack() as stack:
-        running = []
-        for processor in sorted(os.sched_getaffinity(0)):
-            command = [sys.executable, __file__, "--witness", str(processor)]
-            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            stack.callback(process.kill)
-            if process.stdout is None or process.stdout.readline() != "ready\n":
-                raise SystemExit("the witness was refused SCHED_FIFO: run this where it is granted")
-            running.append(process)
-        yield pauses
-        for process in running:
-            process.kill()
-            out, _ = process.communicate()
-            for line in out.splitlines():
-                number, due, woke = (int(word) for word in line.split())
-                pauses.append({"processor": number, "from_ns": due, "until_ns": woke})
 
 
 def _late_cycles(recording: Episode) -> list[tuple[int, int]]:
@@ -106,23 +65,21 @@ def _late_cycles(recording: Episode) -> list[tuple[int, int]]:
     return late
 
 
-def _judge(overruns: list[tuple[int, int]], pauses: list[dict[str, int]]) -> list[dict[str, Any]]:
+def _judge(overruns: list[tuple[int, int]], seen: Account) -> list[dict[str, Any]]:
     """Return each overrun (due, started) [ns] with the longest pause of any processor while it was late."""
-    rows = []
-    for due, started in overruns:
-        paused = [
-            p["until_ns"] - p["from_ns"] for p in pauses if p["from_ns"] < started and p["until_ns"] > due
-        ]
-        rows.append(
-            {"late_ms": (started - due) * 1e-6, "witness_paused_ms": max(paused, default=0) * 1e-6}
-        )  # fmt: skip
-    return rows
+    return [
+        {
+            "late_ms": (started - due) * 1e-6,
+            "witness_paused_ms": seen.longest_between_ns(due, started) * 1e-6,
+        }
+        for due, started in overruns
+    ]
 
 
 def measure(config: MeasureCadence) -> dict[str, Any]:
     """Run and return the report with the machine it was measured on."""
     load_before = os.getloadavg()
-    with tempfile.TemporaryDirectory() as folder, _witnesses() as pauses, _port(config.port) as port:
+    with tempfile.TemporaryDirectory() as folder, witnesses(_PAUSE_NS) as seen, _port(config.port) as port:
         report = collect(
             Collect(
                 robot="cartpole", port=port, dataset=Path(folder), profile=config.profile,
@@ -137,9 +94,9 @@ def measure(config: MeasureCadence) -> dict[str, Any]:
         "outcome": episode.outcome.value,
         "reason": episode.reason,
         "cadence": episode.cadence.to_json() if episode.cadence is not None else None,
-        "beyond_period": _judge(_late_cycles(recording), pauses),
-        "witness_pauses": len(pauses),
-        "witness_longest_ms": max((p["until_ns"] - p["from_ns"] for p in pauses), default=0) * 1e-6,
+        "beyond_period": _judge(_late_cycles(recording), seen),
+        "witness_pauses": len(seen.pauses),
+        "witness_longest_ms": seen.longest_ns * 1e-6,
         "states_recorded": info.states,
         "cycles_recorded": info.cycles,
         "warnings": list(episode.warnings),
@@ -173,9 +130,7 @@ def _port(given: str | None) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure, or be a witness."""
-    if sys.argv[1:2] == ["--witness"]:
-        witness(int(sys.argv[2]))
+    """Measure and print."""
     print(json.dumps(measure(tyro.cli(MeasureCadence)), indent=1))
 
 

@@ -32,6 +32,8 @@ _MARK: Final = struct.Struct("<IQ")
 _HEADER: Final = bytes.fromhex("00010000")
 _LAYOUT: Final[Mapping[str, tuple[int, int]]] = {LOW_COMMAND: (812, 748), LOW_STATE: (1180, 1104)}
 """Topic -> bytes of its message, and where in them the field wireless_remote stands."""
+LATE_NS: Final = 1_000_000
+"""Cycles that are delayed by more are listed one by one, for the witness to judge [ns]."""
 _MEETING_S: Final = 10.0
 _STALE_NS: Final = 100_000_000
 
@@ -180,7 +182,7 @@ class Controller:
         done_ns = self._clock.now_ns()
         suffers = self._freeze.first and self._freeze.first <= number <= self._freeze.settled
         part = self._frozen if suffers else self._quiet
-        part.delays.append(self._cadence.late_ns + done_ns - begun_ns)
+        part.note(begun_ns - self._cadence.late_ns, done_ns)
         part.works.append(done_ns - begun_ns)
         if self._states.newest_sent_ns:
             part.ages.append(sent_ns - self._states.newest_sent_ns)
@@ -208,10 +210,17 @@ class _Cycles:
     works: array[int] = field(default_factory=lambda: array("q"))
     sends: array[int] = field(default_factory=lambda: array("q"))
     ages: array[int] = field(default_factory=lambda: array("q"))
+    late: array[int] = field(default_factory=lambda: array("q"))
     lost: int = 0
+
+    def note(self, deadline_ns: int, done_ns: int) -> None:
+        self.delays.append(done_ns - deadline_ns)
+        if done_ns - deadline_ns > LATE_NS:
+            self.late.extend((deadline_ns, done_ns))
 
     def to_json(self) -> dict[str, Any]:
         return {
+            "late": list(self.late),
             "cycles": len(self.delays),
             "cycle_delay": _plain(Spread.of(self.delays)),
             "work": _plain(Spread.of(self.works)),

@@ -1,0 +1,123 @@
+"""Witnesses beside a measurement: was a program late, or did the machine stand still?
+
+A witness is a process of the highest real-time priority, pinned to one processor, that does nothing but sleep
+for a millisecond and look at the clock. Where it wakes late, too, no program there could have been on time: a
+virtual machine was taken off its processor, or the kernel was busy with itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from deal_hw.control.realtime import become_realtime
+from deal_hw.errors import ConfigurationError
+
+PERIOD_NS = 1_000_000
+TOP_PRIORITY = 99
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """A time in which a processor's most urgent process did not run.
+
+    Attributes:
+        processor: Its number.
+        from_ns: When the witness was due, on the machine's monotonic clock [ns].
+        until_ns: When it woke [ns].
+    """
+
+    processor: int
+    from_ns: int
+    until_ns: int
+
+
+@dataclass(slots=True)
+class Account:
+    """What the witnesses saw; filled when the block that they watch ends.
+
+    Attributes:
+        pauses: All pauses, by processor and time.
+    """
+
+    pauses: list[Pause] = field(default_factory=list)
+
+    @property
+    def longest_ns(self) -> int:
+        """The longest pause [ns]."""
+        return max((pause.until_ns - pause.from_ns for pause in self.pauses), default=0)
+
+    def longest_between_ns(self, from_ns: int, until_ns: int) -> int:
+        """Return the longest pause that touches an interval [ns]."""
+        touching = [p for p in self.pauses if p.from_ns < until_ns and p.until_ns > from_ns]
+        return max((p.until_ns - p.from_ns for p in touching), default=0)
+
+    def awake_ns(self, from_ns: int, until_ns: int) -> int:
+        """Return how much of an interval lies outside every pause: there the machine ran [ns]."""
+        covered, end = 0, from_ns
+        for pause in sorted(self.pauses, key=lambda p: p.from_ns):
+            begin = max(pause.from_ns, end)
+            if (stop := min(pause.until_ns, until_ns)) > begin:
+                covered += stop - begin
+                end = stop
+        return until_ns - from_ns - covered
+
+
+@contextlib.contextmanager
+def witnesses(least_ns: int, processors: Sequence[int] | None = None) -> Iterator[Account]:
+    """Watch processors while the block runs.
+
+    Args:
+        least_ns: Shorter pauses are not noted [ns].
+        processors: Which; by default all that this process may use.
+
+    Raises:
+        ConfigurationError: SCHED_FIFO was refused.
+    """
+    found = Account()
+    numbers = sorted(os.sched_getaffinity(0)) if processors is None else processors
+    with contextlib.ExitStack() as stack:
+        running = []
+        for number in numbers:
+            command = [sys.executable, "-m", __name__, str(number), str(least_ns)]
+            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            stack.callback(process.kill)
+            if process.stdout is None or process.stdout.readline() != "ready\n":
+                raise ConfigurationError("the witness was refused SCHED_FIFO: measure where it is granted")
+            running.append(process)
+        yield found
+        for process in running:
+            process.kill()
+            out, _ = process.communicate()
+            found.pauses += [
+                Pause(*map(int, line.split())) for line in out.splitlines() if line.count(" ") == 2
+            ]
+
+
+def main() -> None:
+    """Print each pause of a processor: number, when the witness was due and when it woke [ns]."""
+    number, least_ns = int(sys.argv[1]), int(sys.argv[2])
+    os.sched_setaffinity(0, {number})
+    become_realtime()
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(TOP_PRIORITY))
+    except OSError as error:
+        sys.exit(str(error))
+    print("ready", flush=True)
+    due_ns = time.monotonic_ns()
+    while True:
+        due_ns += PERIOD_NS
+        time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+        now_ns = time.monotonic_ns()
+        if now_ns - due_ns > least_ns:
+            print(number, due_ns, now_ns, flush=True)
+            due_ns = now_ns
+
+
+if __name__ == "__main__":
+    main()
