@@ -9,7 +9,8 @@ from deal_hw.errors import TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.types import Status
 
-ATTEMPTS = 5
+ATTEMPTS = 10
+"""Half a second in all: legs that were moving swing out before a robot can show that they are damped."""
 CONFIRM_S = 0.05
 
 
