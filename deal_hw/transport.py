@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Collection
+import dataclasses
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from deal_hw.errors import ConfigurationError
 
@@ -112,6 +113,16 @@ class WireOptions:
     def session_mode(self) -> str:
         """The Zenoh session mode that is meant, "peer" or "client"."""
         return self.mode or ("peer" if self.listen else "client")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> WireOptions:
+        """Return the options that :meth:`to_json` wrote."""
+        files = {k: Path(values[k]) for k in ("ca", "certificate", "key") if values[k] is not None}
+        return cls(**{**values, **files})
 
 
 class TopicTransport(Transport):

@@ -14,7 +14,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
-from deal_hw.transport import Transport, WireOptions
+from deal_hw.transport import TopicTransport, Transport, WireOptions
 
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
@@ -62,6 +62,7 @@ __all__ = [
     "default_transport",
     "driver_description",
     "make_robot",
+    "make_topic_transport",
     "make_transport",
     "parameter_spaces",
     "recorded_description",
@@ -106,14 +107,27 @@ def make_transport(
     transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
 ) -> Transport:
     """Return a transport; nothing is opened yet. Arguments and errors as :func:`make_robot`."""
-    transport = _find("transport", TRANSPORTS, transport_name)
     if transport_name in TOPIC_TRANSPORTS:
-        link: Transport = transport(port, clock, options)
-    elif options is not None and options != WireOptions():
+        return make_topic_transport(transport_name, port, clock, options)
+    transport = _find("transport", TRANSPORTS, transport_name)
+    if options is not None and options != WireOptions():
         raise ConfigurationError(f"transport {transport_name!r} knows none of the network's options")
-    else:
-        link = transport(port, clock=clock)
-    return link
+    made: Transport = transport(port, clock=clock)
+    return made
+
+
+def make_topic_transport(
+    transport_name: str, port: str, clock: Clock, options: WireOptions | None = None
+) -> TopicTransport:
+    """Return a transport of topics; nothing is opened yet.
+
+    Raises:
+        UnknownNameError: There is no such transport, or it carries no topics.
+    """
+    if transport_name not in TOPIC_TRANSPORTS:
+        raise UnknownNameError("transport of topics", transport_name, TOPIC_TRANSPORTS)
+    made: TopicTransport = _find("transport", TRANSPORTS, transport_name)(port, clock, options)
+    return made
 
 
 def adopt_robot(name: str, transport_name: str, fd: int, clock: Clock) -> Robot:

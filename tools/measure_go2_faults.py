@@ -89,7 +89,6 @@ class Rig:
         )  # fmt: skip
         with process:
             self.port = process.port
-            self.emulator_pid = process.pid
             yield process
 
     def start(self) -> subprocess.Popen[str]:

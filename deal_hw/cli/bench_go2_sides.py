@@ -7,7 +7,6 @@ processes run on one machine, so their clocks are the same and ages are exact.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import os
 import signal
@@ -17,13 +16,12 @@ import time
 from array import array
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.cadence import Cadence, Spread
 from deal_hw.control.realtime import become_realtime, die_with_parent
-from deal_hw.drivers import TRANSPORTS
+from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import DealHwError, TransportError, TransportLostError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport, WireOptions
@@ -284,9 +282,9 @@ def main() -> int:
     orders = json.load(sys.stdin)
     die_with_parent(orders["parent_pid"])
     clock = MonotonicClock()
-    module, _, name = TRANSPORTS[orders["transport"]].partition(":")
-    made = getattr(importlib.import_module(module), name)
-    transport: TopicTransport = made(orders["port"], clock, _wire(orders["wire"]))
+    transport = make_topic_transport(
+        orders["transport"], orders["port"], clock, WireOptions.from_json(orders["wire"])
+    )
     granted = become_realtime()
     try:
         result = _run(sys.argv[1], transport, clock, orders)
@@ -296,11 +294,6 @@ def main() -> int:
         transport.close()
     print(json.dumps({**result, "scheduling": granted.scheduling, "warnings": granted.warnings}), flush=True)
     return 0
-
-
-def _wire(values: Mapping[str, Any]) -> WireOptions:
-    files = {k: Path(values[k]) for k in ("ca", "certificate", "key") if values[k] is not None}
-    return WireOptions(**{**values, **files})
 
 
 def _run(side: str, transport: TopicTransport, clock: Clock, orders: Mapping[str, Any]) -> dict[str, Any]:

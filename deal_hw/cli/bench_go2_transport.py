@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -15,6 +14,7 @@ import tyro
 from deal_hw.cli.bench_go2_process import SideProcess
 from deal_hw.cli.bench_go2_sides import LATE_NS
 from deal_hw.cli.emulate_go2 import free_port
+from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.cli.witness import Account, witnesses
 from deal_hw.errors import ConfigurationError
 from deal_hw.transport import WireOptions
@@ -104,9 +104,7 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
         "rate_hz": settings.rate,
         "cycles": round(settings.seconds * settings.rate),
     }
-    wire = {
-        key: str(value) if isinstance(value, Path) else value for key, value in asdict(settings.wire).items()
-    }
+    wire = settings.wire.to_json()
     # Zenoh needs one side that waits, and a client cannot; DDS does not care.
     robot_wire, wire = {**wire, "listen": True, "mode": "peer"}, {**wire, "listen": False}
     with (
@@ -118,8 +116,8 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
         with SideProcess("controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
             controller.expect("ready", _START_S)
             controller.expect("running", _START_S)
-            with _progress(f"go2-transport {settings.transport}", settings.seconds, quiet) as update:
-                measured = controller.result(settings.seconds + _END_S, update)
+            with seconds_bar(f"go2-transport {settings.transport}", settings.seconds, quiet) as bar:
+                measured = controller.result(settings.seconds + _END_S, bar.passed)
         robot.stop()
         other = robot.result(_END_S)
     return {**measured, "account": seen}, other
@@ -271,17 +269,3 @@ def lines(row: Mapping[str, Any]) -> list[str]:
 def _ms(spread: Mapping[str, float | None]) -> str:
     values = (spread[name] for name in ("p50_s", "p99_s", "max_s"))
     return " / ".join("-" if v is None else f"{v * 1e3:.3f}" for v in values) + " ms"
-
-
-@contextlib.contextmanager
-def _progress(title: str, seconds: float, quiet: bool) -> Iterator[Callable[[float], None]]:
-    if quiet or not sys.stderr.isatty():
-        yield lambda passed: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=seconds)
-        yield lambda passed: bar.update(task, completed=min(passed, seconds))

@@ -13,8 +13,8 @@ import tyro
 
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_transport
-from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
+from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_topic_transport
+from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
 
@@ -112,10 +112,8 @@ def _examine(config: Doctor) -> Iterator[Finding]:
 
     clock = MonotonicClock()
     try:
-        link = make_transport(name, config.port, clock, config.wire)
+        link = make_topic_transport(name, config.port, clock, config.wire)
         yield from Checkup(link, clock, config.seconds).run()
-    except MissingExtraError as error:
-        yield Finding("link", Level.FAIL, str(error))
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
 
@@ -130,6 +128,4 @@ def _interfaces(port: str) -> Iterator[Finding]:
         elif not interface.multicast and not interface.loopback and interface.up:
             level = Level.WARN
             remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
-        elif any(address.startswith("192.168.123.") for address in interface.addresses):
-            remedy = ""
         yield Finding("interfaces", level, str(interface), remedy)

@@ -93,14 +93,12 @@ class RunPlan:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        values = dataclasses.asdict(self)
-        values["wire"] = {key: str(v) if isinstance(v, Path) else v for key, v in values["wire"].items()}
-        return values
+        return {**dataclasses.asdict(self), "wire": self.wire.to_json()}
 
     @property
     def total_s(self) -> float:
         """Length of the run with standing up and lying down [s]."""
-        return self.seconds + (self.posture.before_s + self.posture.lie_s if self.stand else 0.0)
+        return self.seconds + (self.posture.added_s if self.stand else 0.0)
 
     def velocity_source(self) -> VelocitySource:
         """Return where the wanted velocity comes from.
@@ -117,15 +115,11 @@ class RunPlan:
         rich = dict(known["rich"])
         rich["hold_s"] = tuple(rich["hold_s"])
         rich["segments"] = tuple(Segment(**part) for part in rich["segments"])
-        wire: dict[str, Any] = {
-            key: Path(value) if value is not None and key in ("ca", "certificate", "key") else value
-            for key, value in known["wire"].items()
-        }
         return cls(
             **{
                 **known,
                 "rich": RichConfig(**rich),
-                "wire": WireOptions(**wire),
+                "wire": WireOptions.from_json(known["wire"]),
                 "posture": PostureConfig(**known["posture"]),
             }
         )

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from deal_hw import __version__, errors
 from deal_hw.cli.keyboard import check_terminal, keys
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.cadence import CadenceReport
 from deal_hw.control.handover import Beat
@@ -371,26 +372,18 @@ def print_report(report: EpisodeReport) -> None:
 @contextlib.contextmanager
 def _progress(title: str, seconds: float) -> Iterator[Callable[[Beat], None]]:
     """Show a progress bar on a terminal; nothing otherwise."""
-    if not sys.stderr.isatty():
-        yield _ignore
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=seconds)
+    with seconds_bar(title, seconds) as bar:
         started_ns = 0
 
         def on_beat(beat: Beat) -> None:
             nonlocal started_ns
             if beat.phase != RUNNING:
-                bar.update(task, description=f"{title}: {beat.phase}")
+                bar.say(f"{title}: {beat.phase}")
                 return
             if not started_ns:
                 started_ns = beat.stamp_ns
-                bar.update(task, description=title)
+                bar.say(title)
             if beat.count % 10 == 0:
-                bar.update(task, completed=(beat.stamp_ns - started_ns) * 1e-9)
+                bar.passed((beat.stamp_ns - started_ns) * 1e-9)
 
         yield on_beat

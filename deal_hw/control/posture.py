@@ -39,6 +39,11 @@ class PostureConfig:
         """Time before the behaviour begins [s]."""
         return self.fold_s + self.rise_s + self.settle_s
 
+    @property
+    def added_s(self) -> float:
+        """Time that standing up and lying down add to the behaviour's [s]."""
+        return self.before_s + self.lie_s
+
 
 class PostureBehaviour:
     """Stands up, does what it is given, lies down.
@@ -74,7 +79,7 @@ class PostureBehaviour:
     @property
     def duration_s(self) -> float:
         """Length of all parts together [s]."""
-        return self._config.before_s + self._seconds + self._config.lie_s
+        return self._seconds + self._config.added_s
 
     def reset(self) -> None:
         """Begin anew."""

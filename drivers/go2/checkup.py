@@ -13,18 +13,18 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.control.leg_checks import tilt
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, Services
 from deal_hw.drivers.go2.remote import decode_remote
-from deal_hw.drivers.go2.rpc import Request, decode_response, encode_request
+from deal_hw.drivers.go2.state_stream import PERIOD_MS
 from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
 from deal_hw.findings import Finding, Level
-from deal_hw.transport import Message, Transport
+from deal_hw.transport import Message, TopicTransport
 
-SERVICE: Final = "motion_switcher"
-CHECK_MODE: Final = 1001
 ROUND_TRIPS: Final = 20
-_STATE_HZ: Final = 500.0
+_STATE_HZ: Final = 1000.0 / PERIOD_MS
 _SLOW_ROUND_TRIP_S: Final = 0.02
 _ANSWER_S: Final = 1.0
 _LATE_S: Final = 0.01
@@ -50,7 +50,7 @@ class Checkup:
         seconds: How long to listen [s].
     """
 
-    def __init__(self, link: Transport, clock: Clock, seconds: float) -> None:
+    def __init__(self, link: TopicTransport, clock: Clock, seconds: float) -> None:
         self._link, self._clock, self._seconds = link, clock, seconds
 
     def run(self) -> Iterator[Finding]:
@@ -59,12 +59,11 @@ class Checkup:
         Raises:
             TransportError: It cannot be opened.
         """
-        declare = getattr(self._link, "declare", None)
-        if declare is None:
+        if not isinstance(self._link, TopicTransport):
             raise TransportError(f"{type(self._link).__name__} carries no topics")
-        declare(
-            publish=[topics.request(SERVICE)],
-            subscribe=[topics.LOW_STATE, topics.LOW_COMMAND, topics.response(SERVICE)],
+        self._link.declare(
+            publish=[topics.request(SWITCHER)],
+            subscribe=[topics.LOW_STATE, topics.LOW_COMMAND, topics.response(SWITCHER)],
         )
         with self._link:
             yield Finding("link", Level.OK, "the transport is open")
@@ -72,7 +71,7 @@ class Checkup:
             yield from self._discovery()
             yield from _judge_states(heard, self._seconds)
             mode = yield from self._ask_mode()
-            yield from _judge_commands(heard, self._writers(), mode or "")
+            yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode or "")
             if heard.last is not None:
                 yield from _judge_robot(heard.last)
 
@@ -85,10 +84,6 @@ class Checkup:
             except TransportTimeoutError:
                 break
         return heard
-
-    def _writers(self) -> tuple[str, ...]:
-        writers = getattr(self._link, "writers", None)
-        return tuple(writers(topics.LOW_COMMAND)) if writers is not None else ()
 
     def _discovery(self) -> Iterator[Finding]:
         survey = getattr(self._link, "survey", None)
@@ -111,21 +106,24 @@ class Checkup:
 
     def _ask_mode(self) -> Generator[Finding, None, str | None]:
         """Yield what the motion switcher tells; return the active mode's name, None without an answer."""
+        services = Services(
+            self._send, lambda timeout_s: services.take(self._link.receive(timeout_s)), self._clock
+        )
         times: list[float] = []
-        answer = None
-        for number in range(ROUND_TRIPS):
-            begun = self._clock.now_ns()
-            identity = begun + number
-            payload = encode_request(Request(identity=identity, api=CHECK_MODE))
-            self._link.send(Message(topics.request(SERVICE), payload, begun))
-            found = self._answer(identity)
-            if found is None:
+        name = None
+        for _ in range(ROUND_TRIPS):
+            begun_ns = self._clock.now_ns()
+            try:
+                name = str(services.ask(SWITCHER, CHECK_MODE, {}, _ANSWER_S).get("name", ""))
+            except TransportTimeoutError:
                 break
-            answer = found[0]
-            times.append((found[1] - begun) * 1e-9)
-        if answer is None:
+            except (RefusedError, FrameError) as error:
+                yield Finding("services", Level.WARN, str(error), "restart the robot if it persists")
+                return None
+            times.append((self._clock.now_ns() - begun_ns) * 1e-9)
+        if name is None:
             yield Finding(
-                "services", Level.WARN, f"the service {SERVICE} does not answer",
+                "services", Level.WARN, f"the service {SWITCHER} does not answer",
                 "older firmware has the service robot_state instead; deal-hw tries that one, too",
             )  # fmt: skip
             return None
@@ -138,26 +136,11 @@ class Checkup:
             "link", Level.WARN if slow else Level.OK, text,
             "a cable instead of wireless; stop what else loads network and computer" if slow else "",
         )  # fmt: skip
-        yield _judge_mode(answer)
-        return answer
+        yield _judge_mode(name)
+        return name
 
-    def _answer(self, identity: int) -> tuple[str, int] | None:
-        """Return the active mode's name and the answer's stamp [ns]; None: no answer."""
-        until_ns = self._clock.now_ns() + round(_ANSWER_S * 1e9)
-        while (left_ns := until_ns - self._clock.now_ns()) > 0:
-            try:
-                message = self._link.receive(left_ns * 1e-9)
-            except TransportTimeoutError:
-                return None
-            if message.channel != topics.response(SERVICE):
-                continue
-            try:
-                response = decode_response(message.payload)
-                if response.identity == identity:
-                    return str(response.json().get("name", "")), message.stamp_ns
-            except FrameError:
-                continue
-        return None
+    def _send(self, topic: str, payload: bytes) -> None:
+        self._link.send(Message(topic, payload, self._clock.now_ns()))
 
 
 def _take(heard: _Heard, message: Message) -> None:
@@ -203,7 +186,7 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     if (steps == 0).all():
         yield Finding("states", Level.FAIL, "the robot's clock (tick) stands still", "restart the robot")
         return
-    missing = int(np.sum(np.maximum(steps // 2 - 1, 0)))
+    missing = int(np.sum(np.maximum(steps // PERIOD_MS - 1, 0)))
     back = int(np.sum(steps <= 0))
     if missing or back:
         yield Finding(
@@ -247,10 +230,8 @@ def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
         "robot", Level.WARN if hot else Level.OK, f"hottest motor {hottest} °C",
         "let it cool down" if hot else "",
     )  # fmt: skip
-    w, x, y, z = (float(value) for value in frame.orientation)
-    upright = 1.0 - 2.0 * (x * x + y * y)
-    lean = math.degrees(math.acos(max(-1.0, min(1.0, upright))))
-    tilted = not lean < 30.0 or not abs(w * w + x * x + y * y + z * z - 1.0) < 0.01
+    lean = math.degrees(tilt(frame.orientation))
+    tilted = not lean < 30.0 or not abs(float(frame.orientation @ frame.orientation) - 1.0) < 0.01
     yield Finding(
         "robot", Level.WARN if tilted else Level.OK, f"the body leans by {lean:.0f} degrees",
         "set it down level" if tilted else "",

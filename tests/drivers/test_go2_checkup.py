@@ -14,6 +14,7 @@ from deal_hw.drivers.go2.checkup import Checkup
 from deal_hw.drivers.go2.device import Go2Device
 from deal_hw.drivers.go2.faults import FaultPlan
 from deal_hw.drivers.go2.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.rpc import decode_response, encode_response
 from deal_hw.drivers.go2.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import TransportError
@@ -184,3 +185,16 @@ def test_faults_of_the_emulator_reach_the_doctor() -> None:
     """A tenth of the states corrupt: they are refused by their checksum and reported."""
     findings = examine(plan=FaultPlan(corrupt=0.1))
     assert any(f.level is Level.FAIL and "no Go2 states" in f.message for f in findings)
+
+
+def test_a_refused_question_is_not_taken_for_a_free_robot() -> None:
+    """A switcher that answers with an error names no mode either; the finding has the error's words."""
+
+    def refuse(topic: str, payload: bytes) -> Iterable[bytes]:
+        if topic != topics.response("motion_switcher"):
+            return (payload,)
+        return (encode_response(dataclasses.replace(decode_response(payload), code=7006, data="")),)
+
+    findings = examine(tamper=refuse)
+    assert only(findings, "services", "checking the mode failed").level is Level.WARN
+    assert not any("low level is free" in f.message for f in findings)
