@@ -17,6 +17,9 @@ from deal_hw.calib.problem import Problem
 from deal_hw.types import FloatArray
 
 LATENCY = "latency"
+WIDE = 10.0
+"""What is not in the data is known to be within so many ranges: hardly. Held to the range itself, a kind that
+the data leave open looks known, and what goes with it is not named."""
 NARROWER = math.sqrt(2.0)
 """Kinds are confounded where fixing one makes the other's interval narrower by this factor: half of what is
 not known of the one is what is not known of the other."""
@@ -54,14 +57,14 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
     """Return the confounded pairs of kinds, the worst first.
 
     Args:
-        problem: Says which parameter is of which kind, and the ranges, which are the prior.
+        problem: Says which parameter is of which kind, and the ranges.
         information: What the data say of parameters, in their own scale, and latency, (K + 1, K + 1); without
             any prior.
     """
     space = problem.space
     low, high = problem.latency_range_s
-    flat = 12.0 / np.append(space.width, high - low) ** 2
-    precision = information + np.diag(flat)
+    hardly = 12.0 / (WIDE * np.append(space.width, high - low)) ** 2
+    precision = information + np.diag(hardly)
     kinds = {kind: [k for k, p in enumerate(space) if p.kind == kind] for kind in {p.kind for p in space}}
     if problem.fixed_latency_s is None:
         kinds[LATENCY] = [len(space)]

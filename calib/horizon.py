@@ -22,7 +22,7 @@ from deal_hw.calib.robust import huber_weights
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
-ITERATIONS = 12
+ITERATIONS = 20
 DAMPINGS = 10.0 ** np.arange(-4.0, 3.0, 1.5)
 CONVERGED = 2e-3
 """An iteration that lowers the cost by a smaller share is the last: held-out motion does not see it."""
@@ -85,7 +85,13 @@ class HorizonFit:
 
 
 def fit_horizon(
-    problem: Problem, theta: FloatArray, latency_s: float, recipe: Recipe, *, iterations: int = ITERATIONS
+    problem: Problem,
+    theta: FloatArray,
+    latency_s: float,
+    recipe: Recipe,
+    *,
+    iterations: int = ITERATIONS,
+    central: bool = False,
 ) -> HorizonFit:
     """Fit from a start.
 
@@ -95,6 +101,7 @@ def fit_horizon(
         latency_s: Its latency [s].
         recipe: How.
         iterations: Most iterations; 0 to linearise at the start.
+        central: Linearise the end by central differences, for what is said of the parameters there.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -106,7 +113,7 @@ def fit_horizon(
     value = np.append(space.to_scale(np.clip(theta, space.low, space.high)), latency_s)
     stage = _Stage(problem, longest_windows(problem, recipe.seconds), recipe)
     value, used = stage.solve(value, iterations)
-    return stage.summary(value, used)
+    return stage.summary(value, used, central=central)
 
 
 def prediction_rmse(
@@ -217,9 +224,13 @@ class _Stage:
                 break
         return value, used
 
-    def summary(self, value: FloatArray, used: int) -> HorizonFit:
+    def summary(self, value: FloatArray, used: int, *, central: bool) -> HorizonFit:
         """Return what is known at a value, (K + 1,)."""
         residual, jacobian = self._linear(value)
+        if central:
+            # A one-sided difference's truncation looks like information where there is none.
+            backward = self._linear(value, -1.0)[1]
+            jacobian = [(a + b) / 2 for a, b in zip(jacobian, backward, strict=True)]
         weights, scale, correlation = self._weights(residual)
         gradient, hessian = np.zeros(len(value)), np.zeros((len(value), len(value)))
         rows = []
@@ -241,14 +252,20 @@ class _Stage:
             iterations=used,
         )
 
-    def _linear(self, value: FloatArray) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return residuals, (W, H, M), and their derivatives, (W, H, M, K + 1), of each episode."""
+    def _linear(self, value: FloatArray, way: float = 1.0) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return residuals, (W, H, M), and their derivatives, (W, H, M, K + 1), of each episode.
+
+        Args:
+            value: Where, (K + 1,).
+            way: 1 for forward differences, -1 for backward ones; what leaves the range goes the other way.
+        """
         K = len(value) - 1
         steps = np.append(np.full(K, PARAMETER_STEP), LATENCY_STEP_S)
         count = K + (not self._fixed)
         values = np.repeat(value[None], 1 + count, axis=0)
-        # A difference that leaves the range is taken inwards.
-        sign = np.where(value + steps > self._high, -1.0, 1.0)
+        sign = np.full(K + 1, way)
+        sign[value + way * steps > self._high] = -1.0
+        sign[value + way * steps < self._low] = 1.0
         values[1:] += np.diag(sign * steps)[:count]
         residuals, jacobians = [], []
         for r in self.residuals(values):

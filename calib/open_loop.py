@@ -7,7 +7,7 @@ search that stops early or a fit that goes on predicts other motion better, and 
 2. the ensemble search (:mod:`deal_hw.calib.weki`) is run with these;
 3. on inner folds of the recordings that are fitted, motion by motion, the search's estimate, fits over short
    and long horizons (robust or not, with a latency or none, held to the model's own values or hardly) and the
-   mean of fits over several horizons predict what they have not seen;
+   mean of fits over all horizons predict what they have not seen;
 4. what predicts best is fitted to all, its halves are compared, and what goes with what is said.
 
 Recordings that are held out take no part in any of this.
@@ -118,7 +118,8 @@ class OpenLoop(CalibrationMethod[Problem]):
             choice.chosen
         ]
         recipe = _recipe(choice.chosen)
-        fit = fit_horizon(problem, theta, latency_s, dataclasses.replace(recipe, latency=True), iterations=0)
+        recipe_there = dataclasses.replace(recipe, latency=True)
+        fit = fit_horizon(problem, theta, latency_s, recipe_there, iterations=0, central=True)
         known = _known(problem, fit)
         halves = _halves(problem, fit, recipe, known)
         known = heed(problem, known, theta, halves)
@@ -270,6 +271,8 @@ class _Work:
             for seconds in self._horizons_s:
                 recipe = Recipe(seconds=seconds, prior_std=prior_std)
                 horizons.append(_member(fit_horizon(problem, *horizons[-1], recipe)))
+            for seconds, member in zip(self._horizons_s[:-1], horizons[1:], strict=False):
+                found[f"{seconds:g} s{words}"] = member
             found["long" + words] = horizons[-1]
             found["mean of horizons" + words] = _mean(problem, horizons[1:])
         for name, recipe in VARIANTS.items():
@@ -350,7 +353,7 @@ def _halves(problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertaint
     for mask in fold_masks(problem, 2):
         try:
             half = fit_horizon(
-                problem.part(mask), fit.theta, fit.latency_s, recipe, iterations=HALF_ITERATIONS
+                problem.part(mask), fit.theta, fit.latency_s, recipe, iterations=HALF_ITERATIONS, central=True
             )
         except InsufficientDataError as err:
             return Halves((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")

@@ -19,7 +19,7 @@ from deal_hw.calib.noise import NoiseModel, noise_model, white_noise_std
 from deal_hw.calib.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import ServoBatch
+from deal_hw.sim.batch import BatchPool, ServoBatch
 from deal_hw.sim.episode import Episode, fill_gaps
 from deal_hw.sim.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
@@ -123,9 +123,11 @@ class Problem:
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
-    _batches: dict[int, ServoBatch] = field(init=False, default_factory=dict)
+    _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:
+        robot, space, threads = self.robot, self.space, self.threads
+        self._batches = BatchPool(lambda count: ServoBatch(robot, space, count, threads))
         if not self.episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
         self.episodes = [fill_gaps(e) for e in self.episodes]
@@ -184,7 +186,7 @@ class Problem:
     @property
     def steps(self) -> int:
         """Physics steps simulated so far."""
-        return sum(batch.steps for batch in self._batches.values())
+        return self._batches.steps
 
     def part(self, chosen: Sequence[npt.NDArray[np.bool_]]) -> Problem:
         """Return the problem with only these samples of each recording usable.
@@ -219,10 +221,8 @@ class Problem:
         return tuple(every[c] for c in self.channels)
 
     def batch(self, count: int) -> ServoBatch:
-        """Return the simulator of ``count`` members; made once for each count."""
-        if count not in self._batches:
-            self._batches[count] = ServoBatch(self.robot, self.space, count, self.threads)
-        return self._batches[count]
+        """Return the simulator of ``count`` members, kept while it is among the last used sizes."""
+        return self._batches.get(count)
 
     def measured(self, index: int) -> FloatArray:
         """Return the measured channels of an episode, (T, M)."""

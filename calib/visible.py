@@ -1,4 +1,4 @@
-"""Which parameters a recording can see at all: looked up before any long work, by a few rollouts."""
+"""Which parameters a recording can see at all, and whether smoothly: a few rollouts before any long work."""
 
 from __future__ import annotations
 
@@ -17,6 +17,15 @@ MOST_WINDOWS = 12
 NOTHING = 1e-9
 """Predictions that agree to this many standard deviations of the noise are the same [-]."""
 FAINT = 1.0
+
+NUDGE = 1e-6
+"""A parameter is changed by so much, in its own scale, to see whether predictions jump."""
+PUSH = 1e-3
+"""And by so much to see how steep they really are."""
+JUMP = 10.0
+"""A nudge that changes predictions by so many times what the push says is a jump."""
+MANY = 0.2
+"""Share of windows that must jump: where a contact begins or ends at another moment some do, by no fault."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +71,38 @@ def look(problem: Problem) -> Visibility:
         change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
         effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
     return Visibility(space.names, effect)
+
+
+def jumps(problem: Problem) -> dict[str, float]:
+    """Return the parameters whose smallest change makes predictions jump, and by how many of their units.
+
+    Fits follow derivatives, and those of a simulator whose solver stops early are noise: two frictions at one
+    joint are divided between them as it happens.
+
+    Raises:
+        InsufficientDataError: The recordings hold no window.
+    """
+    space = problem.space
+    K = len(space)
+    value = space.to_scale(space.nominal)
+    # Towards the middle of the range, or a value at its end would be nudged to nothing.
+    inwards = np.where(value > (space.to_scale(space.low) + space.to_scale(space.high)) / 2, -1.0, 1.0)
+    values = np.repeat(value[None], 1 + 2 * K, axis=0)
+    values[1 : 1 + K] += NUDGE * np.diag(inwards)
+    values[1 + K :] += PUSH * np.diag(inwards)
+    theta = space.from_scale(values)
+    latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
+    changes = []
+    for data in _some(_windows(problem)):
+        predicted = problem.predict(theta, latency, data).observed
+        change = np.where(np.isfinite(data.std), np.abs(predicted[1:] - predicted[:1]), 0.0)
+        changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
+    nudged, pushed = np.split(np.concatenate(changes, axis=1), 2)
+    jumping = nudged > np.maximum(
+        JUMP * NUDGE / PUSH * pushed, NOTHING * np.min(problem.noise_std[problem.channels])
+    )
+    rough = np.mean(jumping, axis=1) > MANY
+    return {name: float(nudged[k].max()) for k, name in enumerate(space.names) if rough[k]}
 
 
 def require_visible(found: Visibility) -> None:

@@ -1,9 +1,15 @@
-"""Does memory stay flat over generations? Resident memory of each search, generation by generation.
+"""Does memory stay flat over generations? Memory of each method, generation by generation or run by run.
 
-Each method runs in a process of its own on a short cart-pole recording. A search that ends before the wanted
-number of generations is run again on the same problem with another seed, so that what a run leaves behind
-shows. The growth is that of a straight line through the second half of the generations: by then libraries are
-loaded and buffers have their size.
+Each method runs in a process of its own on a short cart-pole recording. A search is looked at after every
+generation; one that ends before the wanted number is run again on the same problem with another seed, so that
+what a run leaves behind shows. A method that is one optimiser's call, or decides itself what follows its
+search, is run again and again and looked at after every run.
+
+Two figures are taken. The resident memory is what the system lends to the process. What malloc has handed out
+(glibc only) is what somebody still holds, in Python, NumPy, torch and MuJoCo: without memory that was freed
+and waits to be used again, with addresses that were never written to. No garbage is collected and no memory
+is trimmed for the measurement's sake. The first half of the values is warm-up: by its end libraries are
+loaded and buffers have their size. A straight line through the second half is the growth.
 
     python tools/measure_memory.py --out docs/measured/memory.json
 """
@@ -11,12 +17,14 @@ loaded and buffers have their size.
 from __future__ import annotations
 
 import argparse
-import gc
+import ctypes
 import json
+import platform
 import subprocess
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,97 +36,209 @@ from deal_hw.sim.episode import align
 from deal_hw.sim.model import load_model
 from deal_hw.testing.simulated_episode import simulated_episode
 
-METHODS = (
-    "weki", "deal", "deal-paper", "easi", "bo", "cma", "gauss-newton", "ekf", "least-squares",
-    "least-squares-multistart", "random",
+Unit = Literal["generation", "run"]
+
+POLISHED = "default, polished"
+"""What `deal-hw calibrate` does without options."""
+
+SEARCHES = (
+    "weki", "deal", "deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "deal-paper-flat",
+    "easi", "bo", "cma", "gauss-newton", "ekf", "random",
 )  # fmt: skip
-"""Each search once; the variants of deal-paper share its code."""
+"""Methods with generations; a generation of `ekf` is a pass along the recording."""
 
-FLAT_MIB = 1.0
-"""Growth in a hundred generations below this is the allocator's, not the search's [MiB]."""
+WHOLES = ("least-squares", "least-squares-multistart", "mujoco-sysid", "near", "open-loop", POLISHED)
+"""Methods without; `centre` and `nominal`, which only draw once, are not measured."""
 
-MIB = 1024.0**2
+LONGER = {"bo": 2, "gauss-newton": 4}
+"""Times as many generations: until the Gaussian process has its most points (49 generations), and until
+`gauss-newton` has begun anew (62 draws, some 25 refinements)."""
+
+LEAST_SECONDS = {"near": 1.6, "open-loop": 1.6, POLISHED: 1.6}
+"""Recordings that these refuse to judge are shorter [s]."""
+
+RUN_GENERATIONS = 5
+"""So many generations are given to one run of a method without; a run is wanted for as many."""
+
+FLAT_KIB: Mapping[Unit, float] = {"generation": 10.0, "run": 10.0 * RUN_GENERATIONS}
+"""Growth below this is chance: 1 MiB in a hundred generations [KiB]."""
+
+KIB, MIB = 1024.0, 1024.0**2
 
 
 class Enough(Exception):  # noqa: N818
-    """The wanted number of generations is reached."""
+    """The wanted number of values is there."""
 
 
-def watch(method: str, generations: int, population: int, seconds: float) -> dict[str, Any]:
-    """Run a search for so many generations and return its resident memory after each.
+class MallocInfo(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks",
+            "keepcost",
+        )
+    ]  # fmt: skip
+
+
+def heap_reader() -> Callable[[], float] | None:
+    """Return a function that gives what malloc has handed out [MiB]; None where the C library cannot tell."""
+    ask = getattr(ctypes.CDLL(None), "mallinfo2", None) if sys.platform == "linux" else None
+    if ask is None:
+        return None
+    ask.restype = MallocInfo
+
+    def read() -> float:
+        info = ask()
+        return float(info.uordblks + info.hblkhd) / MIB
+
+    return read
+
+
+class Series:
+    """Memory after each generation or run.
 
     Args:
-        method: Name of the method.
-        generations: Generations, over as many runs as it takes.
-        population: Members.
-        seconds: Length of the recording [s].
+        wanted: Values to take.
     """
-    import psutil
 
+    def __init__(self, wanted: int) -> None:
+        import psutil
+
+        self._process, self._heap, self._wanted = psutil.Process(), heap_reader(), wanted
+        self.rss: list[float] = []
+        self.held: list[float] = []
+
+    def take(self) -> None:
+        """Take a value.
+
+        Raises:
+            Enough: It was the last.
+        """
+        self.rss.append(self._process.memory_info().rss / MIB)
+        if self._heap is not None:
+            self.held.append(self._heap())
+        if len(self.rss) >= self._wanted:
+            raise Enough
+
+    def note(self, progress: Progress) -> None:
+        """Take a value after a generation of the search."""
+        if progress.stage == "search":
+            self.take()
+
+
+def make_problem(seconds: float) -> Problem:
+    """Return a problem with a recording of so many seconds."""
     space = k9_space().with_ratio(5.0)
     theta = space.unnormalize(np.random.default_rng(1).uniform(0.3, 0.7, len(space)))
     made = simulated_episode(DESCRIPTION, space, theta, seconds=seconds, latency_ticks=5, sensor=True, seed=1)
-    problem = Problem(load_model(DESCRIPTION), space, [align(made, DESCRIPTION)], threads=1)
-    process, rss, runs = psutil.Process(), [], 0
+    return Problem(load_model(DESCRIPTION), space, [align(made, DESCRIPTION)], threads=1)
 
-    def note(progress: Progress) -> None:
-        gc.collect()
-        rss.append(process.memory_info().rss / MIB)
-        if len(rss) >= generations:
-            raise Enough
 
+def watch(method: str, generations: int, population: int, seconds: float) -> dict[str, Any]:
+    """Run a method as often as it takes and return its memory over generations or runs.
+
+    Args:
+        method: Name of the method.
+        generations: Generations that are wanted.
+        population: Members.
+        seconds: Length of the recording [s].
+    """
+    polish = method == POLISHED
+    unit: Unit = "run" if method in WHOLES else "generation"
+    generations *= LONGER.get(method, 1)
+    wanted = generations if unit == "generation" else max(generations // RUN_GENERATIONS, 4)
+    each = generations if unit == "generation" else RUN_GENERATIONS
+    series = Series(wanted)
+    problem, runs = make_problem(max(seconds, LEAST_SECONDS.get(method, 0.0))), 0
+    budget = Budget(population=population, generations=each, polish=polish)
     try:
         while True:
             runs += 1
-            budget = Budget(population=population, generations=generations, polish=False)
-            make_method(method).run(problem, budget, np.random.default_rng(runs), note)
+            made = make_method("default" if polish else method, polish=polish)
+            note = series.note if unit == "generation" else None
+            made.run(problem, budget, np.random.default_rng(runs), note)
+            if unit == "run":
+                series.take()
     except Enough:
         pass
-    return {"method": method, "runs": runs, "rss_mib": [round(value, 2) for value in rss], **summary(rss)}
+    return {"method": method, "unit": unit, "runs": runs, **summary(series.rss, series.held, FLAT_KIB[unit])}
 
 
-def summary(rss_mib: list[float]) -> dict[str, Any]:
-    """Return what a series of resident memory says, one value a generation [MiB]."""
-    late = np.array(rss_mib[len(rss_mib) // 2 :])
-    slope = float(np.polyfit(np.arange(len(late)), late, 1)[0]) if len(late) > 1 else 0.0
+def slope_kib(values: Sequence[float]) -> float:
+    """Return the growth of a straight line through the second half of values [MiB], in KiB a value."""
+    late = np.asarray(values[len(values) // 2 :])
+    return float(np.polyfit(np.arange(len(late)), late, 1)[0]) * KIB if len(late) > 1 else 0.0
+
+
+def verdict(rss: float, held: float | None, most: float) -> str:
+    """Say what slopes mean, of which so much is chance [KiB a value]."""
+    if rss < most and (held is None or held < most):
+        return "flat"
+    if held is not None and held < most:
+        return "nothing more is held; malloc keeps freed memory"
+    return "grows"
+
+
+def summary(rss: Sequence[float], held: Sequence[float], most_kib: float) -> dict[str, Any]:
+    """Return what two series of memory say [MiB]."""
+    grown = slope_kib(held) if held else None
     return {
-        "generations": len(rss_mib),
-        "first_mib": round(rss_mib[0], 1),
-        "last_mib": round(rss_mib[-1], 1),
-        "growth_mib_per_100_generations": round(100 * slope, 3),
-        "flat": 100 * slope < FLAT_MIB,
+        "count": len(rss),
+        "warm_up": len(rss) // 2,
+        "first_mib": round(rss[0], 1),
+        "last_mib": round(rss[-1], 1),
+        "rss_kib_each": round(slope_kib(rss), 2),
+        "held_kib_each": None if grown is None else round(grown, 2),
+        "verdict": verdict(slope_kib(rss), grown, most_kib),
+        "rss_mib": [round(value, 2) for value in rss],
+        "held_mib": [round(value, 2) for value in held],
     }
 
 
+def measured(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Measure a method in a process of its own: what another method left would hide growth."""
+    words = [sys.executable, __file__, "--one", "--methods", method]
+    words += [f"--{key}={value}" for key, value in settings.items()]
+    done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)
+    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return row
+
+
+def write(path: Path, settings: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write settings and rows, a line each; rows of other methods stay where the settings are the same."""
+    settings = {**settings, "flat_kib": FLAT_KIB, "libc": " ".join(platform.libc_ver())}
+    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    kept = before["rows"] if before.get("settings") == settings else []
+    found = {row["method"]: row for row in (*kept, *rows)}
+    lines = ",\n".join(json.dumps(found[m]) for m in (*SEARCHES, *WHOLES) if m in found)
+    path.write_text(f'{{"settings": {json.dumps(settings)},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
+
+
 def main() -> int:
-    """Measure and write one JSON file; return 1 where a search grows."""
+    """Measure and write one JSON file; return 1 where a method grows."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--methods", nargs="+", default=list(METHODS))
-    parser.add_argument("--generations", type=int, default=200)
-    parser.add_argument("--population", type=int, default=32)
-    parser.add_argument("--seconds", type=float, default=1.2, help="length of the recording")
+    parser.add_argument("--methods", nargs="+", default=[*SEARCHES, *WHOLES])
+    parser.add_argument("--generations", type=int, default=60)
+    parser.add_argument("--population", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=0.6, help="length of the recording")
     parser.add_argument("--out", type=Path, default=None, help="file to write; printed only without it")
     parser.add_argument("--one", action="store_true", help="measure in this process and print JSON")
     config = parser.parse_args()
+    settings = {key: getattr(config, key) for key in ("generations", "population", "seconds")}
     if config.one:
-        row = watch(config.methods[0], config.generations, config.population, config.seconds)
-        print(json.dumps(row))
+        print(json.dumps(watch(config.methods[0], **settings)))
         return 0
-    sizes = [f"--{key}={getattr(config, key)}" for key in ("generations", "population", "seconds")]
     rows = []
     for method in config.methods:
-        # A process of its own: resident memory that another method left would hide growth.
-        words = [sys.executable, __file__, "--one", "--methods", method, *sizes]
-        done = subprocess.run(words, check=True, capture_output=True, text=True)
-        rows.append(json.loads(done.stdout.splitlines()[-1]))
-        print({key: value for key, value in rows[-1].items() if key != "rss_mib"}, flush=True)
+        rows.append(measured(method, settings))
+        print({key: value for key, value in rows[-1].items() if not key.endswith("_mib")}, flush=True)
         if config.out is not None:
-            settings = {key: getattr(config, key) for key in ("generations", "population", "seconds")}
-            text = json.dumps({"settings": settings, "rows": rows}, indent=1) + "\n"
-            config.out.write_text(text, encoding="utf-8")
-    return 0 if all(row["flat"] for row in rows) else 1
+            write(config.out, settings, rows)
+    return int(any(row["verdict"] == "grows" for row in rows))
 
 
 if __name__ == "__main__":

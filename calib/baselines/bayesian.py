@@ -11,11 +11,20 @@ nothing but the order.
 
 Cost: a Gaussian process of n points takes n^3 operations, so it sees `most_points` at most, the better half
 by rank and the others by age, and a batch is small: `bo` simulates far fewer members than its budget allows.
+
+Memory: points that the process can never see again are forgotten. BoTorch's models hold themselves in cycles,
+and its matrices are of another size each generation and leave holes between what stays; so after each one
+garbage is collected and malloc (glibc) is asked to hand free pages back.
 """
 
 from __future__ import annotations
 
+import ctypes
+import functools
+import gc
+import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,12 +143,13 @@ class GaussianProcessSearch:
         self._asked: FloatArray | None = None
         self._batch = min(settings.batch, max(population - 2, 1))
         self._generation = 0
+        self.scored = 0
         self.region = TrustRegion(int(np.ceil(max(4, count) / self._batch)))
         self.fallbacks = 0
 
     @property
     def points(self) -> FloatArray:
-        """Points with scores that compare, (n, C)."""
+        """Points with scores that compare, (n, C); the best and the newest of them."""
         return self._points
 
     @property
@@ -183,8 +193,16 @@ class GaussianProcessSearch:
         before = len(self._points) if self._stationary else 0
         self._points = np.concatenate([self._points[:before], asked])
         self._fitness = np.concatenate([self._fitness[:before], fitness])
+        if self._stationary:
+            self._forget()
+        self.scored += len(asked)
         self._asked = None
         self._generation += 1
+
+    def _forget(self) -> None:
+        # A point only falls in rank and only ages, so that what is not kept now never would be again.
+        kept = self._kept(max(self._settings.most_points, 2 * self._settings.elite))
+        self._points, self._fitness = self._points[kept], self._fitness[kept]
 
     def save(self) -> State:
         """Return points, scores and counters."""
@@ -193,6 +211,7 @@ class GaussianProcessSearch:
             "fitness": self._fitness,
             "generation": self._generation,
             "seed": self._seed,
+            "scored": self.scored,
             "fallbacks": self.fallbacks,
             "region": self.region.save(),
         }
@@ -202,6 +221,7 @@ class GaussianProcessSearch:
         self._points, self._fitness = np.array(state["points"]), np.array(state["fitness"])
         self._generation, self._seed = int(state["generation"]), int(state["seed"])
         self.fallbacks, self._asked = int(state["fallbacks"]), None
+        self.scored = int(state["scored"])
         self.region.load(state["region"])
 
     def _sobol(self, count: int) -> FloatArray:
@@ -336,9 +356,10 @@ class _Bo(ScoredStepper):
         members = self.coordinates.members(unit)
         fitness, values = self.score(members)
         self._search.tell(fitness)
+        _give_back()
         found = self._search.best
         self.note(
-            f"best {found:.3g} of {len(self._search.points)} points",
+            f"best {found:.3g} of {self._search.scored} points",
             members,
             {
                 **values,
@@ -371,6 +392,19 @@ class _Bo(ScoredStepper):
         """See :meth:`Stepper.load`."""
         self._search.load(state["search"])
         self.fitness.load(state["fitness"])
+
+
+@functools.cache
+def _trimmer() -> Callable[[int], int]:
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    return trim or (lambda _: 0)
+
+
+def _give_back() -> None:
+    """Free what a Gaussian process leaves behind and hand free pages back to the system where malloc can."""
+    # Its model refers to itself: a megabyte and more a generation that waits for the collector's last round.
+    gc.collect()
+    _trimmer()(0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,7 +139,7 @@ def require_visible_parameters(
     from deal_hw.calib.excitation import check_excitation
     from deal_hw.calib.problem import SMOOTHING_S, Problem
     from deal_hw.calib.refine import samples_in
-    from deal_hw.calib.visible import look, require_visible
+    from deal_hw.calib.visible import jumps, look, require_visible
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
     # Raises where not even one window of that length fits.
@@ -157,4 +157,12 @@ def require_visible_parameters(
         say(
             f"hardly visible, and so hardly to be found: {', '.join(found.faint)} (from one end of the range "
             "to the other no prediction changes by more than the noise)"
+        )
+    rough = jumps(problem)
+    if rough:
+        worst = max(rough, key=lambda name: rough[name])
+        say(
+            f"warning: predictions jump (by {rough[worst]:.1g}) when {worst} changes by a millionth, and "
+            "no fit can follow that: the model's solver stops too early. Write <option "
+            'tolerance="1e-15" iterations="200" ls_tolerance="1e-6" ls_iterations="200"/> into the MJCF'
         )

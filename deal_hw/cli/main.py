@@ -22,6 +22,8 @@ EXIT_ERROR = 2
 """Something was wrong with what was asked for, or with the world; the message says what."""
 EXIT_INTERRUPTED = 130
 """Ctrl-C, as shells count it: 128 + SIGINT."""
+EXIT_PIPE = 141
+"""Whoever read the output has gone, as with ``| head``; as shells count it: 128 + SIGPIPE."""
 
 TRACEBACK_VARIABLE = "DEAL_HW_TRACEBACK"
 
@@ -226,26 +228,76 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: What follows `deal-hw` on the command line; by default the process's own.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = _answer(list(sys.argv[1:] if arguments is None else arguments))
+        if _flushed():
+            return code
+    except BrokenPipeError:
+        if not _reader_is_gone():
+            raise
+    except SystemExit:
+        if _flushed():
+            raise
+    # The interpreter flushes once more as it ends, and would complain.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)
+    return EXIT_PIPE
+
+
+def _answer(given: list[str]) -> int:
     show_traceback = "--traceback" in given or os.environ.get(TRACEBACK_VARIABLE, "0") not in {"", "0"}
     given = [word for word in given if word != "--traceback"]
-    if not given or given[0] in {"-h", "--help", "help"}:
-        print(help_text())
-        return EXIT_OK
-    if given[0] == "--version":
-        print(f"deal-hw {__version__}")
-        return EXIT_OK
     try:
+        if not given or given[0] in {"-h", "--help", "help"}:
+            print(help_text())
+            return EXIT_OK
+        if given[0] == "--version":
+            print(f"deal-hw {__version__}")
+            return EXIT_OK
         return run(given[0], given[1:])
     except KeyboardInterrupt:
         print("deal-hw: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (DealHwError, OSError) as err:
-        # An OSError is the world's refusal (no such file, disk full), not a bug: it gets its one line, too.
-        if show_traceback:
+        # A broken pipe may be a robot's, which is told, or that of our own output, which nobody reads.
+        if show_traceback or (isinstance(err, BrokenPipeError) and _reader_is_gone()):
             raise
+        # An OSError is the world's refusal (no such file, disk full), not a bug: it gets its one line, too.
         print(f"deal-hw: error: {err}", file=sys.stderr)
         return EXIT_ERROR
+
+
+def _flushed() -> bool:
+    """Write out what was printed and return whether somebody was there to take it."""
+    try:
+        # None where the process was started without an output.
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        return False
+    except OSError:
+        # A full disk: the interpreter tries again as it ends, and tells.
+        pass
+    return True
+
+
+def _reader_is_gone() -> bool:
+    """Return whether a pipe that broke is that of the output."""
+    if not _flushed():
+        return True
+    # What was written without a buffer leaves nothing to flush; then only the pipe itself knows.
+    import select
+
+    if sys.stdout is None or not hasattr(select, "poll"):
+        return False
+    output = select.poll()
+    try:
+        output.register(sys.stdout.fileno(), 0)
+    except OSError:
+        # Not a file: the output was replaced by an object in memory.
+        return False
+    return bool(output.poll(0))
 
 
 if __name__ == "__main__":

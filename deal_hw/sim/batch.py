@@ -9,6 +9,7 @@ what goes in.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,9 @@ ENCODER_BIAS = "encoder_bias"
 
 COMMAND_DELAY = "command_delay"
 """Kind that no MuJoCo field holds: what an actuator is sent acts later by it, on top of the latency."""
+
+SIZES_KEPT = 6
+"""Simulators of so many sizes are kept: one iteration of a search or polish needs up to four."""
 
 
 def default_threads() -> int:
@@ -239,6 +243,40 @@ class ServoBatch:
         # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): a rise is a divergence, which MuJoCo answers
         # by a reset.
         return np.asarray(self.batch.warning[..., 1].sum(axis=-1), dtype=np.int64)
+
+
+class BatchPool:
+    """Simulators of one robot and space by their number of members, the last used ones.
+
+    A simulator holds an MjData a thread, of tens of megabytes of addresses and up to some megabytes in use.
+    Searches whose stages differ in size would keep one for every size that they ever had.
+
+    Args:
+        make: Makes a simulator of so many members.
+        most: Simulators that are kept.
+    """
+
+    def __init__(self, make: Callable[[int], ServoBatch], most: int = SIZES_KEPT) -> None:
+        self._make, self._most = make, most
+        self._kept: dict[int, ServoBatch] = {}
+        self._steps = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def steps(self) -> int:
+        """Physics steps of all simulators so far, of those that were given up too."""
+        return self._steps + sum(batch.steps for batch in self._kept.values())
+
+    def get(self, count: int) -> ServoBatch:
+        """Return the simulator of ``count`` members; parameters and state are whatever its last user left."""
+        batch = self._kept.pop(count, None) or self._make(count)
+        # Last in order is last used.
+        self._kept[count] = batch
+        if len(self._kept) > self._most:
+            self._steps += self._kept.pop(next(iter(self._kept))).steps
+        return batch
 
 
 def bare_steps_per_second(robot: RobotModel, count: int, steps: int, threads: int | None = None) -> float:

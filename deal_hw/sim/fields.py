@@ -62,12 +62,13 @@ _TYPES = {
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
 }
-_COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "geom": "ngeom"}
+_COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "geom": "ngeom", "tendon": "ntendon"}
 
 
 def element_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the names of all elements of a kind ("body", "joint", "actuator", "geom")."""
+    """Return the names of all elements of a kind ("body", "joint", "actuator", "geom", "tendon")."""
     count = getattr(model, _COUNTS[kind])
     return [mujoco.mj_id2name(model, _TYPES[kind], i) or "" for i in range(count)]
 

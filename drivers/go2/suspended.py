@@ -20,6 +20,9 @@ JOINT_DAMPING_NMS_RAD: Final = 0.6
 FRICTIONLOSS_NM: Final = 0.2
 ARMATURE_KGM2: Final = 0.01
 ENCODER_BIAS_RAD: Final = 0.1
+ROD_FRICTIONLOSS_N: Final = 5.0
+KNEE_FRICTIONLOSS_NM: Final = (0.02, 4.0)
+"""Range of the calves' friction where the rods have some of their own."""
 
 DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
     go2.DESCRIPTION,
@@ -89,5 +92,30 @@ def shared_space() -> ParameterSpace:
     return _space(groups, bias=False)
 
 
-SPACES: Final = {"default": parameter_space, "biased": biased_space, "shared": shared_space}
+def linkage_space() -> ParameterSpace:
+    """Return the 48 parameters, calf friction up to 4 N·m, and friction of the four knees' rods, 52 in all.
+
+    A rod's friction makes that of its knee grow as it flexes; the model has the rods with a friction of 0.
+    """
+    low, high = KNEE_FRICTIONLOSS_NM
+    parameters = [
+        dataclasses.replace(p, low=low, high=high) if p.name.endswith("calf_joint.frictionloss") else p
+        for p in parameter_space()
+    ]
+    parameters += [
+        Parameter.around(
+            f"{leg}_calf_rod.frictionloss", "tendon_frictionloss", (f"{leg}_calf_rod",), "N",
+            ROD_FRICTIONLOSS_N, ratio=10.0,
+        )
+        for leg in go2.LEGS
+    ]  # fmt: skip
+    return ParameterSpace(parameters)
+
+
+SPACES: Final = {
+    "default": parameter_space,
+    "biased": biased_space,
+    "shared": shared_space,
+    "linkage": linkage_space,
+}
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

@@ -109,8 +109,30 @@ def test_the_process_sees_a_bounded_number_of_points() -> None:
     """Of forty points ten: the best five, and the five newest of the rest."""
     search = GaussianProcessSearch(1, 40, BoSettings(most_points=10), seed=1, stationary=True)
     search.tell(hill(search.ask()))
-    search._fitness = -np.arange(40.0)
-    np.testing.assert_array_equal(search._kept(10), [0, 1, 2, 3, 4, 35, 36, 37, 38, 39])
+    search._fitness = -np.arange(len(search.points), dtype=float)
+    np.testing.assert_array_equal(search._kept(10), [0, 1, 2, 3, 4, 15, 16, 17, 18, 19])
+
+
+def test_what_is_forgotten_would_never_be_seen_again() -> None:
+    """Told anything for 30 generations, it keeps what it would have kept of all points that ever were."""
+    settings = BoSettings(batch=3, most_points=8, elite=2)
+    search = GaussianProcessSearch(2, 8, settings, seed=1, stationary=True)
+    rng = np.random.default_rng(5)
+    points, fitness = np.empty((0, 2)), np.empty(0)
+    for _ in range(30):
+        asked = np.asarray(rng.uniform(size=(8 if not len(points) else 3, 2)))
+        # Rounded scores, so that some are equal; some are of members that diverged.
+        told = np.where(rng.uniform(size=len(asked)) < 0.2, np.nan, rng.normal(size=len(asked)).round(1))
+        search._asked = asked
+        search.tell(told)
+        points, fitness = np.concatenate([points, asked]), np.concatenate([fitness, told])
+        ranked = np.where(np.isfinite(fitness), fitness, -np.inf)
+        best = np.argsort(-ranked, kind="stable")[:4]
+        newest = [i for i in range(len(points)) if i not in best][::-1][:4]
+        expected = sorted([*best, *newest])
+        np.testing.assert_array_equal(search.points, points[expected])
+        assert search.best == ranked.max()
+    assert search.scored == len(points) == 8 + 29 * 3
 
 
 def test_a_critic_scores_earlier_members_again_and_resumes(small_problem: Callable[..., Problem]) -> None:

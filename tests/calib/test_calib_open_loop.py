@@ -133,6 +133,7 @@ def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationRes
     assert set(folds["errors"]) == {
         "search", "short", "long", "long, wide prior", "long, robust", "long, no latency",
         "mean of horizons", "mean of horizons, wide prior",
+        "0.4 s", "0.8 s", "1.2 s", "0.4 s, wide prior", "0.8 s, wide prior", "1.2 s, wide prior",
     }  # fmt: skip
     assert all(len(errors) == 2 for errors in folds["errors"].values())
     assert folds["chosen"] != "long, no latency"
@@ -212,14 +213,14 @@ def space_of(kinds: tuple[str, ...]) -> Problem:
 def test_a_delay_that_goes_with_all_armatures_together_is_named() -> None:
     """Only the sum of two armatures and the delay is known: the delay is sqrt(3) times narrower without one.
 
-    With a flat prior of information 12 on each and information I on the sum, the delay's variance is
-    (1/12) (12 + 2 I) / (12 + 3 I); with both armatures known it is 1 / (12 + I).
+    A flat prior over ten ranges has information 0.12. With that on each and information I on the sum, the
+    delay's variance is (1/0.12) (0.12 + 2 I) / (0.12 + 3 I); with both armatures known it is 1 / (0.12 + I).
     """
     problem, strong = space_of(("dof_armature", "dof_armature")), 1e4
     found = confounded(problem, strong * np.ones((3, 3)))
     (pair,) = found
     assert (pair.first, pair.second) == ("latency", "dof_armature")
-    expected = np.sqrt((12 + 2 * strong) / (12 + 3 * strong) / 12 * (12 + strong))
+    expected = np.sqrt((0.12 + 2 * strong) / (0.12 + 3 * strong) / 0.12 * (0.12 + strong))
     assert pair.factor == pytest.approx(expected)
     assert "latency and dof_armature are confounded" in pair.words
     assert confounded(problem, strong * np.eye(3)) == ()

@@ -10,7 +10,7 @@ import pytest
 
 from deal_hw.calib.heldout import heldout_rmse
 from deal_hw.calib.problem import Problem
-from deal_hw.calib.visible import look, require_visible
+from deal_hw.calib.visible import jumps, look, require_visible
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.describe import compile_model, describe, sampling
@@ -81,3 +81,66 @@ def test_heldout_errors_are_in_metres(robot: RobotModel) -> None:
     assert found.mean()["model"] == pytest.approx(found.pooled()["model"])
     assert found.to_json()["by_coordinate"]["model"]["rail"] == pytest.approx(found.rmse["model"][0])
     assert not math.isnan(found.window_s)
+
+
+KNEE = """
+<mujoco>
+  <option timestep="0.0025" integrator="implicitfast" {solver}/>
+  <worldbody>
+    <site name="above" pos="0 0 0.1"/>
+    <body>
+      <joint name="knee" axis="0 1 0" armature="0.03" frictionloss="0.5"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="1"/>
+      <site name="below" pos="0 0 -0.1"/>
+      <body pos="0 0 -0.3">
+        <joint name="ankle" axis="0 1 0" armature="0.03" frictionloss="0.5"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.5"/>
+        <site name="toe" pos="0 0 -0.1"/>
+      </body>
+      <site name="shin" pos="0 0 -0.2"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="rod" frictionloss="15"><site site="above"/><site site="below"/></spatial>
+    <spatial name="strap" frictionloss="15"><site site="shin"/><site site="toe"/></spatial>
+  </tendon>
+  <actuator>
+    <position name="knee" joint="knee" kp="20" kv="2"/>
+    <position name="ankle" joint="ankle" kp="20" kv="2"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("solver", "smooth"),
+    [
+        ('iterations="2"', False),
+        ('tolerance="1e-15" iterations="200" ls_tolerance="1e-6" ls_iterations="200"', True),
+    ],
+)
+def test_a_solver_that_stops_early_is_seen_by_what_jumps(solver: str, smooth: bool, tmp_path: Path) -> None:
+    """Two frictions at each of two joints: predictions jump where the solver may not converge, only there."""
+    path = tmp_path / "knee.xml"
+    path.write_text(KNEE.format(solver=solver), encoding="utf-8")
+    rates, names = sampling(0.01, 0.0025, 0.4), ("knee", "ankle")
+    robot = load_model(describe(path, compile_model(path), names, names, rates), rates.step_s)
+    T, steps = 200, 4 * 199
+    rows = np.ones((steps, 2))
+    angle = -1.2 + 0.4 * np.sin(np.arange(steps) * 0.0025 * 3.0)[:, None] * [1.0, -1.0]
+    found = np.concatenate([angle[:1], angle[3::4]])
+    episode = Episode(
+        step_s=robot.step_s, sample=4 * np.arange(T), position=found,
+        velocity=np.gradient(found, 0.01, axis=0),
+        target=angle + 0.2 * np.sign(np.cos(np.arange(steps) * 0.0025 * 3.0))[:, None] * [1.0, -1.0],
+        stiffness=20 * rows, damping=2 * rows, effort_limit=rows * np.inf, speed_limit=rows * np.inf,
+        usable=np.ones(T, dtype=bool), start_setpoint=np.full(2, -1.2),
+    )  # fmt: skip
+    space = ParameterSpace(
+        [
+            Parameter.around("rod", "tendon_frictionloss", ("rod",), "N", 15.0),
+            Parameter.around("knee", "dof_frictionloss", ("knee",), "N·m", 0.5),
+        ]
+    )
+    problem = Problem(robot, space, [episode], known_std=np.array([1e-3, 1e-3, 1.0, 1.0]), threads=1)
+    assert (jumps(problem) == {}) is smooth

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -194,6 +195,40 @@ def test_interrupt_exits_with_130(add_verb: Callable[..., None], capsys: pytest.
     add_verb(stop)
     assert cli.main(["probe"]) == 130
     assert capsys.readouterr().err == "deal-hw: interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unbuffered"), [(["--help"], ""), (["data", "--help"], ""), (["data", "--help"], "1")]
+)
+def test_reader_that_left_ends_it_quietly(arguments: list[str], unbuffered: str) -> None:
+    """A closed pipe, as behind ``| head``, gives 128 + SIGPIPE, no message and no traceback."""
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "deal_hw.cli.main", *arguments]
+    try:
+        done = subprocess.run(
+            words,
+            stdout=write,
+            stderr=subprocess.PIPE,
+            check=False,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
+    finally:
+        os.close(write)
+    assert (done.returncode, done.stderr) == (cli.EXIT_PIPE, b"")
+
+
+def test_broken_pipe_of_a_robot_is_told(
+    add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A pipe that broke elsewhere, while the output is read, is an error like any other."""
+
+    def fail(settings: Settings) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    add_verb(fail)
+    assert cli.main(["probe"]) == 2
+    assert capsys.readouterr().err == "deal-hw: error: [Errno 32] Broken pipe\n"
 
 
 def test_missing_package_names_the_extra(add_verb: Callable[..., None]) -> None:

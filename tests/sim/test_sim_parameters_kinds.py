@@ -36,6 +36,7 @@ MJCF = """
     <body name="cart" pos="0 0 1">
       <joint name="cart" type="slide" axis="1 0 0" damping="0.1"/>
       <geom name="box" type="box" size="0.1 0.1 0.05" mass="2" contype="0" conaffinity="0"/>
+      <site name="mast" pos="0 0 -0.3"/>
       <body name="arm" pos="0 0 0.1">
         <joint name="arm" axis="0 1 0" damping="0.2" frictionloss="0.3" armature="0.01" stiffness="1.5"/>
         <geom name="arm" type="capsule" fromto="0 0 0 0 0 0.4" size="0.02" mass="0.5"/>
@@ -51,10 +52,13 @@ MJCF = """
     <position name="arm" joint="arm" kp="20" kv="1" forcerange="-5 5"/>
     <motor name="cart" joint="cart" gear="-3" ctrlrange="-1 1"/>
   </actuator>
+  <tendon>
+    <spatial name="belt" frictionloss="0.7" damping="0.2"><site site="mast"/><site site="end"/></spatial>
+  </tendon>
 </mujoco>
 """
 
-ELEMENTS = {"body": "arm", "joint": "arm", "geom": "floor", "actuator": "arm"}
+ELEMENTS = {"body": "arm", "joint": "arm", "geom": "floor", "actuator": "arm", "tendon": "belt"}
 VALUES = {"geom_restitution": 0.4, "dof_friction_creep": 0.02}
 
 
@@ -301,6 +305,33 @@ def test_unknown_kind_lists_all_kinds_and_the_nearest() -> None:
         find_kind("dof_dampin")
     assert all(name in str(caught.value) for name in (*KINDS, *DEVICE_KINDS))
     assert set(DEVICE_KINDS) == {"servo_speed_limit", "command_delay", "encoder_bias", "sensor_noise"}
+
+
+@pytest.mark.parametrize(("torque", "moves"), [(0.19, False), (0.21, True)])
+def test_tendon_friction_is_force_times_moment_arm(torque: float, moves: bool) -> None:
+    """At 90 degrees the line between points 0.1 m from the knee passes it at 0.0707 m: 2.83 N hold 0.2 N·m."""
+    knee = mujoco.MjModel.from_xml_string(
+        """
+<mujoco>
+  <option timestep="0.001" gravity="0 0 0" integrator="implicitfast" tolerance="1e-12"/>
+  <worldbody>
+    <site name="above" pos="0 0 0.1"/>
+    <body>
+      <joint name="knee" axis="0 1 0" armature="0.01"/>
+      <geom size="0.01" pos="0 0 -0.1" mass="0.01"/>
+      <site name="below" pos="0 0 -0.1"/>
+    </body>
+  </worldbody>
+  <tendon><spatial name="rod"><site site="above"/><site site="below"/></spatial></tendon>
+</mujoco>"""
+    )
+    space = ParameterSpace([_parameter("tendon_frictionloss", "rod", 0.2 / (0.1 * np.sin(np.pi / 4)))])
+    changed = _single(knee, space, space.nominal)
+    data = mujoco.MjData(changed)
+    data.qpos[0], data.qfrc_applied[0] = np.pi / 2, torque
+    mujoco.mj_step(changed, data, 100)
+    # 0.01 N·m on 0.0101 kg·m² for 0.1 s is 0.1 rad/s; what friction holds creeps by 0.02 rad/s.
+    assert (abs(data.qvel[0]) > 0.04) == moves
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if name != "geom_restitution"])

@@ -22,9 +22,13 @@ from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
 from deal_hw.sim.parameters.joint import JOINT_KINDS
 from deal_hw.sim.parameters.kind import Apply, Kind
 from deal_hw.sim.parameters.sensor import SENSOR_KINDS
+from deal_hw.sim.parameters.tendon import TENDON_KINDS
 
 KIND_TABLE: Mapping[str, Kind] = MappingProxyType(
-    {k.name: k for k in (*BODY_KINDS, *JOINT_KINDS, *GEOM_KINDS, *ACTUATOR_KINDS, *SENSOR_KINDS)}
+    {
+        k.name: k
+        for k in (*BODY_KINDS, *JOINT_KINDS, *TENDON_KINDS, *GEOM_KINDS, *ACTUATOR_KINDS, *SENSOR_KINDS)
+    }
 )
 """Every kind by name."""
 

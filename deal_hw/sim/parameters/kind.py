@@ -16,7 +16,7 @@ HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE
 _OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 Apply = Callable[[Fields, Sequence[str], Array], None]
-Element = Literal["body", "joint", "geom", "actuator"]
+Element = Literal["body", "joint", "geom", "actuator", "tendon"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,43 @@
+"""Parameter kinds of tendons: friction that changes with position, by the tendon's moment arm.
+
+A rod or belt that drives a joint through a linkage has a moment arm that depends on the joint's position, and
+so has its friction at the joint. MuJoCo's own dry friction of a joint is the same everywhere; that of a
+spatial tendon is force times moment arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from deal_hw.sim.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.kind import Kind
+
+
+def tendon_frictionloss(fields: Fields, elements: Sequence[str], values: Array) -> None:
+    """Set dry friction along a tendon [N; N·m/rad where a fixed tendon combines hinges]."""
+    frictionloss = fields.get("tendon_frictionloss")
+    for name in elements:
+        frictionloss[:, element_id(fields.model, "tendon", name)] = values
+
+
+def tendon_damping(fields: Fields, elements: Sequence[str], values: Array) -> None:
+    """Set viscous damping along a tendon [N·s/m]."""
+    damping = fields.get("tendon_damping")
+    for name in elements:
+        damping[:, element_id(fields.model, "tendon", name)] = values
+
+
+TENDON_KINDS = (
+    Kind(
+        name="tendon_frictionloss", element="tendon", quantity="frictionloss", unit="N",
+        writes=("tendon_frictionloss",), along="nothing", apply=tendon_frictionloss,
+        baseline=lambda m, i: float(m.tendon_frictionloss[i]),
+    ),
+    Kind(
+        name="tendon_damping", element="tendon", quantity="damping", unit="N·s/m",
+        writes=("tendon_damping",), along="nothing", apply=tendon_damping,
+        baseline=lambda m, i: float(np.ravel(m.tendon_damping[i])[0]),
+    ),
+)  # fmt: skip

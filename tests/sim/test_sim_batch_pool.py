@@ -1,0 +1,61 @@
+"""Simulators by size: the last used are kept, steps of all are counted, and a new one does the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.sim.batch import BatchPool, ServoBatch
+from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.types import FloatArray
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    """The cart-pole."""
+    return load_model(DESCRIPTION)
+
+
+@pytest.fixture
+def pool(robot: RobotModel) -> BatchPool:
+    """Two simulators are kept."""
+    space = k9_space()
+    return BatchPool(lambda count: ServoBatch(robot, space, count, threads=1), most=2)
+
+
+def moved(batch: ServoBatch) -> FloatArray:
+    """Return where ten steps towards 5 cm lead, (N, 1, J), from parameters that differ between members."""
+    spread = np.linspace(0.8, 1.2, batch.count)[:, None]
+    batch.set_parameters(batch.space.nominal * spread)
+    batch.set_state(np.array([0.0, 0.1]), np.zeros(2))
+    return batch.advance(np.full((batch.count, 10, 1), 0.05))[0]
+
+
+def test_the_last_used_sizes_are_kept(pool: BatchPool) -> None:
+    """Of sizes 1, 2, 1, 3 the second is the one not used for longest: it is made anew."""
+    one, two = pool.get(1), pool.get(2)
+    assert pool.get(1) is one
+    three = pool.get(3)
+    assert len(pool) == 2
+    assert pool.get(1) is one and pool.get(3) is three
+    assert pool.get(2) is not two
+    assert pool.get(2).count == 2
+
+
+def test_steps_of_those_given_up_count(pool: BatchPool) -> None:
+    """Ten steps with each of four, three, two members and one: a hundred."""
+    for count in (4, 3, 2, 1):
+        moved(pool.get(count))
+    assert len(pool) == 2
+    assert pool.steps == 100
+
+
+def test_a_simulator_made_anew_gives_the_same(pool: BatchPool) -> None:
+    """To the last bit, whatever the first one had simulated before."""
+    first = moved(pool.get(3))
+    for count in (1, 2):
+        pool.get(count)
+    again = pool.get(3)
+    np.testing.assert_array_equal(moved(again), first)
+    np.testing.assert_array_equal(moved(again), first)
