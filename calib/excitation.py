@@ -46,7 +46,7 @@ def check_excitation(problem: Problem) -> None:
     joints = problem.robot.joints
     spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
-    if problem.known_std is None:
+    if problem.known_std is None and not problem.exact:
         # What a recording happens to show may be less than its sensor's noise, down to none at all: a joint
         # that never left its friction is still no motion to calibrate from.
         noises = np.maximum(noises, problem.robot.description.sensor.position_std)

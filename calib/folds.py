@@ -138,6 +138,22 @@ def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np
     return found
 
 
+def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]]:
+    """Return for each fold which samples of each recording it leaves out, (T,) each: one stretch of time.
+
+    Blocks of both sides that take turns share whatever drifts (a gear that warms up), and a fit that follows
+    the drift predicts them well. What a calibration is for comes later.
+
+    Args:
+        problem: The problem.
+        count: Folds.
+    """
+    lengths = [len(episode.sample) for episode in problem.episodes]
+    fold = np.arange(sum(lengths)) * count // sum(lengths)
+    parts = np.split(fold, np.cumsum(lengths)[:-1])
+    return [[part == number for part in parts] for number in range(count)]
+
+
 def motion_numbers(episodes: Sequence[Episode]) -> list[int]:
     """Return which motion each episode is of, counted from 0: stretches of one follow each other."""
     number, found = -1, []

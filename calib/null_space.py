@@ -17,6 +17,9 @@ from deal_hw.types import FloatArray
 SEEN = 1.0
 """Information below this, relative to what the range itself says, is none."""
 
+ROUNDING = 1e-13
+"""So is what lies this far below the direction that is seen best: differences are not more exact."""
+
 PART = 0.1
 """Parameters that move by less than this part of the one that moves most are not named."""
 
@@ -43,7 +46,7 @@ def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
     """
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
-    blind = values < SEEN
+    blind = values < max(SEEN, ROUNDING * float(values[-1]))
     # Posterior variance along each of them, the range's own variance being the prior's.
     spread = vectors[:, blind] ** 2 @ (1.0 / (1.0 + np.maximum(values[blind], 0.0)))
     directions = sparse_basis(vectors[:, blind].T) * root

@@ -26,7 +26,7 @@ from deal_hw.calib.attempts import Attempts
 from deal_hw.calib.baselines.simple import Nominal
 from deal_hw.calib.confounded import confounded
 from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.folds import Choice, fold_masks
+from deal_hw.calib.folds import Choice, fold_masks, motion_numbers, time_masks
 from deal_hw.calib.halves import FALSE_ALARMS, Halves, heed
 from deal_hw.calib.horizon import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
 from deal_hw.calib.identifiability import MISMATCH_CHI2, Uncertainty, uncertainty
@@ -50,6 +50,9 @@ SEARCH_S = 12.0
 """The search is to find the neighbourhood: so much of the recordings, evenly spread, says where it is [s]."""
 
 STRETCH_S = 2.5
+MOST_FOLDS = 3
+"""Motions are left out in so many turns, a single motion third by third."""
+
 SEARCHED_WINDOW_S = 0.4
 """Starts are compared in windows of this length: even a far one does not diverge in them."""
 
@@ -231,7 +234,10 @@ class _Work:
         """Fit every candidate to the data without each fold and compare what they predict of it."""
         problem, before = self._problem, self.steps
         errors: dict[str, list[float]] = {}
-        masks = fold_masks(problem)
+        motions = motion_numbers(problem.episodes)[-1] + 1
+        masks = (
+            time_masks(problem, MOST_FOLDS) if motions == 1 else fold_masks(problem, min(motions, MOST_FOLDS))
+        )
         for fold, left_out in enumerate(masks):
             self.say("folds", f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?")
             train, test = problem.part([~m for m in left_out]), problem.part(left_out)

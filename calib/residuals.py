@@ -167,21 +167,25 @@ class Shooting:
         """Return the physical parameters at a point, (K,)."""
         return self.problem.space.from_scale(point.value[:-1])
 
-    def normal(self, point: Point, keep: bool = False) -> Normal:
+    def normal(
+        self, point: Point, keep: bool = False, stretch: float = 1.0, *, central: bool = False
+    ) -> Normal:
         """Return the normal equations at a point, derivatives by forward differences in one batch.
 
         Args:
             point: Where.
             keep: Hand back the linearised residuals, too; they take much memory.
+            stretch: Factor on the differences' steps; negative for backward differences.
+            central: Take central differences, twice as dear: the truncation of one-sided ones looks like
+                information where there is none.
         """
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.problem.exact else C
         members = 1 + K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
-        values[1 : K + 1, :K] += self._parameter_step * np.eye(K)
-        values[K + 1, K] += LATENCY_STEP_S
         steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
-        steps = steps[: members - 1]
+        steps = stretch * steps[: members - 1]
+        values[1 : K + 2] += np.diag(steps[: K + 1])
         expected = point.value - self._prior_mean
         hessian, gradient = np.diag(self._prior_information), self._prior_information * expected
         cost, count = float(np.sum(self._prior_information * expected**2)), 0
@@ -192,11 +196,17 @@ class Shooting:
             x = np.repeat(point.position[e][None], members, axis=0)
             v = np.repeat(point.velocity[e][None], members, axis=0)
             for c in range(moved):
-                x[K + 2 + c, :, c] += self._state_step[c]
-                v[K + 2 + C + c, :, c] += self._state_step[C + c]
+                x[K + 2 + c, :, c] += steps[K + 1 + c]
+                v[K + 2 + C + c, :, c] += steps[K + 1 + C + c]
             predicted = self._predict(values, data, x, v).observed
             r = (predicted[0] - data.measured) / data.std
-            jac = np.moveaxis((predicted[1:] - predicted[:1]) / data.std, 0, -1) / steps
+            difference = predicted[1:] - predicted[:1]
+            if central:
+                before = self._predict(2 * values[:1] - values, data, 2 * x[:1] - x, 2 * v[:1] - v).observed
+                # A command cannot act before it was sent: there the forward difference has to do.
+                told = np.arange(members - 1) != K if values[0, K] < steps[K] else slice(None)
+                difference[told] = (predicted[1:] - before[1:])[told] / 2
+            jac = np.moveaxis(difference / data.std, 0, -1) / steps
             W = len(data.windows)
             r_flat, jac = r.reshape(W, -1), jac.reshape(W, -1, len(steps))
             jp, js = jac[..., : K + 1], jac[..., K + 1 :]
@@ -271,13 +281,23 @@ class Shooting:
 
     def costs(self, points: Sequence[Point]) -> FloatArray:
         """Return the cost at each of several points, in one batch; infinite where a member diverged."""
+        each = self.each_cost(points)
+        return np.asarray(self.prior_costs(points) + np.sum([c.sum(axis=1) for c in each], axis=0))
+
+    def prior_costs(self, points: Sequence[Point]) -> FloatArray:
+        """Return what the parameters' priors add to the cost at each of several points, (N,)."""
         values = np.stack([p.value for p in points])
-        total = (values - self._prior_mean) ** 2 @ self._prior_information
+        return np.asarray((values - self._prior_mean) ** 2 @ self._prior_information)
+
+    def each_cost(self, points: Sequence[Point]) -> list[FloatArray]:
+        """Return the cost of each window at each of several points, in one batch, (N, W) an episode."""
+        values = np.stack([p.value for p in points])
+        found = []
         for e in range(len(self.data)):
             x = np.stack([p.position[e] for p in points])
             v = np.stack([p.velocity[e] for p in points])
-            total += self._window_costs(e, values, x, v).sum(axis=1)
-        return np.asarray(total)
+            found.append(self._window_costs(e, values, x, v))
+        return found
 
     def window_costs(self, point: Point) -> list[FloatArray]:
         """Return the cost of each window of each episode at a point, (W,) each."""

@@ -6,17 +6,29 @@ import dataclasses
 
 import numpy as np
 
-from deal_hw.calib.identifiability import Uncertainty, intervals, uncertainty
+from deal_hw.calib.identifiability import CONTACT_KINKS, KINKS, Uncertainty, intervals, uncertainty
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import Polished
 from deal_hw.types import FloatArray
 
+NEAR = 0.1
+"""Share of the polish's step in parameters: over a whole one dry friction kinks often enough to look like
+information where a recording without noise has none."""
+
 
 def with_rows(polished: Polished) -> Polished:
-    """Return the same with linearised residuals, from which variances are clustered."""
+    """Return the same with linearised residuals, from which variances are clustered.
+
+    Central differences where nothing kinks: what is said of directions without information depends on them.
+    """
     if polished.normal.rows:
         return polished
-    return dataclasses.replace(polished, normal=polished.shooting.normal(polished.point, keep=True))
+    shooting = polished.shooting
+    if shooting.problem.robot.base is None:
+        normal = shooting.normal(polished.point, keep=True, stretch=NEAR, central=True)
+    else:
+        normal = shooting.normal(polished.point, keep=True)
+    return dataclasses.replace(polished, normal=normal)
 
 
 def statement(problem: Problem, polished: Polished, fixed_latency: bool) -> Uncertainty:
@@ -41,6 +53,7 @@ def statement(problem: Problem, polished: Polished, fixed_latency: bool) -> Unce
         gradient=normal.gradient,
         prior=normal.prior,
         rows=normal.rows,
+        kinks=KINKS if problem.robot.base is None or problem.exact else CONTACT_KINKS,
     )
 
 

@@ -45,7 +45,7 @@ class WekiSettings:
     restart_chi2: float = 3.0
     stage_generations: int = 20
     before_polish: bool = False
-    least_spread: float = 2e-3
+    least_spread: float = 0.01
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,7 @@ def calibration_row(
         "chi2": result.chi2,
         "alarms": list(result.alarms),
         "untold": untold,
+        "null_directions": list(result.null_directions),
         "per_parameter": {
             p.name: {
                 "truth": float(d.theta[k]),

@@ -40,6 +40,7 @@ __all__ = [
 ]  # fmt: skip
 
 HELDOUT_PROFILE = "chirp"
+DEFAULT = "default"
 XI = 5.0
 SAMPLES_A_PERIOD = 4
 """States of a control period that are fitted to."""
@@ -74,8 +75,10 @@ class Calibrate:
     heldout_window: float = HELDOUT_WINDOW_S
     """Held-out predictions restart from the measured state this often [s]."""
 
-    method: str = "default"
-    """How to search: default, weki, deal, deal-paper, ... (an unknown name lists all)."""
+    method: str = DEFAULT
+    """How to search: default, open-loop, weki, deal, deal-paper, ... (an unknown name lists all). The default
+    is weki and its polish; with --model, for a robot that servos hold on a fixed base, it is open-loop unless
+    --residual-std or --no-polish say how to treat what no model explains."""
 
     space: str = ""
     """Which parameters of a robot of ours, such as k9 or k11 (docs/parameters.md); the first by default."""
@@ -168,6 +171,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     budget = Budget(population=config.population, generations=config.generations, polish=config.polish)
     work = prepare_dataset(config) if source.model is None else _prepare_model(config)
     known_std = residual_std(config.residual_std, work.robot)
+    method = _usual_method(config, work.robot)
     with (
         saying_how_to_resume(checkpoint),
         watching(
@@ -179,7 +183,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             work.space,
             work.episodes,
             work.holdout,
-            method=config.method,
+            method=method,
             budget=budget,
             rng=np.random.default_rng(config.seed),
             latency_s=config.latency,
@@ -210,6 +214,22 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     )
     checkpoint.unlink(missing_ok=True)
     return report
+
+
+def _usual_method(config: Calibrate, robot: RobotModel) -> str:
+    """Return the method, where none is named that which suits the recordings."""
+    if config.method != DEFAULT or config.recordings.model is None:
+        return config.method
+    if config.residual_std or not config.polish:
+        return config.method
+    facts = robot.description
+    held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
+    if robot.base is not None or not held:
+        # Predictions of seconds, which open-loop compares, mean nothing for a robot that falls.
+        return config.method
+    if not config.quiet:
+        print("method: open-loop (--method weki to search and polish to the sensor noise)", file=sys.stderr)
+    return "open-loop"
 
 
 def _run_folder(config: Calibrate) -> Path:

@@ -150,10 +150,23 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
         effort_limit=trajectory.effort_limit[in_force],
         speed_limit=trajectory.speed_limit[in_force],
         usable=usable,
-        start_setpoint=trajectory.position[rows[0]][list(description.actuated_index)],
+        start_setpoint=_armed_at(trajectory, armed, int(rows[0]))[list(description.actuated_index)],
         first_row=int(rows[0]),
         origin=origin - int(device[0]),
     )
+
+
+def _armed_at(trajectory: Trajectory, armed: npt.NDArray[np.bool_], first: int) -> FloatArray:
+    """Return the position where a servo's set-point began, (J,).
+
+    That is where it was armed. By the first sample that reports a command the robot has moved some
+    micrometres, which a set-point that slews carries along as a constant error until it is there.
+    """
+    row = first
+    while row > 0 and armed[row - 1] and trajectory.command_sequence[row - 1] < 0:
+        row -= 1
+    found = trajectory.position[row]
+    return np.asarray(np.where(np.isfinite(found), found, trajectory.position[first]))
 
 
 def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:

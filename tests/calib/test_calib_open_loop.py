@@ -14,7 +14,7 @@ import pytest
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.checkpoint import Checkpoint
 from deal_hw.calib.confounded import confounded
-from deal_hw.calib.folds import fold_masks, motion_numbers
+from deal_hw.calib.folds import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.horizon import Recipe, expected_residual, fit_horizon, prediction_rmse
 from deal_hw.calib.open_loop import OpenLoop
 from deal_hw.calib.problem import Problem
@@ -198,6 +198,16 @@ def test_folds_leave_out_whole_motions_where_there_are_several() -> None:
     assert [bool(m.all()) for m in one[0]] == [True, False, True]
     single = fold_masks(cast("Problem", SimpleNamespace(episodes=[episode_at(0, 8)])), 2)
     assert single[0][0].tolist() == [True, True, False, False, True, True, False, False]
+
+
+def test_one_motion_is_left_out_stretch_by_stretch_of_time() -> None:
+    """Recordings of 8 and 4 samples in three folds of four samples each, in order."""
+    masks = time_masks(cast("Problem", SimpleNamespace(episodes=[episode_at(0, 8), episode_at(9, 4)])), 3)
+    assert [[mask.astype(int).tolist() for mask in fold] for fold in masks] == [
+        [[1, 1, 1, 1, 0, 0, 0, 0], [0, 0, 0, 0]],
+        [[0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 0, 0]],
+        [[0, 0, 0, 0, 0, 0, 0, 0], [1, 1, 1, 1]],
+    ]
 
 
 def space_of(kinds: tuple[str, ...]) -> Problem:

@@ -14,6 +14,7 @@ from deal_hw.calib.pipeline import LatencyScan, PolishedMethod
 from deal_hw.calib.problem import Problem
 from deal_hw.calib.refine import polish
 from deal_hw.calib.residuals import Shooting
+from deal_hw.calib.statements import NEAR
 from deal_hw.calib.validate import heldout_nrmse
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.bench_loop import demonstrate
@@ -177,7 +178,8 @@ def test_k11_names_its_null_directions_on_real_information(noisy: Demonstration)
     problem = Problem(noisy.robot, space, [noisy.fit], threads=1)
     theta = np.array([noisy.truth.parameters[name] for name in space.names])
     shooting = Shooting(problem, 80)
-    hessian = shooting.normal(shooting.start(theta, noisy.truth.latency_s, [noisy.fit_truth])).hessian
+    start = shooting.start(theta, noisy.truth.latency_s, [noisy.fit_truth])
+    hessian = shooting.normal(start, stretch=NEAR, central=True).hessian
     words = _unseen(space, hessian[:-1, :-1])
     assert len(words) == 2
     assert all("mass" in text for text in words)

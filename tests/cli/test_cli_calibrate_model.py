@@ -106,6 +106,7 @@ def test_mjcf_and_csv_give_a_report(folder: Path, tmp_path: Path, capsys: pytest
     calibration = tmp_path / "calibration"
     assert (calibration / "report.html").stat().st_size > 10_000
     found = json.loads((calibration / "result.json").read_text())
+    assert found["method"] == "open-loop" and "method: open-loop" in told.err
     assert found["parameters"]["shoulder.damping"]["estimate"] == pytest.approx(0.35, rel=0.1)
     assert found["parameters"]["shoulder.frictionloss"]["estimate"] == pytest.approx(0.06, rel=0.1)
     assert found["latency_s"] == pytest.approx(0.006, abs=0.002)

@@ -123,3 +123,16 @@ def test_command_that_never_arrived_is_not_placed(recorded: VirtualEpisode) -> N
     new = t.position_target[i]
     begin = [int(np.flatnonzero(align(x, DESCRIPTION).target[:, 0] == new[0])[0]) for x in (t, silent)]
     assert begin[1] - begin[0] == DESCRIPTION.steps_per_control
+
+
+def test_set_point_begins_where_the_servo_was_armed(recorded: VirtualEpisode) -> None:
+    """Armed at 10 mm, 10.03 mm at the first sample that reports a command: the set-point began at 10 mm."""
+    t = recorded.trajectory
+    first = int(np.argmax(t.command_sequence >= 0))
+    assert first == 1
+    position = t.position.copy()
+    position[:2, 0] = 0.01, 0.01003
+    moved = dataclasses.replace(t, position=position)
+    assert align(moved, DESCRIPTION).start_setpoint.tolist() == [0.01]
+    # Where the recording begins under a command nothing earlier is known.
+    assert align(without(moved, 0, 1), DESCRIPTION).start_setpoint.tolist() == [0.01003]

@@ -309,7 +309,7 @@ def test_unknown_kind_lists_all_kinds_and_the_nearest() -> None:
 
 @pytest.mark.parametrize(("torque", "moves"), [(0.19, False), (0.21, True)])
 def test_tendon_friction_is_force_times_moment_arm(torque: float, moves: bool) -> None:
-    """At 90 degrees the line between points 0.1 m from the knee passes it at 0.0707 m: 2.83 N hold 0.2 N·m."""
+    """At 90 degrees a line between points 0.1 m from the knee passes it at 0.0707 m: 2.83 N hold 0.2 N·m."""
     knee = mujoco.MjModel.from_xml_string(
         """
 <mujoco>

@@ -1,0 +1,113 @@
+"""The polish's solver where feet touch the floor: windows whose start states follow one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.contacts import settle
+from deal_hw.calib.identifiability import MISMATCH_CHI2, MISMATCH_TIME, correlation_time
+from deal_hw.calib.judgement import unexplained
+from deal_hw.calib.problem import Problem
+from deal_hw.calib.refine import polish
+from deal_hw.calib.residuals import Shooting
+from deal_hw.cli.bench_tasks import Case, make_case
+from deal_hw.drivers.go2.description import DESCRIPTION, parameter_space
+from deal_hw.drivers.go2.motions import FEET, sway
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.episode import Episode
+from deal_hw.sim.model import load_model
+from deal_hw.sim.target import Sensing, record_target
+from deal_hw.types import FloatArray
+
+FREE = ("FL_hip_joint.stiffness", "RR_thigh_joint.stiffness", "FR_calf_joint.damping")
+
+
+@pytest.fixture(scope="module")
+def sensed() -> Case:
+    """Return a Go2 that reports joints and IMU, noisy and late."""
+    return make_case("go2", "sensor", 0, 3.0)
+
+
+def beginning(episode: Episode, seconds: float) -> Episode:
+    """Return the first part of a recording."""
+    count = round(seconds / episode.period_s)
+    names = ("sample", "position", "velocity", "usable", "reference")
+    return dataclasses.replace(episode, **{name: getattr(episode, name)[:count] for name in names})
+
+
+def three_unknown(space: ParameterSpace, theta: FloatArray) -> tuple[ParameterSpace, FloatArray]:
+    """Return the space in which only three parameters are not known, and their true values."""
+    truth = dict(zip(space.names, map(float, theta), strict=True))
+    small = space.with_known({name: value for name, value in truth.items() if name not in FREE})
+    return small, np.array([truth[name] for name in small.names])
+
+
+def test_smoothed_start_states_settle_to_the_noise(sensed: Case) -> None:
+    """At the true parameters no window's cost grows, and what several times the noise was is noise."""
+    space, truth = three_unknown(sensed.space, sensed.theta)
+    shooting = Shooting(Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1), 20)
+    before = shooting.start(truth, sensed.latency_s)
+    after, cost = settle(shooting, before, 6)
+    np.testing.assert_array_equal(after.value, before.value)
+    windows = np.array([w for p in (before, after) for w in shooting.window_costs(p)])
+    assert np.all(windows[1] <= windows[0])
+    assert cost == pytest.approx(windows[1].sum())
+    normal = shooting.normal(after)
+    assert cost / normal.count < 1.25 < 3.0 < windows[0].sum() / normal.count
+    assert correlation_time(normal.residual) < MISMATCH_TIME
+
+
+def test_a_right_model_raises_no_alarm(sensed: Case) -> None:
+    """From eight percent off the residual becomes noise, and the parameters come back."""
+    space, truth = three_unknown(sensed.space, sensed.theta)
+    problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1)
+    found = polish(
+        problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=5, fixed_latency=True
+    )
+    assert found.chi2 < MISMATCH_CHI2
+    assert not unexplained(found)
+    np.testing.assert_allclose(found.theta, truth, rtol=0.05)
+
+
+def test_friction_that_the_model_lacks_is_not_explained_away() -> None:
+    """Start states of their own cannot hide 0.5 N·m of dry friction in each knee."""
+    rng = np.random.default_rng(3)
+    robot, real = load_model(DESCRIPTION), load_model(DESCRIPTION)
+    real.model.dof_frictionloss[list(real.qvel)[2::3]] += 0.5
+    whole = parameter_space().with_ratio(3.0)
+    sensing = Sensing(
+        joint_std=DESCRIPTION.sensor.noise, joint_resolution=DESCRIPTION.sensor.resolution,
+        orientation_std=4e-3, gyro_std=0.02, feet=FEET,
+    )  # fmt: skip
+    target = record_target(
+        real, whole, whole.nominal, sway(robot, rng, 1.7), seconds=1.7, sensing=sensing, rng=rng
+    )
+    space, truth = three_unknown(whole, whole.nominal)
+    problem = Problem(robot, space, [target.episode], threads=1, fixed_latency_s=0.0)
+    shooting = Shooting(problem, 20)
+    point, cost = settle(shooting, shooting.start(truth, 0.0), 6)
+    normal = shooting.normal(point)
+    assert cost / normal.count > MISMATCH_CHI2 or correlation_time(normal.residual) > MISMATCH_TIME
+
+
+def test_backward_differences_agree_with_forward_ones(small_problem: Callable[..., Problem]) -> None:
+    """On a smooth cart-pole both linearisations are the same to the step's order."""
+    problem = small_problem()
+    shooting = Shooting(problem, 10)
+    point = shooting.start(problem.space.nominal, 0.0)
+    forward, backward = shooting.normal(point), shooting.normal(point, stretch=-1.0)
+    assert backward.cost == pytest.approx(forward.cost)
+    np.testing.assert_allclose(backward.gradient[:-1], forward.gradient[:-1], rtol=0.02)
+
+
+def test_costs_are_the_sums_of_windows(small_problem: Callable[..., Problem]) -> None:
+    """One cost a point, one a window, from the same prediction."""
+    problem = small_problem()
+    shooting = Shooting(problem, 10)
+    points = [shooting.start(problem.space.nominal * f, 0.0) for f in (1.0, 1.3)]
+    total = sum(of_episode.sum(axis=1) for of_episode in shooting.each_cost(points))
+    np.testing.assert_allclose(shooting.costs(points), total + shooting.prior_costs(points))
