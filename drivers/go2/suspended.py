@@ -21,6 +21,7 @@ FRICTIONLOSS_NM: Final = 0.2
 ARMATURE_KGM2: Final = 0.01
 ENCODER_BIAS_RAD: Final = 0.1
 ROD_FRICTIONLOSS_N: Final = 5.0
+STRAP_FRICTIONLOSS_N: Final = 5.0
 KNEE_FRICTIONLOSS_NM: Final = (0.02, 4.0)
 """Range of the calves' friction where the rods have some of their own."""
 
@@ -93,9 +94,10 @@ def shared_space() -> ParameterSpace:
 
 
 def linkage_space() -> ParameterSpace:
-    """Return the 48 parameters, calf friction up to 4 N·m, and friction of the four knees' rods, 52 in all.
+    """Return the 48 parameters, calf friction up to 4 N·m, and that of the knees' rods and straps, 56 in all.
 
-    A rod's friction makes that of its knee grow as it flexes; the model has the rods with a friction of 0.
+    A rod's friction makes that of its knee grow as it flexes, a strap's to both ends of the travel; in the
+    model both are 0.
     """
     low, high = KNEE_FRICTIONLOSS_NM
     parameters = [
@@ -104,9 +106,10 @@ def linkage_space() -> ParameterSpace:
     ]
     parameters += [
         Parameter.around(
-            f"{leg}_calf_rod.frictionloss", "tendon_frictionloss", (f"{leg}_calf_rod",), "N",
-            ROD_FRICTIONLOSS_N, ratio=10.0,
+            f"{leg}_calf_{line}.frictionloss", "tendon_frictionloss", (f"{leg}_calf_{line}",), "N",
+            nominal, ratio=10.0,
         )
+        for line, nominal in (("rod", ROD_FRICTIONLOSS_N), ("strap", STRAP_FRICTIONLOSS_N))
         for leg in go2.LEGS
     ]  # fmt: skip
     return ParameterSpace(parameters)

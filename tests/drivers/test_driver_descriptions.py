@@ -43,11 +43,11 @@ SIZES = {
     ("go2_hung", "default"): 48,
     ("go2_hung", "biased"): 60,
     ("go2_hung", "shared"): 12,
-    ("go2_hung", "linkage"): 52,
+    ("go2_hung", "linkage"): 56,
     ("go2_suspended", "default"): 48,
     ("go2_suspended", "biased"): 60,
     ("go2_suspended", "shared"): 12,
-    ("go2_suspended", "linkage"): 52,
+    ("go2_suspended", "linkage"): 56,
     ("so101", "default"): 30,
     ("so101", "unbiased"): 24,
 }
