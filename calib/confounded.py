@@ -7,7 +7,6 @@ kinds are compared.
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +19,12 @@ LATENCY = "latency"
 WIDE = 10.0
 """What is not in the data is known to be within so many ranges: hardly. Held to the range itself, a kind that
 the data leave open looks known, and what goes with it is not named."""
-NARROWER = math.sqrt(2.0)
-"""Kinds are confounded where fixing one makes the other's interval narrower by this factor: half of what is
-not known of the one is what is not known of the other."""
+NARROWER = 1.25
+"""Kinds are named where fixing one makes the other's interval narrower by this factor: a third of what is not
+known of the one (in variance) is what is not known of the other."""
+
+MOSTLY = 2.0
+"""From this factor on, three quarters, they are confounded; below it partly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +45,10 @@ class Confounded:
     @property
     def words(self) -> str:
         """In a sentence."""
+        degree = "" if self.factor >= MOSTLY else "partly "
         return (
-            f"{self.first} and {self.second} are confounded: with {self.second} known the interval of "
-            f"{self.first} would be {self.factor:.1f} times narrower"
+            f"{self.first} and {self.second} are {degree}confounded: with {self.second} known the interval "
+            f"of {self.first} would be {self.factor:.1f} times narrower"
         )
 
     def to_json(self) -> dict[str, Any]:
