@@ -237,7 +237,7 @@ def test_a_delay_that_goes_with_all_armatures_together_is_named() -> None:
 
 
 def test_kinds_that_share_half_of_what_is_unknown_are_partly_confounded() -> None:
-    """A correlation of 0.7 makes intervals 1 / sqrt(1 - 0.49) = 1.40 times narrower, one of 0.5 1.15 times."""
+    """A correlation of 0.7 makes them 1 / sqrt(1 - 0.49) = 1.40 times narrower, one of 0.5 1.15 times."""
     problem = space_of(("dof_armature",))
     (pair,) = confounded(problem, 1e6 * np.array([[1.0, 0.7], [0.7, 1.0]]))
     assert pair.factor == pytest.approx(1.40, abs=0.005)
