@@ -26,9 +26,9 @@ KINKS = 1.2
 likelihood. Measured on tuning seeds: without it 90 % intervals held 86-89 % of the truths."""
 
 CONTACT_KINKS = 2.0
-"""The same where feet touch the floor. On five sensed Go2 tuning seeds errors were 0.9 to 1.7 times (root mean
-square) what linearising says, about 1.5 over all; as it differs so much from robot to robot, Student's quantile
-with four degrees of freedom, 1.3 times the normal one, belongs to it."""
+"""The same where feet touch the floor. On five sensed Go2 tuning seeds errors were 0.9 to 1.7 times (root
+mean square) what linearising says, about 1.5 over all; as it differs so much from robot to robot, Student's
+quantile with four degrees of freedom, 1.3 times the normal one, belongs to it."""
 
 IDENTIFIABLE_STD = 0.15
 """Up to this standard deviation, in ln units or parts of a linear range, a parameter is identified."""
