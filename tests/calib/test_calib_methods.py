@@ -203,7 +203,7 @@ def test_weki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
 
 
 def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
-    """Tuning seed 0, profile sensor: mean |ln| within 0.2 where the centre is at 0.6, latency within 10 of 40 ms.
+    """Tuning seed 0, profile sensor: mean |ln| within 0.2 where the centre is at 0.6, latency within 10 ms.
 
     So short a search ends 0.3 to 7 ms off, as rounding has it; on four draws 0.09 to 0.17 and at most 1.8 ms.
     """
