@@ -121,8 +121,8 @@ class OpenLoop(CalibrationMethod[Problem]):
             choice.chosen
         ]
         recipe = _recipe(choice.chosen)
-        recipe_there = dataclasses.replace(recipe, latency=True)
-        fit = fit_horizon(problem, theta, latency_s, recipe_there, iterations=0, central=True)
+        told = dataclasses.replace(recipe, latency=True)
+        fit = fit_horizon(problem, theta, latency_s, told, iterations=0, central=True)
         known = _known(problem, fit)
         halves = _halves(problem, fit, recipe, known)
         known = heed(problem, known, theta, halves)

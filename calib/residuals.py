@@ -299,13 +299,6 @@ class Shooting:
             found.append(self._window_costs(e, values, x, v))
         return found
 
-    def window_costs(self, point: Point) -> list[FloatArray]:
-        """Return the cost of each window of each episode at a point, (W,) each."""
-        return [
-            self._window_costs(e, point.value[None], point.position[e][None], point.velocity[e][None])[0]
-            for e in range(len(self.data))
-        ]
-
     def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""
         data = self.data[e]

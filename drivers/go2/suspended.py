@@ -20,8 +20,8 @@ JOINT_DAMPING_NMS_RAD: Final = 0.6
 FRICTIONLOSS_NM: Final = 0.2
 ARMATURE_KGM2: Final = 0.01
 ENCODER_BIAS_RAD: Final = 0.1
-ROD_FRICTIONLOSS_N: Final = 5.0
-STRAP_FRICTIONLOSS_N: Final = 5.0
+LINE_FRICTIONLOSS_N: Final = 5.0
+"""Of a knee's rod or strap."""
 KNEE_FRICTIONLOSS_NM: Final = (0.02, 4.0)
 """Range of the calves' friction where the rods have some of their own."""
 
@@ -107,9 +107,9 @@ def linkage_space() -> ParameterSpace:
     parameters += [
         Parameter.around(
             f"{leg}_calf_{line}.frictionloss", "tendon_frictionloss", (f"{leg}_calf_{line}",), "N",
-            nominal, ratio=10.0,
+            LINE_FRICTIONLOSS_N, ratio=10.0,
         )
-        for line, nominal in (("rod", ROD_FRICTIONLOSS_N), ("strap", STRAP_FRICTIONLOSS_N))
+        for line in ("rod", "strap")
         for leg in go2.LEGS
     ]  # fmt: skip
     return ParameterSpace(parameters)

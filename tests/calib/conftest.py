@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -17,6 +18,9 @@ from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
 Recorded = tuple[ParameterSpace, FloatArray, Episode]
+Beginning = Callable[[Episode, float], Episode]
+Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
+FREE = ("FL_hip_joint.stiffness", "RR_thigh_joint.stiffness", "FR_calf_joint.damping")
 TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
 """Factors of the nominal values."""
 
@@ -47,3 +51,27 @@ def small_problem() -> Callable[..., Problem]:
         return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def beginning() -> Beginning:
+    """Return what cuts a recording after so many seconds."""
+
+    def cut(episode: Episode, seconds: float) -> Episode:
+        count = round(seconds / episode.period_s)
+        names = ("sample", "position", "velocity", "usable", "reference")
+        return dataclasses.replace(episode, **{name: getattr(episode, name)[:count] for name in names})
+
+    return cut
+
+
+@pytest.fixture(scope="session")
+def three_unknown() -> Known:
+    """Return what leaves three drive parameters of a Go2 unknown: the smaller space, their true values."""
+
+    def known(space: ParameterSpace, theta: FloatArray) -> tuple[ParameterSpace, FloatArray]:
+        truth = dict(zip(space.names, map(float, theta), strict=True))
+        small = space.with_known({name: value for name, value in truth.items() if name not in FREE})
+        return small, np.array([truth[name] for name in small.names])
+
+    return known

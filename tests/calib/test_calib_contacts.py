@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -23,7 +22,8 @@ from deal_hw.sim.model import load_model
 from deal_hw.sim.target import Sensing, record_target
 from deal_hw.types import FloatArray
 
-FREE = ("FL_hip_joint.stiffness", "RR_thigh_joint.stiffness", "FR_calf_joint.damping")
+Beginning = Callable[[Episode, float], Episode]
+Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 
 
 @pytest.fixture(scope="module")
@@ -32,28 +32,16 @@ def sensed() -> Case:
     return make_case("go2", "sensor", 0, 3.0)
 
 
-def beginning(episode: Episode, seconds: float) -> Episode:
-    """Return the first part of a recording."""
-    count = round(seconds / episode.period_s)
-    names = ("sample", "position", "velocity", "usable", "reference")
-    return dataclasses.replace(episode, **{name: getattr(episode, name)[:count] for name in names})
-
-
-def three_unknown(space: ParameterSpace, theta: FloatArray) -> tuple[ParameterSpace, FloatArray]:
-    """Return the space in which only three parameters are not known, and their true values."""
-    truth = dict(zip(space.names, map(float, theta), strict=True))
-    small = space.with_known({name: value for name, value in truth.items() if name not in FREE})
-    return small, np.array([truth[name] for name in small.names])
-
-
-def test_smoothed_start_states_settle_to_the_noise(sensed: Case) -> None:
+def test_smoothed_start_states_settle_to_the_noise(
+    sensed: Case, beginning: Beginning, three_unknown: Known
+) -> None:
     """At the true parameters no window's cost grows, and what several times the noise was is noise."""
     space, truth = three_unknown(sensed.space, sensed.theta)
     shooting = Shooting(Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1), 20)
     before = shooting.start(truth, sensed.latency_s)
     after, cost = settle(shooting, before, 6)
     np.testing.assert_array_equal(after.value, before.value)
-    windows = np.array([w for p in (before, after) for w in shooting.window_costs(p)])
+    windows = np.array([w for p in (before, after) for (w,) in shooting.each_cost([p])])
     assert np.all(windows[1] <= windows[0])
     assert cost == pytest.approx(windows[1].sum())
     normal = shooting.normal(after)
@@ -61,7 +49,7 @@ def test_smoothed_start_states_settle_to_the_noise(sensed: Case) -> None:
     assert correlation_time(normal.residual) < MISMATCH_TIME
 
 
-def test_a_right_model_raises_no_alarm(sensed: Case) -> None:
+def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three_unknown: Known) -> None:
     """From eight percent off the residual becomes noise, and the parameters come back."""
     space, truth = three_unknown(sensed.space, sensed.theta)
     problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1)
@@ -73,7 +61,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case) -> None:
     np.testing.assert_allclose(found.theta, truth, rtol=0.05)
 
 
-def test_friction_that_the_model_lacks_is_not_explained_away() -> None:
+def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Known) -> None:
     """Start states of their own cannot hide 0.5 N·m of dry friction in each knee."""
     rng = np.random.default_rng(3)
     robot, real = load_model(DESCRIPTION), load_model(DESCRIPTION)

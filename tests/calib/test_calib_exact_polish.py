@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from deal_hw.sim.episode import Episode
 from deal_hw.sim.model import RobotModel
 from deal_hw.types import FloatArray
 
-FREE = ("FL_hip_joint.stiffness", "RR_thigh_joint.stiffness", "FR_calf_joint.damping")
+Beginning = Callable[[Episode, float], Episode]
+Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 SECONDS = 1.0
 STEP_S = 0.002
 
@@ -35,16 +37,11 @@ class Seen:
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
+def seen(beginning: Beginning, three_unknown: Known) -> Seen:
     """The beginning of a tuning seed."""
     case = make_case("go2", "ideal", 2, 3.0)
-    truth = dict(zip(case.space.names, map(float, case.theta), strict=True))
-    known = {name: value for name, value in truth.items() if name not in FREE}
-    space = case.space.with_ratio(20.0).with_known(known)
-    count = round(SECONDS / case.fit.period_s)
-    names = ("sample", "position", "velocity", "usable", "reference")
-    episode = dataclasses.replace(case.fit, **{name: getattr(case.fit, name)[:count] for name in names})
-    return Seen(case.robot, space, episode, np.array([truth[name] for name in space.names]))
+    space, truth = three_unknown(case.space.with_ratio(20.0), case.theta)
+    return Seen(case.robot, space, beginning(case.fit, SECONDS), truth)
 
 
 def test_a_factor_of_eight_off_and_a_step_late_comes_out_exact(seen: Seen) -> None:

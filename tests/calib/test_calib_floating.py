@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.episode import Episode
 from deal_hw.types import FloatArray
 
-FREE = ("FL_hip_joint.stiffness", "RR_thigh_joint.stiffness", "FR_calf_joint.damping")
+Beginning = Callable[[Episode, float], Episode]
+Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 
 
 @pytest.fixture(scope="module")
@@ -30,21 +32,6 @@ def exact() -> Case:
 def sensed() -> Case:
     """Return a Go2 that reports joints and IMU, noisy and late."""
     return make_case("go2", "sensor", 2, 3.0)
-
-
-def beginning(episode: Episode, seconds: float) -> Episode:
-    """Return the first part of a recording."""
-    count = round(seconds / episode.period_s)
-    names = ("sample", "position", "velocity", "usable", "reference")
-    return dataclasses.replace(episode, **{name: getattr(episode, name)[:count] for name in names})
-
-
-def three_unknown(case: Case) -> tuple[ParameterSpace, FloatArray]:
-    """Return the space in which only three parameters are not known, and their true values."""
-    truth = dict(zip(case.space.names, map(float, case.theta), strict=True))
-    known = {name: value for name, value in truth.items() if name not in FREE}
-    space = case.space.with_known(known)
-    return space, np.array([truth[name] for name in space.names])
 
 
 def test_channels_are_what_a_real_go2_reports(sensed: Case) -> None:
@@ -73,17 +60,19 @@ def test_the_truth_explains_exact_states_to_rounding(exact: Case) -> None:
     assert normal.cost / normal.count < 1e-6
 
 
-def test_polish_recovers_an_exactly_seen_go2(exact: Case) -> None:
+def test_polish_recovers_an_exactly_seen_go2(exact: Case, beginning: Beginning, three_unknown: Known) -> None:
     """From ten percent off, three unknown drive parameters come out to a ten-thousandth."""
-    space, truth = three_unknown(exact)
+    space, truth = three_unknown(exact.space, exact.theta)
     problem = Problem(exact.robot, space, [beginning(exact.fit, 1.5)], fixed_latency_s=0.0)
     found = polish(problem, truth * [1.1, 0.9, 1.1], 0.0, (0.1,), fixed_latency=True)
     np.testing.assert_allclose(found.theta, truth, rtol=1e-4)
 
 
-def test_polish_recovers_a_go2_from_joints_and_imu(sensed: Case) -> None:
+def test_polish_recovers_a_go2_from_joints_and_imu(
+    sensed: Case, beginning: Beginning, three_unknown: Known
+) -> None:
     """From ten percent and 2 ms off: stiffness to 2 %, damping to 10 %, the latency to a millisecond."""
-    space, truth = three_unknown(sensed)
+    space, truth = three_unknown(sensed.space, sensed.theta)
     problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)])
     found = polish(problem, truth * [1.1, 0.9, 1.1], sensed.latency_s + 2e-3, (0.2,), iterations=5)
     errors = dict(zip(space.names, np.abs(np.log(found.theta / truth)), strict=True))
@@ -92,9 +81,9 @@ def test_polish_recovers_a_go2_from_joints_and_imu(sensed: Case) -> None:
     assert found.latency_s == pytest.approx(sensed.latency_s, abs=1e-3)
 
 
-def test_other_start_states_never_cost_more(sensed: Case) -> None:
+def test_other_start_states_never_cost_more(sensed: Case, three_unknown: Known) -> None:
     """Each window keeps its start state unless a drawn one explains it better; parameters stay."""
-    space, truth = three_unknown(sensed)
+    space, truth = three_unknown(sensed.space, sensed.theta)
     shooting = Shooting(Problem(sensed.robot, space, [sensed.fit]), 10)
     before = shooting.start(truth, sensed.latency_s)
     after = shooting.shaken(before, 0.5, 20, np.random.default_rng(1))

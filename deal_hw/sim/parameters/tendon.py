@@ -15,18 +15,20 @@ from deal_hw.sim.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.kind import Kind
 
 
+def _set(fields: Fields, field: str, elements: Sequence[str], values: Array) -> None:
+    column = fields.get(field)
+    for name in elements:
+        column[:, element_id(fields.model, "tendon", name)] = values
+
+
 def tendon_frictionloss(fields: Fields, elements: Sequence[str], values: Array) -> None:
     """Set dry friction along a tendon [N; N·m/rad where a fixed tendon combines hinges]."""
-    frictionloss = fields.get("tendon_frictionloss")
-    for name in elements:
-        frictionloss[:, element_id(fields.model, "tendon", name)] = values
+    _set(fields, "tendon_frictionloss", elements, values)
 
 
 def tendon_damping(fields: Fields, elements: Sequence[str], values: Array) -> None:
     """Set viscous damping along a tendon [N·s/m]."""
-    damping = fields.get("tendon_damping")
-    for name in elements:
-        damping[:, element_id(fields.model, "tendon", name)] = values
+    _set(fields, "tendon_damping", elements, values)
 
 
 TENDON_KINDS = (
