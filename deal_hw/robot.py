@@ -20,6 +20,11 @@ class Robot(abc.ABC):
     """
 
     description: ClassVar[RobotDescription]
+    watchdog_s: ClassVar[float] = 0.0
+    """The device itself switches its motors off after this time without a command [s]; 0: it holds the last
+    command for ever, so only its own side can help where the link is cut or this computer dies."""
+    homes_by_motor: ClassVar[bool] = True
+    """Whether ``home`` moves the motors by this driver's commands: from then on a run must end passive."""
 
     @abc.abstractmethod
     def connect(self) -> None:
@@ -34,6 +39,13 @@ class Robot(abc.ABC):
     @abc.abstractmethod
     def disconnect(self) -> None:
         """Close the transport. Does not send ``passive``: the caller does, last of all commands."""
+
+    def reopen(self) -> None:  # noqa: B027
+        """Open the transport again where it is lost; what is known of the robot stays.
+
+        Raises:
+            TransportError: It cannot be opened now; another try may succeed.
+        """
 
     @abc.abstractmethod
     def home(self, timeout_s: float) -> None:

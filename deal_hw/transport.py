@@ -29,7 +29,13 @@ class Message:
 
 
 class Transport(abc.ABC):
-    """A path for bytes or messages. The constructor does no I/O; ``open`` and ``close`` are idempotent."""
+    """A path for bytes or messages. The constructor does no I/O; ``open`` and ``close`` are idempotent.
+
+    Attributes:
+        can_send: Whether :meth:`send` may be called at all; False for a path that only listens.
+    """
+
+    can_send: bool = True
 
     @abc.abstractmethod
     def open(self) -> None:
@@ -43,6 +49,15 @@ class Transport(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Close the path."""
+
+    def reopen(self) -> None:
+        """Open the path again after it was lost. A path that is sound may be left alone.
+
+        Raises:
+            TransportError: It cannot be opened now; another try may succeed.
+        """
+        self.close()
+        self.open()
 
     @abc.abstractmethod
     def send(self, message: Message) -> None:

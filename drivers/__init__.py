@@ -6,15 +6,20 @@ Explicit tables, name -> "module:class", imported on use: naming a robot loads i
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
+from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
 from deal_hw.transport import TopicTransport, Transport, WireOptions
+
+if TYPE_CHECKING:
+    from deal_hw.drivers.go2.claim import WireClaim
 
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
@@ -59,6 +64,7 @@ __all__ = [
     "TOPIC_TRANSPORTS",
     "TRANSPORTS",
     "adopt_robot",
+    "claim_name",
     "default_transport",
     "driver_description",
     "make_robot",
@@ -67,6 +73,7 @@ __all__ = [
     "parameter_spaces",
     "recorded_description",
     "robot_description",
+    "wire_claim",
 ]
 
 
@@ -77,6 +84,8 @@ def make_robot(
     clock: Clock,
     options: WireOptions | None = None,
     settings: Mapping[str, Any] | None = None,
+    *,
+    can_send: bool = True,
 ) -> Robot:
     """Return a robot that will be reached over a port; nothing is opened yet.
 
@@ -87,6 +96,7 @@ def make_robot(
         clock: Gives the stamps.
         options: More about a transport of topics.
         settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2.
+        can_send: False for a robot that is only listened to, as in a dry run.
 
     Raises:
         UnknownNameError: There is no such robot or transport.
@@ -97,10 +107,47 @@ def make_robot(
     link = make_transport(transport_name, port, clock, options)
     _check_reach(name, transport_name)
     try:
-        made: Robot = robot(link, clock, **(settings or {}))
+        made: Robot = robot(link if can_send else listen_only(link), clock, **(settings or {}))
     except TypeError as error:
         raise ConfigurationError(f"robot {name!r} has no setting of {', '.join(settings or ())}") from error
     return made
+
+
+def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
+    """Return the name under which a robot is claimed on this computer: how and where it is reached."""
+    if transport_name == "zenoh":
+        from deal_hw.drivers.transports.zenoh_session import parse_endpoints
+
+        port = ", ".join(
+            sorted("loopback:" + str(e.port) if e.loopback else str(e) for e in parse_endpoints(port))
+        )
+    elif transport_name == "dds":
+        from deal_hw.drivers.transports.interfaces import find_interface
+
+        port = f"{find_interface(port).name}, domain {options.domain}"
+    else:
+        port = os.path.realpath(port)
+    return f"{transport_name} on {port}"
+
+
+def wire_claim(
+    name: str, transport_name: str, port: str, clock: Clock, holder: str, options: WireOptions
+) -> WireClaim | None:
+    """Return the claim on a robot that others on its wire hear; None where the port itself is exclusive.
+
+    Args:
+        name: The robot.
+        transport_name: How it is reached.
+        port: Where.
+        clock: For the waiting.
+        holder: Who claims, in words.
+        options: More about a transport of topics.
+    """
+    if name not in ROBOTS or transport_name not in TOPIC_TRANSPORTS:
+        return None
+    from deal_hw.drivers.go2.claim import WireClaim
+
+    return WireClaim(make_topic_transport(transport_name, port, clock, options), clock, holder)
 
 
 def make_transport(
@@ -130,8 +177,18 @@ def make_topic_transport(
     return made
 
 
-def adopt_robot(name: str, transport_name: str, fd: int, clock: Clock) -> Robot:
+def adopt_robot(
+    name: str, transport_name: str, fd: int, clock: Clock, *, port: str = "", can_send: bool = True
+) -> Robot:
     """Return a robot over a descriptor that a parent process opened and this process inherited.
+
+    Args:
+        name: The robot.
+        transport_name: How it is reached.
+        fd: The descriptor.
+        clock: Gives the stamps.
+        port: What the parent opened, to open it again where the device vanishes and comes back.
+        can_send: False for a robot that is only listened to, as in a dry run.
 
     Raises:
         UnknownNameError: There is no such robot or transport.
@@ -144,7 +201,8 @@ def adopt_robot(name: str, transport_name: str, fd: int, clock: Clock) -> Robot:
             f"transport {transport_name!r} has no descriptor to inherit: each process opens its own, "
             "make_robot() does"
         )
-    made: Robot = robot(transport.from_fd(fd, clock=clock), clock)
+    link: Transport = transport.from_fd(fd, clock=clock, port=port)
+    made: Robot = robot(link if can_send else listen_only(link), clock)
     return made
 
 

@@ -12,11 +12,12 @@ import os
 import signal
 import socket
 import sys
+import threading
 from types import FrameType
 from typing import Any
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.handover import RecordSender, StatusSender
+from deal_hw.control.handover import LOADING, RecordSender, StatusSender
 from deal_hw.control.realtime import (
     PARENT_DIED,
     Granted,
@@ -24,9 +25,13 @@ from deal_hw.control.realtime import (
     die_with_parent,
     kill_self_after,
 )
+from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 
 _START_SILENCE_S = 30.0
-_ORPHAN_S = 2.0
+_ORPHAN_S = 5.0
+"""What an orphan may take beyond the time for which it repeats the passive command [s]."""
+_SUPERVISOR_SILENT = signal.SIGUSR2
+"""Sent by the vigil's thread to the main one, which may be waiting for the robot."""
 
 
 class _Stopper:
@@ -35,15 +40,21 @@ class _Stopper:
     def __init__(self, parent_pid: int) -> None:
         self._parent_pid = parent_pid
         self.loop: Any = None
-        for number in (signal.SIGINT, signal.SIGTERM, PARENT_DIED):
+        self.passive_s = 0.0
+        for number in (signal.SIGINT, signal.SIGTERM, PARENT_DIED, _SUPERVISOR_SILENT):
             signal.signal(number, self._handle)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         reason = "stopped by the operator"
         if number == PARENT_DIED or os.getppid() != self._parent_pid:
             # Nobody is left to kill this process if its passive route hangs.
-            kill_self_after(_ORPHAN_S)
+            kill_self_after(self.passive_s + _ORPHAN_S)
             reason = "the supervisor died"
+        elif number == _SUPERVISOR_SILENT:
+            reason = (
+                f"the supervisor gave no sign of life for {SUPERVISOR_SILENCE_S:g} s: it is stopped, swapped "
+                "out or held up, and could not act for the operator"
+            )
         if self.loop is None:
             raise KeyboardInterrupt
         self.loop.request_stop(reason)
@@ -57,7 +68,7 @@ def main() -> int:
     stopper = _Stopper(orders["parent_pid"])
     try:
         die_with_parent(orders["parent_pid"])
-        status.beat(clock.now_ns(), "loading", _START_SILENCE_S)
+        status.beat(clock.now_ns(), LOADING, _START_SILENCE_S)
         status.result(_run(orders, status, clock, stopper))
     except KeyboardInterrupt:
         status.result(
@@ -82,38 +93,49 @@ def _run(
     # Imported here, so that a stop during these imports is answered, too.
     from deal_hw.cli.run_plan import RunPlan, make_behaviour
     from deal_hw.control.loop import ControlLoop, LoopConfig
+    from deal_hw.control.passive import PassiveConfig
     from deal_hw.control.safety import Safety
     from deal_hw.control.velocity import KeyboardVelocity
     from deal_hw.drivers import adopt_robot, make_robot
 
     plan = RunPlan.from_json(orders)
+    can_send = not plan.dry_run
     if orders["port_fd"] is None:
-        robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire, plan.robot_settings)
+        robot = make_robot(
+            plan.robot, plan.transport, plan.port, clock, plan.wire, plan.robot_settings, can_send=can_send
+        )
     else:
-        robot = adopt_robot(plan.robot, plan.transport, orders["port_fd"], clock)
+        robot = adopt_robot(
+            plan.robot, plan.transport, orders["port_fd"], clock, port=plan.port, can_send=can_send
+        )
     source = plan.velocity_source()
     behaviour = make_behaviour(plan, robot.description, source)
     sink = RecordSender(socket.socket(fileno=orders["record_fd"])) if "record_fd" in orders else _discard
 
+    main = threading.get_ident()
+    vigil = SupervisorVigil(status, clock, lambda: signal.pthread_kill(main, _SUPERVISOR_SILENT))
+
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)
-        if isinstance(source, KeyboardVelocity):
-            for key in status.heard():
+        for key in vigil.words():
+            if isinstance(source, KeyboardVelocity):
                 source.press(key)
 
     granted = become_realtime() if plan.realtime else Granted("default", ())
+    passive = PassiveConfig(timeout_s=plan.passive_timeout_s)
     loop = ControlLoop(
         robot, behaviour, Safety(robot.description), clock, sink,
         LoopConfig(
             duration_s=plan.total_s, dry_run=plan.dry_run, home=plan.home, record_wire=plan.record_wire,
-            hand_back=plan.hand_back,
+            hand_back=plan.hand_back, passive=passive,
         ),
         progress=progress,
         scheduling=granted.scheduling,
     )  # fmt: skip
     for warning in granted.warnings:
         loop.note("warning", warning)
-    stopper.loop = loop
+    stopper.loop, stopper.passive_s = loop, passive.timeout_s
+    vigil.start()
     return {**loop.run().to_json(), "warnings": list(granted.warnings)}
 
 

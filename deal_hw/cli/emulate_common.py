@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from deal_hw.clock import MonotonicClock
+from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
 
 _PARENT_CHECK_STEPS = 100
@@ -28,17 +29,9 @@ def stop_on_signals() -> threading.Event:
     return stop
 
 
-@contextlib.contextmanager
-def realtime_priority() -> Iterator[None]:
+def realtime_priority() -> AbstractContextManager[None]:
     """Run ahead of ordinary processes where permitted: a real robot does not share the host's processor."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, *before)
+    return priority(_FIFO_PRIORITY, children=True)
 
 
 def run_until(

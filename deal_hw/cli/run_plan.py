@@ -59,6 +59,7 @@ class RunPlan:
         hand_back: Whether to return the robot to its own controller at the end.
         record_wire: Whether to record the raw bytes, too.
         realtime: Whether to ask for SCHED_FIFO and locked memory.
+        passive_timeout_s: How long the passive command is repeated at the end until the robot shows it [s].
     """
 
     robot: str
@@ -82,6 +83,7 @@ class RunPlan:
     hand_back: bool = False
     record_wire: bool = True
     realtime: bool = True
+    passive_timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
         if self.profile not in get_args(Profile):

@@ -13,15 +13,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw import __version__, errors
+from deal_hw.cli.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
 from deal_hw.cli.keyboard import check_terminal, keys
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.cadence import CadenceReport
-from deal_hw.control.handover import Beat
-from deal_hw.control.loop import RUNNING, Outcome
-from deal_hw.control.passive import make_passive
-from deal_hw.control.supervisor import OPERATOR, ChildEnd, Supervisor
+from deal_hw.control.handover import (
+    CONNECTING,
+    HANDING_BACK,
+    HOMING,
+    LOADING,
+    MAKING_PASSIVE,
+    RUNNING,
+    STARTING,
+    Beat,
+)
+from deal_hw.control.loop import Outcome
+from deal_hw.control.passive import PassiveConfig, make_passive
+from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
 from deal_hw.control.vigor import VigorSearch, shortfalls
 from deal_hw.data.excitation import Excitation
 from deal_hw.data.recorder_launch import start_recorder
@@ -34,6 +44,8 @@ if TYPE_CHECKING:
 
 _LINK_WARNING = 0.01
 """Share of corrupt and missing state frames above which the operator is told."""
+_IN_VAIN = PassiveConfig(timeout_s=1.0)
+"""Where the control process tried for its whole time, the supervisor's own path gets this chance."""
 _EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
 
 
@@ -112,6 +124,20 @@ class RunReport:
         return _EXIT_CODES[self.outcome]
 
 
+class InterruptedRunError(KeyboardInterrupt):
+    """The operator ended the program (Ctrl-C, SIGTERM, Ctrl-Z) in a run; the robot was made passive first.
+
+    A ``KeyboardInterrupt``, so that loops over runs end, too, and the program with 130.
+
+    Attributes:
+        report: How the runs went until then.
+    """
+
+    def __init__(self, report: RunReport) -> None:
+        super().__init__(report.episodes[-1].reason)
+        self.report = report
+
+
 def _ignore(beat: Beat) -> None:
     return
 
@@ -165,20 +191,30 @@ def run_episodes(
 
     Raises:
         DealHwError: What made it fail, after the robot was made passive and the recording closed.
+        InterruptedRunError: The operator ended the program.
     """
     if episodes < 1:
         raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
     plan = dataclasses.replace(plan, port=port)
     if plan.velocity == "keyboard":
         check_terminal()
-    robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire, plan.robot_settings)
+    clock = MonotonicClock()
+    robot = make_robot(
+        plan.robot, plan.transport, port, clock, plan.wire, plan.robot_settings, can_send=not plan.dry_run
+    )
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     VigorSearch(plan.vigor, attempts)
     make_behaviour(plan, robot.description)
     reports: list[EpisodeReport] = []
-    # The supervisor greets the robot itself, so that a wrong port is known before any process is started.
+    if not robot.watchdog_s and not plan.dry_run and not quiet:
+        print(HOLDS_LAST_COMMAND.format(robot=plan.robot), file=sys.stderr)
+    # The supervisor connects to the robot itself, so that a wrong port is known before a process is started.
     # From then on it only keeps the port, until the control process is dead.
-    with robot, _open_dataset(dataset, robot.description) as store:
+    with (
+        claimed(plan) as claim,
+        connected(robot),
+        _open_dataset(dataset, robot.description) as store,
+    ):
         for number in range(episodes):
             # The robot's own controller gets it back after the last episode only.
             last = number == episodes - 1
@@ -188,11 +224,16 @@ def run_episodes(
             again = True
             while again:
                 episode = dataclasses.replace(episode, vigor=search.vigor)
-                run = _Episode(episode, robot, port, store, purpose, task, len(search.attempts))
+                run = _Episode(episode, robot, port, store, purpose, task, len(search.attempts), claim)
                 with contextlib.nullcontext(_ignore) if quiet else _progress(title, plan.total_s) as show:
                     reports.append(run.run(_both(show, on_beat)))
                 if not quiet:
                     print_report(reports[-1])
+                if run.signal:
+                    report = RunReport(dataset=dataset, episodes=tuple(reports))
+                    if run.signal == signal.SIGTSTP.name:
+                        suspend()
+                    raise InterruptedRunError(report)
                 again = _to_repeat(search, episode, reports[-1], robot.description)
                 if search.words:
                     print(f"warning: {search.words}", file=sys.stderr)
@@ -236,7 +277,11 @@ class _Episode:
         purpose: str,
         task: str,
         attempt: int = 0,
+        keep_fds: tuple[int, ...] = (),
     ) -> None:
+        self._keep_fds = keep_fds
+        self.signal = ""
+        """Name of the signal by which the operator ended it; "" where there was none."""
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
         self._path = store.next_episode_path() if store is not None else None
         self._metadata = {
@@ -274,9 +319,10 @@ class _Episode:
             module="deal_hw.cli.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
-            passive=lambda: make_passive(self._robot, MonotonicClock()),
+            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, supervisor, on_beat),
             recorder=recorder,
             on_beat=on_beat,
+            keep_fds=self._keep_fds,
         )
         listening = (
             keys(supervisor.tell, lambda: supervisor.stop(OPERATOR))
@@ -285,10 +331,8 @@ class _Episode:
         )
         with listening:
             end = supervisor.run()
-        report = account(end, self._path)
-        # The control process knows the port only as the descriptor that it inherited.
-        reason = report.reason.replace(f"inherited descriptor {port_fd}", self._port)
-        report = dataclasses.replace(report, reason=reason)
+        self.signal = end.signal
+        report = account(end, self._path, self._robot.watchdog_s)
         if self._store is not None and self._path is not None:
             try:
                 facts = {"task": self._metadata["task"], **report.to_json()}
@@ -300,21 +344,51 @@ class _Episode:
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
 
+    def _make_passive(
+        self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]
+    ) -> bool:
+        """Make the robot passive for a dead control process, where that one had set out to command it."""
+        untouched = (
+            STARTING,
+            LOADING,
+            CONNECTING,
+            HANDING_BACK,
+            *(() if self._robot.homes_by_motor else (HOMING,)),
+        )
+        if self._plan.dry_run or phase in untouched:
+            return True
+        clock = MonotonicClock()
+
+        def tell(text: str, silence_s: float) -> None:
+            on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
+
+        config = _IN_VAIN if in_vain else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
+        return make_passive(self._robot, clock, config, progress=tell, abandoned=lambda: supervisor.abandoned)
+
 
 def _digest(policy: str) -> str:
     return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16] if policy else ""
 
 
-def account(end: ChildEnd, path: Path | None) -> EpisodeReport:
-    """Return how an episode went from how its processes ended."""
+def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeReport:
+    """Return how an episode went from how its processes ended.
+
+    Args:
+        end: That.
+        path: The recording; None where there is none.
+        watchdog_s: ``Robot.watchdog_s``.
+    """
     result = end.result or {}
     outcome, reason, error = _verdict(end, result)
     warnings = list(result.get("warnings", ()))
     if not end.passive_confirmed:
-        warnings.append(
-            "the robot did not confirm that it is passive: switch it off by hand. Where the cable is cut, "
-            "only the device's own watchdog can stop its motors"
+        cut = (
+            f"Where the cable is cut, its own watchdog has stopped the motor after {watchdog_s:g} s"
+            if watchdog_s
+            else "Where the link is gone it still holds its last command, with stiff motors: use its remote "
+            "(damping), then its switch"
         )
+        warnings.append(f"the robot did not confirm that it is passive: switch it off by hand. {cut}")
     cadence = CadenceReport.from_json(result["cadence"]) if result.get("cadence") else None
     if cadence is not None and cadence.link_errors > _LINK_WARNING * max(cadence.states, 1):
         share = cadence.link_errors / (cadence.states + cadence.link_errors)
@@ -343,14 +417,15 @@ def account(end: ChildEnd, path: Path | None) -> EpisodeReport:
 
 def _verdict(end: ChildEnd, result: dict[str, Any]) -> tuple[Outcome, str, str]:
     """Return outcome, reason in words and the error's class."""
-    if end.killed and end.stop_cause != OPERATOR:
+    operator = end.stop_cause in (OPERATOR, SUSPENDED)
+    if end.killed and not operator:
         return Outcome.FAILED, f"the control process was killed: {end.killed}", "SafetyError"
-    if end.stop_cause and end.stop_cause != OPERATOR:
+    if end.stop_cause and not operator:
         return Outcome.FAILED, end.stop_cause, "DatasetError"
     if result:
         return Outcome(result["outcome"]), result["reason"], result["error"]
-    if end.stop_cause == OPERATOR:
-        return Outcome.STOPPED, OPERATOR, ""
+    if operator:
+        return Outcome.STOPPED, end.stop_cause, ""
     code = end.exit_code
     how = f"by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"with exit code {code}"
     return Outcome.FAILED, f"the control process died {how} without a report", "SafetyError"
@@ -371,12 +446,16 @@ def print_report(report: EpisodeReport) -> None:
 
 @contextlib.contextmanager
 def _progress(title: str, seconds: float) -> Iterator[Callable[[Beat], None]]:
-    """Show a progress bar on a terminal; nothing otherwise."""
+    """Show a progress bar on a terminal; everywhere, each second, trouble in making the robot passive."""
     with seconds_bar(title, seconds) as bar:
         started_ns = 0
+        trouble = ""
 
         def on_beat(beat: Beat) -> None:
-            nonlocal started_ns
+            nonlocal started_ns, trouble
+            if beat.phase.startswith(f"{MAKING_PASSIVE}: ") and beat.phase != trouble:
+                trouble = beat.phase
+                print(f"{title}: {trouble}", file=sys.stderr, flush=True)
             if beat.phase != RUNNING:
                 bar.say(f"{title}: {beat.phase}")
                 return

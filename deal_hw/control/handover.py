@@ -22,6 +22,12 @@ default."""
 _MOST_REFUSED = 50
 """So many refusals in a row (one second at 50 Hz) mean that nobody records: the run ends."""
 _MOST_WORD = 256
+STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, MAKING_PASSIVE, HANDING_BACK = (
+    "starting", "loading", "connecting", "homing", "arming", "running", "making passive", "handing back",
+)  # fmt: skip
+"""Phases of a run, in order; cycles run in RUNNING. A phase is told before what it names happens."""
+HEARTBEAT = "\0"
+"""The word by which the supervisor says that it lives."""
 _BEAT = struct.Struct("<cqdI")
 
 
@@ -102,6 +108,10 @@ class StatusSender:
             self._socket.send(_BEAT.pack(b"H", stamp_ns, silence_s, self._count) + phase.encode())
         except OSError:
             return
+
+    def fileno(self) -> int:
+        """Return the descriptor, for ``select``."""
+        return self._socket.fileno()
 
     def heard(self) -> list[str]:
         """Return what the supervisor told since the last call; never waits."""

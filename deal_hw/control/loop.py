@@ -11,6 +11,7 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.cadence import Cadence, CadenceReport
+from deal_hw.control.handover import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
 from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
 from deal_hw.control.passive import make_passive
 from deal_hw.control.repeater import Repeater
@@ -27,9 +28,6 @@ Sink = Callable[[CycleRecord], bool]
 """Takes a record and never waits; False: refused. Raises a DealHwError where nobody will ever take one
 again."""
 
-
-RUNNING = "running"
-"""Name of the phase in which cycles run."""
 
 _MOST_WIRE_BYTES = 48_000
 """Raw bytes in one record: a datagram holds no more beside the rest; a cycle of a Go2 has 13 000."""
@@ -73,7 +71,7 @@ class ControlLoop:
         self._cadence = Cadence(clock, robot.description.control_rate_hz)
         self._repeater = Repeater(robot, clock)
         self._stop_reason = ""
-        self._raise_on_stop = self._connected = False
+        self._raise_on_stop = self._connected = self._commanding = False
         self._state: RobotState | None = None
         self._pending: list[RobotState] = []
         self._events: list[Event] = []
@@ -95,17 +93,24 @@ class ControlLoop:
     def run(self) -> LoopReport:
         """Run once. Errors come back in the report, after the robot was made passive."""
         outcome, reason, error, confirmed = Outcome.FAILED, "", "", False
+        running = False
         try:
             self._raise_on_stop = True
             if self._stop_reason:
                 raise OperatorStop(self._stop_reason)
             self._prepare()
             self._raise_on_stop = False
+            running = self._commanding
             outcome, reason = self._cycles()
         except (OperatorStop, KeyboardInterrupt):
             outcome, reason = Outcome.STOPPED, self._stop_reason or "stopped by the operator"
         except Exception as err:
             reason, error = str(err) or type(err).__name__, type(err).__name__
+            if isinstance(err, TransportError) and running:
+                # The link is lost while commands go out. It is judged like what the safety module finds: the
+                # run is tripped, latched, and the passive command goes out over whatever link there is.
+                outcome, reason, error = Outcome.TRIPPED, f"the link is lost: {reason}", ""
+                self.note("passive", reason, flags=["link_lost"])
         finally:
             # First of all, and before anything that might fail: the robot.
             self._raise_on_stop = False
@@ -120,17 +125,20 @@ class ControlLoop:
 
     def _prepare(self) -> None:
         c = self._config
-        self._phase("connecting", 10.0)
+        self._phase(CONNECTING, 10.0)
         self._robot.connect()
         self._connected = True
         self._behaviour.reset()
         if c.home and not c.dry_run:
-            self._phase("homing", c.home_timeout_s + 2.0)
+            # Told before it happens: a supervisor that finds this process dead knows whether to send damping.
+            self._phase(HOMING, c.home_timeout_s + c.state_timeout_s + 2.0)
+            self._commanding = self._robot.homes_by_motor
             self._robot.home(c.home_timeout_s)
-        self._phase("arming", c.arm_timeout_s + c.state_timeout_s + 2.0)
         self._await_state()
         if not c.dry_run:
             self._safety.arm(self._input())
+            self._phase(ARMING, c.arm_timeout_s + c.state_timeout_s + 2.0)
+            self._commanding = True
             self._robot.arm(c.arm_timeout_s)
             self.note("armed", "the motors follow commands")
             # What waited in buffers meanwhile is old: the first cycle takes what comes from now on.
@@ -194,7 +202,7 @@ class ControlLoop:
                 self._sent += 1
         else:
             self._repeater.stop()
-            if verdict.state is SafetyState.PASSIVE:
+            if verdict.state is SafetyState.PASSIVE and self._commanding:
                 self._robot.passive()
         with self._cadence.section("record"):
             self._hand_over(
@@ -293,22 +301,28 @@ class ControlLoop:
         )  # fmt: skip
 
     def _make_passive(self) -> bool:
-        """Send the passive command until the robot confirms it; return whether it did."""
+        """Send the passive command until the robot confirms it; return whether it did.
+
+        A robot that this run never commanded may stand under its own controller: it is left alone.
+        """
         if self._safety.state.armed:
             self._safety.stop("the run ended")
-        self._phase("making passive", 2.0)
-        if self._config.dry_run or not self._connected:
+        if not self._commanding:
             return True
+        self._phase(MAKING_PASSIVE, 2.0)
         # What it reads is not recorded: nobody knows which of the samples the passive command found.
         return make_passive(
-            self._robot, self._clock, self._config.passive_attempts, self._config.passive_confirm_s
+            self._robot,
+            self._clock,
+            self._config.passive,
+            progress=lambda text, silence_s: self._phase(f"{MAKING_PASSIVE}: {text}", silence_s),
         )
 
     def _hand_back(self) -> None:
         if not self._config.hand_back or self._config.dry_run or not self._connected:
             return
         timeout_s = self._config.hand_back_timeout_s
-        self._phase("handing back", timeout_s + 2.0)
+        self._phase(HANDING_BACK, timeout_s + 2.0)
         try:
             self._robot.hand_back(timeout_s)
             self.note("handed back", "the robot's own controller has the robot again")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from deal_hw.control.cadence import CadenceReport
-from deal_hw.control.passive import ATTEMPTS, CONFIRM_S
+from deal_hw.control.passive import PassiveConfig
 from deal_hw.errors import ConfigurationError
 
 
@@ -37,10 +37,8 @@ class LoopConfig:
     arm_timeout_s: float = 1.0
     state_timeout_s: float = 1.0
     """How long to wait for the first state sample [s]."""
-    passive_attempts: int = ATTEMPTS
-    """How often the passive command is sent before giving up on a confirmation."""
-    passive_confirm_s: float = CONFIRM_S
-    """How long to wait for the confirmation of each [s]."""
+    passive: PassiveConfig = field(default_factory=PassiveConfig)
+    """How long the passive command is repeated at the end, until the robot shows it."""
     record_wire: bool = True
     """Hand the raw bytes to the recorder, too."""
     hand_back: bool = False
@@ -50,10 +48,6 @@ class LoopConfig:
     def __post_init__(self) -> None:
         if not self.duration_s > 0:
             raise ConfigurationError(f"a run must last longer than 0 s, not {self.duration_s!r}")
-        if self.passive_attempts < 1:
-            raise ConfigurationError(
-                "passive_attempts must be at least 1: a run never ends without the passive command"
-            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,61 +1,152 @@
-"""The passive command, sent until the robot confirms it: the last thing that any run does."""
+"""The passive command, repeated until the robot shows it or a stated time is over: the last thing of any run.
+
+It works against a clock, not a count of attempts: a link that is gone as the run ends may come back, and a
+robot that holds its last command would stay stiff for ever.
+"""
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from deal_hw.clock import Clock
-from deal_hw.errors import TransportTimeoutError
+from deal_hw.errors import ConfigurationError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.types import Status
 
-ATTEMPTS = 10
-"""Half a second in all: legs that were moving swing out before a robot can show that they are damped."""
-CONFIRM_S = 0.05
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PassiveConfig:
+    """How hard to try."""
+
+    timeout_s: float = 30.0
+    """How long the command is repeated without a sign of the robot [s]: longer than a network takes to come
+    back (Zenoh goes to its end point once a second; a switch that restarts takes some 20 s)."""
+    confirm_s: float = 0.05
+    """How long to wait for the robot to show each one [s]."""
+    reopen_s: float = 0.5
+    """Time between two tries to open a transport that is lost [s]."""
+    silent_s: float = 3.0
+    """Without a state for this long the transport is opened again, even where it reports no error [s]."""
+
+    def __post_init__(self) -> None:
+        for field in ("timeout_s", "confirm_s", "reopen_s", "silent_s"):
+            value = getattr(self, field)
+            if not 0 < value < 3600:
+                raise ConfigurationError(
+                    f"PassiveConfig.{field} is {value!r} s; allowed: above 0, below 3600"
+                )
 
 
-def make_passive(robot: Robot, clock: Clock, attempts: int = ATTEMPTS, confirm_s: float = CONFIRM_S) -> bool:
+def _nothing(text: str, silence_s: float) -> None:
+    return
+
+
+def make_passive(
+    robot: Robot,
+    clock: Clock,
+    config: PassiveConfig | None = None,
+    *,
+    progress: Callable[[str, float], None] = _nothing,
+    abandoned: Callable[[], bool] = lambda: False,
+) -> bool:
     """Send the passive command until the robot reports that its motors no longer follow commands.
 
-    Never raises: whoever calls it has something worse at hand.
+    A send that raises is one failed attempt; the transport is then opened again. Never raises: whoever calls
+    it has something worse at hand.
 
     Args:
-        robot: Connected, or at least with an open port.
+        robot: Connected, or at least with a transport that was open.
         clock: For the waiting.
-        attempts: How often to send it.
-        confirm_s: How long to wait for the confirmation of each [s].
+        config: How hard to try.
+        progress: Called after each attempt that failed, with what the operator should read, which changes
+            once a second, and with the longest time until the next call [s].
+        abandoned: Whether the operator gave up; asked after each attempt.
 
     Returns:
         Whether the robot confirmed it.
     """
-    for _ in range(attempts):
-        try:
-            # A sample that waited since before the run also says "not armed": only what comes now counts. A
-            # path that cannot be read may still be written.
-            with contextlib.suppress(Exception):
-                _drain(robot)
-            robot.passive()
-            if _confirmed(robot, clock, confirm_s):
-                return True
-        except Exception:  # Even a bug in a driver must not keep the next attempt from being made.
-            continue
-    return False
-
-
-def _drain(robot: Robot) -> None:
-    try:
-        while True:
-            robot.read_state(0.0)
-    except TransportTimeoutError:
-        return
-
-
-def _confirmed(robot: Robot, clock: Clock, confirm_s: float) -> bool:
-    until_ns = clock.now_ns() + round(confirm_s * 1e9)
-    while (left_ns := until_ns - clock.now_ns()) > 0:
-        try:
-            if Status.ARMED not in robot.read_state(left_ns * 1e-9).status:
-                return True
-        except TransportTimeoutError:
+    try_hard = _Endeavour(robot, clock, config or PassiveConfig(), progress)
+    while not try_hard.attempt():
+        if try_hard.over or abandoned():
             return False
-    return False
+        try_hard.prepare_next()
+    return True
+
+
+class _Endeavour:
+    """The attempts at making one robot passive, and what is known of the link between them."""
+
+    def __init__(
+        self, robot: Robot, clock: Clock, config: PassiveConfig, progress: Callable[[str, float], None]
+    ) -> None:
+        self._robot, self._clock, self._config, self._progress = robot, clock, config, progress
+        self._begin_ns = self._heard_ns = clock.now_ns()
+        self._reopen_ns = self._begin_ns
+        self._trouble: Exception | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether the time is over."""
+        return self._clock.now_ns() - self._begin_ns >= round(self._config.timeout_s * 1e9)
+
+    def attempt(self) -> bool:
+        """Send the command once; return whether the robot showed that it is passive."""
+        # Even a bug in a driver must not keep the next attempt from being made.
+        try:
+            # First of all the command. A sample that waited since before says nothing: only what comes from
+            # now on counts. A path that cannot be read may still be written.
+            self._robot.passive()
+            with contextlib.suppress(Exception):
+                self._drain()
+            confirmed = self._confirmed()
+            self._trouble = None
+        except Exception as error:
+            confirmed, self._trouble = False, error
+        return confirmed
+
+    def prepare_next(self) -> None:
+        """Tell, open the transport again where it seems lost, and wait where the attempt took no time."""
+        until_ns = self._clock.now_ns() + (round(self._config.confirm_s * 1e9) if self._trouble else 0)
+        silent = self._clock.now_ns() - self._heard_ns >= round(self._config.silent_s * 1e9)
+        if (self._trouble is not None or silent) and self._clock.now_ns() >= self._reopen_ns:
+            # Opening may take seconds where something listens and does not answer.
+            self._tell(silence_s=10.0)
+            with contextlib.suppress(Exception):
+                self._robot.reopen()
+            pause_s = self._config.reopen_s if self._trouble is not None else self._config.silent_s
+            self._reopen_ns = self._clock.now_ns() + round(pause_s * 1e9)
+        self._tell(silence_s=1.0)
+        self._clock.sleep_until_ns(until_ns)
+
+    def _tell(self, silence_s: float) -> None:
+        passed_s = (self._clock.now_ns() - self._begin_ns) // 10**9
+        left_s = max(round(self._config.timeout_s) - passed_s, 0)
+        why = (
+            f"the link is down ({self._trouble})"
+            if self._trouble is not None
+            else "the robot does not show it"
+        )
+        text = f"{why}; passive command repeated for {passed_s} s, {left_s} s left"
+        self._progress(text, silence_s)
+
+    def _drain(self) -> None:
+        try:
+            while True:
+                self._robot.read_state(0.0)
+                self._heard_ns = self._clock.now_ns()
+        except TransportTimeoutError:
+            return
+
+    def _confirmed(self) -> bool:
+        until_ns = self._clock.now_ns() + round(self._config.confirm_s * 1e9)
+        while (left_ns := until_ns - self._clock.now_ns()) > 0:
+            try:
+                state = self._robot.read_state(left_ns * 1e-9)
+            except TransportTimeoutError:
+                return False
+            self._heard_ns = self._clock.now_ns()
+            if Status.ARMED not in state.status:
+                return True
+        return False

@@ -8,6 +8,7 @@ import gc
 import os
 import resource
 import signal
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 _PR_SET_PDEATHSIG = 1
@@ -15,6 +16,11 @@ _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
 """Sent by the kernel when the parent dies; nobody else sends it, so the record names the true reason."""
 FIFO_PRIORITY = 50
+SUPERVISOR_PRIORITY = FIFO_PRIORITY + 1
+"""Above the control process, which it must be able to kill when that one does not let go of a processor."""
+TRANSPORT_PRIORITY = FIFO_PRIORITY - 10
+"""Of the threads of a supervisor's transport: its damping must go out on a busy machine, too."""
+_MCL_ONFAULT = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +64,31 @@ def become_realtime() -> Granted:
             "Remedy: a memlock line for this user in /etc/security/limits.conf, or CAP_IPC_LOCK"
         )
     return Granted(" + ".join(words), tuple(warnings))
+
+
+@contextlib.contextmanager
+def priority(level: int, *, children: bool = False, lock: bool = False) -> Iterator[None]:
+    """Run the calling thread under SCHED_FIFO inside the block where permitted; quietly not elsewhere.
+
+    Args:
+        level: The priority.
+        children: Whether threads and processes that are started inside get it, too.
+        lock: Whether the pages that are in memory stay there, so that the process is not swapped out.
+    """
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    policy = os.SCHED_FIFO | (0 if children else os.SCHED_RESET_ON_FORK)
+    libc = ctypes.CDLL(None) if lock else None
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, policy, os.sched_param(level))
+    if libc is not None:
+        libc.mlockall(_MCL_CURRENT | _MCL_ONFAULT)
+    try:
+        yield
+    finally:
+        if libc is not None:
+            libc.munlockall()
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, *before)
 
 
 def _lock_memory() -> str | None:

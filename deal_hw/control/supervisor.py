@@ -2,7 +2,8 @@
 
 It owns the port for as long as it lives, so that nobody else takes the robot, and so that the passive command
 can still be sent once the control process is dead. It never sends while the control process lives: two
-writers on one port would tear each other's frames.
+writers on one port would tear each other's frames. It sends nothing at all where the control process had not
+set out to command the robot. The control process watches it in turn (:mod:`deal_hw.control.vigil`).
 """
 
 from __future__ import annotations
@@ -16,19 +17,23 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.handover import BUFFER_BYTES, Beat, StatusReceiver, socket_pair
+from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
+from deal_hw.control.realtime import SUPERVISOR_PRIORITY, priority
 from deal_hw.data.recorder_launch import RecorderHandle, RecorderOutcome
 
 START_SILENCE_S = 30.0
 """How long a new control process may take to import and load before its first heartbeat [s]."""
 OPERATOR = "stopped by the operator"
+SUSPENDED = "suspended by the operator (Ctrl-Z)"
 _POLL_S = 0.05
+_MOST_STOPS = 3
+"""After so many wishes of the operator to stop, the next one ends the repeating of the passive command."""
 _GRACE_S = 3.0
 """How long a control process may take to exit after it closed its end [s]."""
 
@@ -44,6 +49,7 @@ class ChildEnd:
         stop_cause: Why the supervisor asked it to stop; "" where it did not.
         passive_confirmed: Whether the robot itself confirmed that it is passive.
         recorder: How the recording ended; None without a recorder.
+        signal: Name of the signal by which the operator ended it, such as "SIGINT"; "" where there was none.
     """
 
     result: dict[str, Any] | None
@@ -52,6 +58,7 @@ class ChildEnd:
     stop_cause: str
     passive_confirmed: bool
     recorder: RecorderOutcome | None
+    signal: str = ""
 
 
 class Supervisor:
@@ -62,10 +69,12 @@ class Supervisor:
         plan: Its orders, as plain JSON values; it reads them from its standard input.
         port_fd: The open port, which it inherits; None where each process opens its own path.
         passive: Sends the passive command through the port and returns whether the robot confirmed it. Called
-            only once the control process is dead.
+            only once the control process is dead, with the phase in which it died and with whether it tried
+            the same in vain; whether anything is to be sent is for the function to say.
         recorder: The recorder, ready; None to record nothing.
         on_beat: Called with each heartbeat.
         clock: For heartbeats; the machine's monotonic clock by default.
+        keep_fds: More descriptors that live as long as the control process, such as a claim.
     """
 
     def __init__(
@@ -74,23 +83,26 @@ class Supervisor:
         module: str,
         plan: Mapping[str, Any],
         port_fd: int | None,
-        passive: Callable[[], bool],
+        passive: Callable[[str, bool], bool],
         recorder: RecorderHandle | None = None,
         on_beat: Callable[[Beat], None] = lambda beat: None,
         clock: Clock | None = None,
+        keep_fds: Sequence[int] = (),
     ) -> None:
+        self._keep_fds = tuple(keep_fds)
         self._module, self._plan, self._port_fd, self._passive = module, plan, port_fd, passive
         self._recorder, self._on_beat, self._clock = recorder, on_beat, clock or MonotonicClock()
         self._child: subprocess.Popen[bytes] | None = None
         self._status: StatusReceiver | None = None
         self._result: dict[str, Any] | None = None
-        self._killed = self._stop_cause = ""
+        self._killed = self._stop_cause = self._signal = ""
+        self._stops = self._beat_ns = 0
         self._stale_ns = 0
-        self._phase = "starting"
+        self._phase = STARTING
 
     def run(self) -> ChildEnd:
         """Start the control process, watch it to its end, see to the robot and to the recording."""
-        with self._operator_stops():
+        with self._operator_stops(), priority(SUPERVISOR_PRIORITY, lock=True):
             status = self._status = self._start()
             try:
                 self._watch(status)
@@ -100,19 +112,28 @@ class Supervisor:
             finally:
                 # Whatever went wrong up here: no control process is left alone, and the robot comes first.
                 exit_code = self._reap()
-                confirmed = bool(self._result and self._result.get("passive_confirmed")) or self._passive()
+                confirmed = bool(self._result and self._result.get("passive_confirmed"))
+                confirmed = confirmed or self._passive(self._phase, self._result is not None)
                 outcome = self._recorder.finish() if self._recorder is not None else None
                 status.close()
-        return ChildEnd(self._result, exit_code, self._killed, self._stop_cause, confirmed, outcome)
+        return ChildEnd(
+            self._result, exit_code, self._killed, self._stop_cause, confirmed, outcome, self._signal
+        )
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether the operator has asked so often that even the passive command is given up."""
+        return self._stops > _MOST_STOPS
 
     def stop(self, cause: str) -> None:
         """Ask the control process to end by its passive route; the operator's second wish kills it."""
+        self._stops += 1
         again, self._stop_cause = bool(self._stop_cause), self._stop_cause or cause
         if self._child is None or self._child.returncode is not None:
             return
         if not again:
             self._child.send_signal(signal.SIGTERM)
-        elif cause == OPERATOR:
+        elif cause in (OPERATOR, SUSPENDED):
             self._kill("the operator asked twice")
 
     def tell(self, text: str) -> None:
@@ -122,7 +143,7 @@ class Supervisor:
 
     def _start(self) -> StatusReceiver:
         sender, receiver = socket_pair()
-        inherited = [sender.fileno(), *([] if self._port_fd is None else [self._port_fd])]
+        inherited = [sender.fileno(), *self._keep_fds, *([] if self._port_fd is None else [self._port_fd])]
         plan = {
             **self._plan,
             "port_fd": self._port_fd,
@@ -157,6 +178,9 @@ class Supervisor:
     def _watch(self, status: StatusReceiver) -> None:
         """Return when the control process has said its last word, has died or was killed."""
         while status.open:
+            if (now_ns := self._clock.now_ns()) >= self._beat_ns:
+                status.tell(HEARTBEAT)
+                self._beat_ns = now_ns + round(_POLL_S * 1e9)
             left_s = (self._stale_ns - self._clock.now_ns()) * 1e-9
             if select.select([status], [], [], min(_POLL_S, max(left_s, 0.0) + 1e-3))[0]:
                 while (message := status.receive()) is not None:
@@ -188,22 +212,25 @@ class Supervisor:
         if child is None:
             return 0
         try:
-            return child.wait(_GRACE_S)
+            # A wait with a limit polls with pauses of up to 50 ms: a robot may be stiff meanwhile.
+            return child.wait() if self._killed else child.wait(_GRACE_S)
         except subprocess.TimeoutExpired:
             self._kill("it did not end after its last word")
             return child.wait()
 
     @contextlib.contextmanager
     def _operator_stops(self) -> Iterator[None]:
-        """Pass Ctrl-C and SIGTERM on as the operator's stop."""
+        """Pass Ctrl-C, SIGTERM and Ctrl-Z on as the operator's stop."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
 
         def handler(number: int, frame: FrameType | None) -> None:
-            self.stop(OPERATOR)
+            self._signal = self._signal or signal.Signals(number).name
+            self.stop(SUSPENDED if number == signal.SIGTSTP else OPERATOR)
 
-        before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGTSTP)
+        before = {number: signal.signal(number, handler) for number in numbers}
         try:
             yield
         finally:

@@ -36,11 +36,12 @@ _REFUSALS = {
 class CartpoleRobot(Robot):
     """A cart-pole that speaks the serial protocol of docs/protocol-cartpole-serial.md.
 
-    ``connect`` greets the device, which switches its motor off; on an inherited port a child process connects
-    again, with a transport that adopted the descriptor, and so starts from the passive state.
+    ``connect`` says hello to the device, which switches its motor off; on an inherited port a child process
+    connects again, with a transport that adopted the descriptor, and so starts from the passive state. Over a
+    transport that only listens ``connect`` waits for a state instead: kind and version are not checked then.
 
     Attributes:
-        info: What the device said of itself; None before ``connect``.
+        info: What the device said of itself; None before ``connect``, and where it was only listened to.
         resent: Requests that had to be sent again because no answer came within :data:`RETRY_S`.
 
     Args:
@@ -49,6 +50,7 @@ class CartpoleRobot(Robot):
     """
 
     description: ClassVar[RobotDescription] = DESCRIPTION
+    watchdog_s: ClassVar[float] = 0.2
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self.info: protocol.Info | None = None
@@ -65,24 +67,33 @@ class CartpoleRobot(Robot):
         self._next_state: int | None = None
         self._sequence = -1
         self._after_ack: Status | None = None
-        self._torn = False
+        self._torn = self._connected = False
 
     def connect(self) -> None:
-        """Open the transport, greet the device and check what it is."""
-        if self.info is not None:
+        """Open the transport, say hello to the device and check what it is."""
+        if self._connected:
             return
         self._transport.open()
         try:
-            self.info = self._greet()
+            if self._transport.can_send:
+                self.info = self._greet()
+            else:
+                self._states.append(self.read_state(HELLO_TIMEOUT_S))
         except BaseException:
             self._transport.close()
             raise
+        self._connected = True
 
     def disconnect(self) -> None:
         """Close the transport."""
         self._transport.close()
-        self.info = None
+        self.info, self._connected = None, False
         self._decoder = protocol.FrameDecoder()
+
+    def reopen(self) -> None:
+        """Open the port again where the device vanished; bytes from before make no frame with new ones."""
+        self._transport.reopen()
+        self._torn = True
 
     def home(self, timeout_s: float) -> None:
         """Bring the cart to the middle and wait until the pole has been set upright."""

@@ -77,6 +77,7 @@ class Go2Robot(Robot):
     """
 
     description: ClassVar[RobotDescription] = DRIVEN
+    homes_by_motor: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -130,6 +131,10 @@ class Go2Robot(Robot):
         """Close the transport."""
         self._transport.close()
         self._forget()
+
+    def reopen(self) -> None:
+        """Open the transport again where it is lost."""
+        self._transport.reopen()
 
     def home(self, timeout_s: float) -> None:
         """Release the robot's own controller, lying, and make sure that nobody else commands the motors.

@@ -50,12 +50,17 @@ class SerialTransport(Transport):
         self._fd = -1
 
     @classmethod
-    def from_fd(cls, fd: int, clock: Clock | None = None) -> SerialTransport:
+    def from_fd(cls, fd: int, clock: Clock | None = None, port: str = "") -> SerialTransport:
         """Return a transport over a port that a parent process opened; it closes ``fd`` when closed.
 
         It is made for the process with the deadlines, so it reads ahead in a thread.
+
+        Args:
+            fd: The descriptor.
+            clock: Gives the stamps.
+            port: Path of the port, for :meth:`reopen`; "": it cannot be opened again.
         """
-        transport = cls(f"inherited descriptor {fd}", clock=clock)
+        transport = cls(port or f"inherited descriptor {fd}", clock=clock)
         transport._adopted = fd
         return transport
 
@@ -64,7 +69,8 @@ class SerialTransport(Transport):
         if self._fd >= 0:
             return
         if self._adopted is None:
-            self._fd = self._open_port()
+            self._serial = self._open_port()
+            self._fd = self._serial.fileno()
         else:
             self._fd = self._adopt(self._adopted)
             self._ahead = ReadAhead(self._fd, self._clock)
@@ -82,6 +88,24 @@ class SerialTransport(Transport):
         elif fd >= 0:
             with contextlib.suppress(OSError):
                 os.close(fd)
+
+    def reopen(self) -> None:
+        """Open the port by its path where the device vanished, as after a cable was pulled and put back.
+
+        The new port is open before the dead one is closed: a try that fails loses nothing. A port that still
+        works is left alone: its lock is this program's own.
+        """
+        if self._fd >= 0 and not _hung_up(self._fd):
+            return
+        fresh = self._open_port()
+        lost, self._serial = self._serial, None
+        self.close()
+        self._fd, self._serial = fresh.fileno(), fresh
+        if lost is not None:
+            with contextlib.suppress(OSError):
+                lost.close()
+        if self._adopted is not None:
+            self._ahead = ReadAhead(self._fd, self._clock)
 
     def send(self, message: Message) -> None:
         """Write at once; what the port does not take is an error, never a wait."""
@@ -134,7 +158,7 @@ class SerialTransport(Transport):
             raise TransportLostError(f"{self.port}: the port is not open")
         return self._fd
 
-    def _open_port(self) -> int:
+    def _open_port(self) -> serial.Serial:
         try:
             port = serial.Serial(self.port, self._baud_rate, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, OSError) as error:
@@ -144,9 +168,8 @@ class SerialTransport(Transport):
         # FTDI adapters hold bytes back for up to 16 ms without this; ptys and many drivers do not know it.
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             port.set_low_latency_mode(True)
-        self._serial = port
         _read_nothing_means_gone(port.fileno())
-        return int(port.fileno())
+        return port
 
     def _adopt(self, fd: int) -> int:
         try:
@@ -180,6 +203,12 @@ class SerialTransport(Transport):
     def _lost(self, error: OSError | None) -> TransportLostError:
         reason = f" ({error.strerror})" if error is not None else ""
         return TransportLostError(f"{self.port}: the device vanished{reason}; check the cable and the power")
+
+
+def _hung_up(fd: int) -> bool:
+    poll = select.poll()
+    poll.register(fd, 0)
+    return bool(poll.poll(0))
 
 
 def _read_nothing_means_gone(fd: int) -> None:

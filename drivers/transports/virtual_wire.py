@@ -60,6 +60,10 @@ class VirtualWire(Transport, Generic[CoreT]):
         """Pull the cable: every later call fails as if the device had vanished."""
         self._unplugged = True
 
+    def plug_in(self) -> None:
+        """Put the cable back: the wire can be opened again."""
+        self._unplugged = False
+
     def receive(self, timeout_s: float) -> Message:
         """Return the oldest message, moving the clock up to ``timeout_s`` if there is none yet."""
         self._check()

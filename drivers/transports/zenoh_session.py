@@ -182,16 +182,18 @@ def _tls_settings(options: WireOptions) -> dict[str, Any]:
     return {f"transport/link/tls/{name}": value for name, value in (named | flags).items()}
 
 
-def answering(endpoints: Sequence[Endpoint], options: WireOptions) -> tuple[Endpoint, ...]:
+def answering(
+    endpoints: Sequence[Endpoint], options: WireOptions, timeout_s: float = PROBE_TIMEOUT_S
+) -> tuple[Endpoint, ...]:
     """Return the end points, those that take a connection first: Zenoh itself cannot say why one does not.
 
-    A client needs one of them, a peer needs all.
+    A client needs one of them, a peer needs all. Each is waited for so long at most [s].
 
     Raises:
         PortNotFoundError: Nothing listens there, or there is no such host.
         TransportTimeoutError: The host does not answer.
     """
-    errors = {endpoint: _probe(endpoint) for endpoint in endpoints}
+    errors = {endpoint: _probe(endpoint, timeout_s) for endpoint in endpoints}
     good = tuple(endpoint for endpoint in endpoints if errors[endpoint] is None)
     bad = tuple(endpoint for endpoint in endpoints if errors[endpoint] is not None)
     error = errors[bad[0]] if bad else None
@@ -200,14 +202,14 @@ def answering(endpoints: Sequence[Endpoint], options: WireOptions) -> tuple[Endp
     return good + bad
 
 
-def _probe(endpoint: Endpoint) -> PortNotFoundError | TransportTimeoutError | None:
+def _probe(endpoint: Endpoint, timeout_s: float) -> PortNotFoundError | TransportTimeoutError | None:
     if endpoint.protocol == "udp":
         return None
     try:
-        socket.create_connection((endpoint.host, endpoint.port), PROBE_TIMEOUT_S).close()
+        socket.create_connection((endpoint.host, endpoint.port), timeout_s).close()
     except TimeoutError:
         return TransportTimeoutError(
-            f"{endpoint}: the host did not answer within {PROBE_TIMEOUT_S:g} s; is it switched on, is the "
+            f"{endpoint}: the host did not answer within {timeout_s:g} s; is it switched on, is the "
             "address right, does a firewall stand between?"
         )
     except socket.gaierror as error:

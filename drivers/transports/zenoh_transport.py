@@ -32,6 +32,7 @@ _TOPIC: Final = re.compile(r"[^/*$?#\s]+(/[^/*$?#\s]+)*")
 _AT_HAND: Final = 256
 """Messages kept for a reader that does not come: half a second of states. The oldest are dropped."""
 _JOIN_S: Final = 1.0
+_REOPEN_PROBE_S: Final = 0.2
 
 
 class ZenohTransport(TopicTransport):
@@ -119,6 +120,19 @@ class ZenohTransport(TopicTransport):
         threads, self._threads = self._threads, []
         for thread in threads:
             thread.join(_JOIN_S)
+
+    def reopen(self) -> None:
+        """Make a new session where the link is gone and the end point answers; Zenoh tries by itself, too.
+
+        Raises:
+            TransportError: The end points do not answer, or there is no session with them.
+        """
+        if self._session is not None and (self._options.listen or not self._lost):
+            return
+        # Only asked shortly: who repeats a command meanwhile must not wait for a host that is gone.
+        zenoh_session.answering(zenoh_session.parse_endpoints(self.port), self._options, _REOPEN_PROBE_S)
+        self.close()
+        self.open()
 
     def send(self, message: Message) -> None:
         """Put a message on the wire, or drop it where a peer takes no more.

@@ -12,12 +12,13 @@ import pytest
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.passive import make_passive
+from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.safety import Safety
 from deal_hw.data.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import ConfigurationError, DatasetError, TransportLostError, TransportTimeoutError
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.testing.linear_policy import LinearPolicy, feedback_spec
@@ -76,11 +77,12 @@ def test_records_hold_each_state_once_and_what_was_sent(rig: Any) -> None:
 
 
 def test_dry_run_computes_and_sends_nothing(rig: Any) -> None:
-    """Neither home, nor arm, nor targets, nor stop: hello alone; but the commands are in the record."""
+    """Not a byte, hello included; but the commands are in the record."""
+    rig.robot = CartpoleRobot(listen_only(rig.transport), rig.clock)
     report = make_loop(rig, balance(), dry_run=True).run()
     assert report.outcome is Outcome.FINISHED
     assert report.cycles_sent == 0
-    assert set(sent_types(rig)) == {protocol.MessageType.HELLO}
+    assert sent_types(rig) == []
     assert all(r.asked is not None and r.sent is None for r in rig.records[:-1])
     assert {r.safety_state for r in rig.records[:-1]} == {"disarmed"}
 
@@ -228,7 +230,7 @@ def test_a_bug_in_the_behaviour_ends_passively_with_its_message(rig: Any) -> Non
 
 
 def test_a_cable_that_is_pulled_fails_with_what_to_do(rig: Any) -> None:
-    """The robot cannot confirm; its own watchdog stops the motor 200 ms later."""
+    """The run is tripped; the robot cannot confirm; its own watchdog stops the motor 200 ms later."""
 
     def pull(call: int, action: FloatArray) -> FloatArray:
         if call == 20:
@@ -236,9 +238,10 @@ def test_a_cable_that_is_pulled_fails_with_what_to_do(rig: Any) -> None:
         return action
 
     report = make_loop(rig, balance(pull)).run()
-    assert (report.outcome, report.error) == (Outcome.FAILED, "TransportLostError")
-    assert "vanished" in report.reason
+    assert (report.outcome, report.error) == (Outcome.TRIPPED, "")
+    assert report.reason == "the link is lost: virtual wire: the device vanished"
     assert not report.passive_confirmed
+    assert ("passive", report.reason) in rig.events
     assert rig.device.armed
     rig.device.advance_to(rig.clock.now_ns())
     for _ in range(200):
@@ -265,7 +268,7 @@ def test_a_state_stream_that_stops_trips(rig: Any) -> None:
         transport.deaf = call >= 30
         return action
 
-    report = make_loop(rig, balance(silence), passive_attempts=2).run()
+    report = make_loop(rig, balance(silence), passive=PassiveConfig(timeout_s=0.1)).run()
     assert report.outcome is Outcome.TRIPPED
     # Ages at the cycles after the last state: 20, 40, 60 (allowed), 80 ms.
     assert report.reason == "the newest state is 80 ms old, at most 60 ms are allowed"
@@ -337,7 +340,7 @@ def test_only_what_comes_after_the_passive_command_confirms_it(rig: Any) -> None
     assert rig.robot.read_state(0.0).status == 0
     tick = rig.device.tick
     rig.device.tick = lambda: tick()[:0]
-    assert make_passive(rig.robot, rig.clock, attempts=2) is False
+    assert make_passive(rig.robot, rig.clock, PassiveConfig(timeout_s=0.1)) is False
 
 
 @pytest.mark.parametrize("error", [TransportLostError("the read side is gone"), ZeroDivisionError("a bug")])
@@ -359,7 +362,7 @@ def test_a_path_that_cannot_be_read_is_still_written(rig: Any, error: Exception)
     robot.arm(1.0)
     assert rig.device.armed
     transport.broken = True
-    assert make_passive(robot, rig.clock, attempts=1) is False
+    assert make_passive(robot, rig.clock, PassiveConfig(timeout_s=1e-9)) is False
     rig.device.advance_to(rig.clock.now_ns())
     for _ in range(5):
         rig.device.tick()
@@ -391,8 +394,8 @@ def test_the_report_survives_json(rig: Any) -> None:
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
-    """A run of no time, and a run that never sends the passive command."""
+    """A run of no time, and a passive command that is given up before it begins."""
     with pytest.raises(ConfigurationError, match="longer than 0 s"):
         LoopConfig(duration_s=0.0)
-    with pytest.raises(ConfigurationError, match="passive_attempts"):
-        LoopConfig(duration_s=1.0, passive_attempts=0)
+    with pytest.raises(ConfigurationError, match=r"PassiveConfig\.timeout_s"):
+        PassiveConfig(timeout_s=0.0)

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
-from deal_hw.control.loop import RUNNING, ControlLoop, LoopConfig, LoopReport, Outcome, _newest
+from deal_hw.control.handover import RUNNING
+from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.safety import CycleInput, Safety, Verdict
 from deal_hw.data.record import CycleRecord, encode

@@ -23,9 +23,9 @@ from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.replay import Replay, replay
 from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import RunReport, run_episodes
-from deal_hw.control.handover import Beat
-from deal_hw.control.loop import RUNNING, Outcome
+from deal_hw.cli.supervised import InterruptedRunError, RunReport, run_episodes
+from deal_hw.control.handover import RUNNING, Beat
+from deal_hw.control.loop import Outcome
 from deal_hw.data.dataset import Dataset
 from deal_hw.data.reader import read_episode
 from deal_hw.drivers.cartpole import protocol
@@ -39,7 +39,6 @@ from deal_hw.errors import (
     PortBusyError,
     PortNotFoundError,
     SafetyError,
-    TransportLostError,
     WrongDeviceError,
 )
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
@@ -47,6 +46,8 @@ from deal_hw.types import Status
 
 AT_BEAT = 25
 """Faults happen half a second into the run."""
+PASSIVE_S = 0.5
+"""So long is a robot without a link waited for here [s]."""
 LONG = 60.0
 """Nothing here runs to this end [s]."""
 
@@ -129,7 +130,9 @@ def run(
             done = True
             act()
 
-    plan = RunPlan(robot="cartpole", profile="chirp", seconds=seconds, dry_run=dry)
+    plan = RunPlan(
+        robot="cartpole", profile="chirp", seconds=seconds, dry_run=dry, passive_timeout_s=PASSIVE_S
+    )
     return run_episodes(
         plan, port=emulator.port, dataset=folder, episodes=1, purpose="collect", quiet=True, on_beat=on_beat
     )
@@ -197,7 +200,9 @@ def test_ctrl_c_and_sigterm_end_the_run_passively(
 ) -> None:
     """The operator's stop: passive, whole data, exit code 130, and the handlers of before are back."""
     before = signal.getsignal(number)
-    report = run(emulator, tmp_path, lambda: os.kill(os.getpid(), number))
+    with pytest.raises(InterruptedRunError, match="stopped by the operator") as raised:
+        run(emulator, tmp_path, lambda: os.kill(os.getpid(), number))
+    report = raised.value.report
     assert (report.outcome, report.exit_code) == (Outcome.STOPPED, 130)
     assert report.episodes[0].reason == "stopped by the operator"
     assert report.episodes[0].passive_confirmed
@@ -219,11 +224,13 @@ def test_ctrl_c_in_every_other_phase_ends_passively(emulator: Emulator, tmp_path
             os.kill(os.getpid(), signal.SIGINT)
 
     plan = RunPlan(robot="cartpole", profile="chirp", seconds=0.2 if phase == "making passive" else LONG)
-    report = run_episodes(
-        plan, port=emulator.port, dataset=tmp_path, episodes=1, purpose="collect", quiet=True, on_beat=on_beat
-    )
+    with pytest.raises(InterruptedRunError) as raised:
+        run_episodes(
+            plan, port=emulator.port, dataset=tmp_path, episodes=1, purpose="collect", quiet=True,
+            on_beat=on_beat,
+        )  # fmt: skip
     assert done
-    assert report.outcome is (Outcome.FINISHED if phase == "making passive" else Outcome.STOPPED)
+    assert raised.value.report.outcome is (Outcome.FINISHED if phase == "making passive" else Outcome.STOPPED)
     assert Status.ARMED not in emulator.status()
     assert len(Dataset.open(tmp_path).episodes) == 1
 
@@ -324,13 +331,18 @@ def test_a_killed_supervisor_leaves_a_passive_robot_and_no_process(
 def test_a_cable_that_is_pulled_is_named_and_the_data_are_whole(
     start_emulator: Callable[..., Emulator], tmp_path: Path
 ) -> None:
-    """The message names the port; the report says that nobody could confirm."""
+    """The message names the port; the report says that nobody could confirm, and what the device does."""
     emulator = start_emulator("--vanish-after-s", "0.6")
-    with pytest.raises(TransportLostError, match=f"{emulator.port}: the device vanished"):
-        run(emulator, tmp_path)
+    report = run(emulator, tmp_path)
+    assert (report.outcome, report.exit_code) == (Outcome.TRIPPED, 3)
+    assert report.episodes[0].reason.startswith(f"the link is lost: {emulator.port}: the device vanished")
     facts = Dataset.open(tmp_path).episodes[0].facts
     assert facts["passive_confirmed"] is False
-    assert any("switch it off by hand" in warning for warning in facts["warnings"])
+    assert any(
+        "switch it off by hand. Where the cable is cut, its own watchdog has stopped the motor after 0.2 s"
+        in w
+        for w in facts["warnings"]
+    )
     assert_whole(tmp_path)
 
 
@@ -367,7 +379,7 @@ def test_a_second_collector_is_refused_and_disturbs_nobody(emulator: Emulator, t
 
     report = run(emulator, tmp_path / "first", second, seconds=1.0)
     assert report.outcome is Outcome.FINISHED
-    assert "is held by another process" in str(refused[0])
+    assert f"the robot is in use by process {os.getpid()} (" in str(refused[0])
     assert not (tmp_path / "second").exists()
 
 

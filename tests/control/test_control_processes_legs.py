@@ -17,8 +17,8 @@ import pytest
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import RunReport, run_episodes
-from deal_hw.control.handover import Beat
-from deal_hw.control.loop import RUNNING, Outcome
+from deal_hw.control.handover import RUNNING, Beat
+from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
 from deal_hw.data.dataset import Dataset
 from deal_hw.drivers.go2.command_log import DAMPING, STIFF

@@ -1,0 +1,84 @@
+"""The exclusive claim on a robot, on this computer: a name that the kernel lets one process tree hold."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import socket
+import struct
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from deal_hw.errors import PortBusyError
+
+_PEER_CREDENTIALS = struct.Struct("3i")
+
+
+class LocalClaim:
+    """Holds a name for as long as this process, or a child that inherited the descriptor, lives.
+
+    An abstract Unix socket: no file is left behind by a process that was killed, no permission is needed, and
+    who holds it can be asked. The child counts, because it makes the robot passive when its parent dies.
+
+    Args:
+        resource: What is claimed, such as a transport with its address; the same text is the same claim.
+    """
+
+    def __init__(self, resource: str) -> None:
+        self._resource = resource
+        self._name = b"\0deal-hw/claim/" + hashlib.sha256(resource.encode()).hexdigest()[:32].encode()
+        self._socket: socket.socket | None = None
+
+    def fileno(self) -> int:
+        """Return the descriptor that a child inherits."""
+        if self._socket is None:
+            raise RuntimeError("the claim is not held")
+        return self._socket.fileno()
+
+    def acquire(self) -> None:
+        """Take the name.
+
+        Raises:
+            PortBusyError: Another run holds it; the text says which.
+        """
+        held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            held.bind(self._name)
+            held.listen(1)
+        except OSError as error:
+            held.close()
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise PortBusyError(
+                f"{self._resource}: the robot is in use by {self._holder()}. Two programs that command one "
+                "robot make it jump. End that run first (Ctrl-C in its terminal), then start this one"
+            ) from None
+        self._socket = held
+
+    def release(self) -> None:
+        """Give the name up; idempotent."""
+        held, self._socket = self._socket, None
+        if held is not None:
+            held.close()
+
+    def __enter__(self) -> Self:
+        self.acquire()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()
+
+    def _holder(self) -> str:
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+            asking.setblocking(False)
+            asking.connect(self._name)
+            credentials = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER_CREDENTIALS.size)
+            pid, _, _ = _PEER_CREDENTIALS.unpack(credentials)
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            command = " ".join(Path(word.decode("utf-8", "replace")).name for word in words[:6] if word)
+            return f"process {pid} ({command[:120]})"
+        return "another run"

@@ -1,0 +1,144 @@
+"""The exclusive claim on a Go2, on the wire: who commands it, so that a second program is refused at once.
+
+Claims are messages on a topic of our own, which robot and sport mode ignore. A claim has a life cycle:
+
+    asking --nobody answered for LISTEN_S--> held --every REFRESH_S--> held ... --> released
+       └──── somebody holds it, or asks with a smaller number: refused
+
+Whoever holds it answers each asking at once and repeats itself; whoever falls silent for LISTEN_S has lost
+it: the claim has expired. Programs that know nothing of claims are found by their commands (:mod:`takeover`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import uuid
+from collections.abc import Callable
+from typing import Any, Final
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.go2.rpc import Request, decode_request, encode_request
+from deal_hw.drivers.go2.topics import CLAIM
+from deal_hw.errors import FrameError, PortBusyError, TransportError, TransportTimeoutError
+from deal_hw.transport import Message, TopicTransport
+
+LISTEN_S: Final = 0.8
+"""How long nobody may have answered before the claim is held; who is silent for so long has lost it [s].
+Discovery over DDS takes up to some 0.3 s of it."""
+REFRESH_S: Final = 0.2
+_ASK_S: Final = 0.1
+_JOIN_S: Final = 2.0
+ASKING, HELD, RELEASED = "asking", "held", "released"
+
+
+class WireClaim:
+    """Claims the robot on a transport of its own; a thread keeps the claim alive.
+
+    Args:
+        transport: Topics of the robot; not open, and nobody else's.
+        clock: For the waiting.
+        holder: Who claims, in words for others to read.
+        identity: Tells claims apart; of two that ask at the same time the smaller wins. Random by default.
+    """
+
+    def __init__(
+        self, transport: TopicTransport, clock: Clock, holder: str, identity: str | None = None
+    ) -> None:
+        self._transport, self._clock, self._holder = transport, clock, holder
+        self._identity = identity or uuid.uuid4().hex
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def acquire(self) -> None:
+        """Open the transport, ask, and hold the claim from now on.
+
+        Raises:
+            PortBusyError: Somebody else holds it, or asked first.
+            TransportError: The transport cannot be opened.
+        """
+        self._transport.declare(publish=[CLAIM], subscribe=[CLAIM])
+        self._transport.open()
+        try:
+            self._ask()
+        except BaseException:
+            self._transport.close()
+            raise
+        self._say(HELD)
+        self._thread = threading.Thread(target=self._keep, name="claim", daemon=True)
+        self._thread.start()
+
+    def release(self) -> None:
+        """Give the claim up and close the transport; idempotent."""
+        self._end.set()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(_JOIN_S)
+            with contextlib.suppress(TransportError):
+                self._say(RELEASED)
+        self._transport.close()
+
+    def _ask(self) -> None:
+        end_ns = self._clock.now_ns() + round(LISTEN_S * 1e9)
+        next_ns = self._clock.now_ns()
+        while (now_ns := self._clock.now_ns()) < end_ns:
+            if now_ns >= next_ns:
+                self._say(ASKING)
+                next_ns += round(_ASK_S * 1e9)
+            self._listen((min(next_ns, end_ns) - now_ns) * 1e-9, self._yield_to)
+
+    def _yield_to(self, claim: dict[str, Any]) -> None:
+        if claim["state"] == HELD or (claim["state"] == ASKING and claim["id"] < self._identity):
+            raise PortBusyError(
+                f"go2: the robot is in use: {claim['who']} commands it, or is about to. Two programs that "
+                "command one robot make it jump. End that run first (Ctrl-C in its terminal)"
+            )
+
+    def _keep(self) -> None:
+        next_ns = self._clock.now_ns()
+        while not self._end.is_set():
+            now_ns = self._clock.now_ns()
+            try:
+                if now_ns >= next_ns:
+                    self._say(HELD)
+                    next_ns = now_ns + round(REFRESH_S * 1e9)
+                self._listen(max(next_ns - now_ns, 0) * 1e-9, self._answer)
+            except TransportError:
+                # The link is down: the control process deals with that. The claim goes on once it is back.
+                self._end.wait(REFRESH_S)
+                with contextlib.suppress(TransportError):
+                    self._transport.reopen()
+
+    def _answer(self, claim: dict[str, Any]) -> None:
+        if claim["state"] == ASKING:
+            self._say(HELD)
+
+    def _listen(self, timeout_s: float, heed: Callable[[dict[str, Any]], None]) -> None:
+        """Hand what another says to ``heed``; return after one message or the time [s]."""
+        try:
+            message = self._transport.receive(timeout_s)
+        except TransportTimeoutError:
+            return
+        claim = read_claim(message.payload) if message.channel == CLAIM else None
+        if claim is not None and claim["id"] != self._identity:
+            heed(claim)
+
+    def _say(self, state: str) -> None:
+        text = json.dumps({"id": self._identity, "who": self._holder, "state": state})
+        payload = encode_request(Request(identity=0, api=0, parameter=text, no_reply=True))
+        with contextlib.suppress(TransportTimeoutError):
+            self._transport.send(Message(CLAIM, payload, self._clock.now_ns()))
+
+
+def read_claim(payload: bytes) -> dict[str, Any] | None:
+    """Return the claim in a message, its ``id``, ``who`` and ``state`` as text; None where it is none."""
+    try:
+        values = json.loads(decode_request(payload).parameter)
+    except (FrameError, ValueError, RecursionError):
+        return None
+    if not isinstance(values, dict) or not all(
+        isinstance(values.get(k), str) for k in ("id", "who", "state")
+    ):
+        return None
+    return {**values, "who": values["who"][:200]}

@@ -1,0 +1,80 @@
+"""A path that only listens: what a dry run is given, so that nothing in it holds a way to send."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NoReturn
+
+from deal_hw.errors import SafetyError
+from deal_hw.transport import Message, TopicTransport, Transport
+
+
+class ListenOnly(Transport):
+    """Wraps a transport; whoever sends through it gets an error, and nothing goes out.
+
+    Args:
+        inner: The transport that could send.
+    """
+
+    can_send = False
+
+    def __init__(self, inner: Transport) -> None:
+        self._inner = inner
+
+    @property
+    def port(self) -> str:
+        """Where the path leads."""
+        return str(getattr(self._inner, "port", type(self._inner).__name__))
+
+    def open(self) -> None:
+        """Open the path."""
+        self._inner.open()
+
+    def close(self) -> None:
+        """Close the path."""
+        self._inner.close()
+
+    def reopen(self) -> None:
+        """Open the path again."""
+        self._inner.reopen()
+
+    def send(self, message: Message) -> NoReturn:
+        """Refuse.
+
+        Raises:
+            SafetyError: Always.
+        """
+        raise SafetyError(f"{self.port}: this run only listens (--dry-run): nothing may be sent")
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return what arrived."""
+        return self._inner.receive(timeout_s)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the path."""
+        return int(self._inner.fileno())  # type: ignore[attr-defined]
+
+
+class ListenOnlyTopics(ListenOnly, TopicTransport):
+    """The same for topics: no publisher is declared, so that peers see none either.
+
+    Args:
+        inner: The transport that could send.
+    """
+
+    def __init__(self, inner: TopicTransport) -> None:
+        super().__init__(inner)
+        self._topics = inner
+
+    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
+        """Say which topics will be heard; those to publish are left out."""
+        self._topics.declare(subscribe=subscribe)
+
+    def writers(self, topic: str) -> tuple[str, ...]:
+        """Return a description of each other participant that is known to write a topic."""
+        return self._topics.writers(topic)
+
+
+def listen_only(transport: Transport) -> Transport:
+    """Return the transport without its way to send."""
+    return ListenOnlyTopics(transport) if isinstance(transport, TopicTransport) else ListenOnly(transport)
