@@ -158,7 +158,11 @@ class StatusReceiver:
     def receive(self) -> Beat | dict[str, Any] | None:
         """Return the next heartbeat or result; None when there is none at hand."""
         try:
-            datagram = self._socket.recv(1 << 18)
+            try:
+                datagram = self._socket.recv(1 << 18)
+            except ConnectionResetError:
+                # It closed with words of ours unread: the kernel says so once, ahead of its last words.
+                datagram = self._socket.recv(1 << 18)
         except BlockingIOError:
             return None
         except OSError:

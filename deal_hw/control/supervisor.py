@@ -20,7 +20,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any
+from typing import IO, Any, cast
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
@@ -103,15 +103,15 @@ class Supervisor:
     def run(self) -> ChildEnd:
         """Start the control process, watch it to its end, see to the robot and to the recording."""
         with self._operator_stops(), priority(SUPERVISOR_PRIORITY, lock=True):
-            status = self._status = self._start()
+            child, status = self._start()
             try:
-                self._watch(status)
+                self._watch(child, status)
             except BaseException:
-                self._kill("the supervisor failed")
+                self._kill(child, "the supervisor failed")
                 raise
             finally:
                 # Whatever went wrong up here: no control process is left alone, and the robot comes first.
-                exit_code = self._reap()
+                exit_code = self._reap(child)
                 confirmed = bool(self._result and self._result.get("passive_confirmed"))
                 confirmed = confirmed or self._passive(self._phase, self._result is not None)
                 outcome = self._recorder.finish() if self._recorder is not None else None
@@ -129,19 +129,20 @@ class Supervisor:
         """Ask the control process to end by its passive route; the operator's second wish kills it."""
         self._stops += 1
         again, self._stop_cause = bool(self._stop_cause), self._stop_cause or cause
-        if self._child is None or self._child.returncode is not None:
+        child = self._child
+        if child is None or child.returncode is not None:
             return
         if not again:
-            self._child.send_signal(signal.SIGTERM)
+            child.send_signal(signal.SIGTERM)
         elif cause in (OPERATOR, SUSPENDED):
-            self._kill("the operator asked twice")
+            self._kill(child, "the operator asked twice")
 
     def tell(self, text: str) -> None:
         """Pass a word of the operator on to the control process, such as a key; safe from another thread."""
         if self._status is not None:
             self._status.tell(text)
 
-    def _start(self) -> StatusReceiver:
+    def _start(self) -> tuple[subprocess.Popen[bytes], StatusReceiver]:
         sender, receiver = socket_pair()
         inherited = [sender.fileno(), *self._keep_fds, *([] if self._port_fd is None else [self._port_fd])]
         plan = {
@@ -170,12 +171,12 @@ class Supervisor:
         if self._stop_cause:
             child.send_signal(signal.SIGTERM)
         self._stale_ns = self._clock.now_ns() + round(START_SILENCE_S * 1e9)
-        if child.stdin is not None:
-            with contextlib.suppress(BrokenPipeError), child.stdin:
-                child.stdin.write(json.dumps(plan).encode())
-        return StatusReceiver(receiver)
+        with contextlib.suppress(BrokenPipeError), cast("IO[bytes]", child.stdin) as orders:
+            orders.write(json.dumps(plan).encode())
+        self._status = StatusReceiver(receiver)
+        return child, self._status
 
-    def _watch(self, status: StatusReceiver) -> None:
+    def _watch(self, child: subprocess.Popen[bytes], status: StatusReceiver) -> None:
         """Return when the control process has said its last word, has died or was killed."""
         while status.open:
             if (now_ns := self._clock.now_ns()) >= self._beat_ns:
@@ -188,7 +189,7 @@ class Supervisor:
             # Only after a wait that brought nothing: a supervisor that was itself held up finds old beats
             # first.
             elif self._clock.now_ns() > self._stale_ns:
-                self._kill(f"it gave no sign of life while {self._phase}")
+                self._kill(child, f"it gave no sign of life while {self._phase}")
                 return
             if self._recorder is not None and not self._stop_cause and (errors := self._recorder.errors()):
                 self.stop(f"the recorder failed: {errors[0]}")
@@ -200,22 +201,18 @@ class Supervisor:
         else:
             self._result = message
 
-    def _kill(self, why: str) -> None:
+    def _kill(self, child: subprocess.Popen[bytes], why: str) -> None:
         # SIGKILL also ends a process that was stopped by SIGSTOP.
         self._killed = self._killed or why
-        if self._child is not None:
-            self._child.kill()
+        child.kill()
 
-    def _reap(self) -> int:
+    def _reap(self, child: subprocess.Popen[bytes]) -> int:
         """Return the exit code of the control process, which has said its last word or never will."""
-        child = self._child
-        if child is None:
-            return 0
         try:
             # A wait with a limit polls with pauses of up to 50 ms: a robot may be stiff meanwhile.
             return child.wait() if self._killed else child.wait(_GRACE_S)
         except subprocess.TimeoutExpired:
-            self._kill("it did not end after its last word")
+            self._kill(child, "it did not end after its last word")
             return child.wait()
 
     @contextlib.contextmanager

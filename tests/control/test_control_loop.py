@@ -12,14 +12,14 @@ import pytest
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
-from deal_hw.control.passive import PassiveConfig, make_passive
+from deal_hw.control.passive import PassiveConfig
 from deal_hw.control.safety import Safety
 from deal_hw.data.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.transports.listen_only import listen_only
-from deal_hw.errors import ConfigurationError, DatasetError, TransportLostError, TransportTimeoutError
+from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.testing.linear_policy import LinearPolicy, feedback_spec
 from deal_hw.types import FloatArray, JointCommand, RobotState
@@ -332,43 +332,6 @@ def test_rich_runs_twice_alike_and_reaches_the_devices_own_limits(rig: Any) -> N
     assert any("CLAMPED" in (s.status.name or "") for r in rig.records for s in r.states)
 
 
-def test_only_what_comes_after_the_passive_command_confirms_it(rig: Any) -> None:
-    """A sample from before the run, still in the queue of a supervisor's robot, confirms nothing."""
-    rig.robot.connect()
-    rig.clock.advance_ns(20 * MS)
-    # Some samples, all unarmed, wait on the wire; then the device falls silent.
-    assert rig.robot.read_state(0.0).status == 0
-    tick = rig.device.tick
-    rig.device.tick = lambda: tick()[:0]
-    assert make_passive(rig.robot, rig.clock, PassiveConfig(timeout_s=0.1)) is False
-
-
-@pytest.mark.parametrize("error", [TransportLostError("the read side is gone"), ZeroDivisionError("a bug")])
-def test_a_path_that_cannot_be_read_is_still_written(rig: Any, error: Exception) -> None:
-    """Nothing confirms it, but the passive command goes out with the first attempt and the motor stops."""
-
-    class Mute(FaultyTransport):
-        broken = False
-
-        def receive(self, timeout_s: float) -> Any:
-            if self.broken:
-                raise error
-            return super().receive(timeout_s)
-
-    transport = Mute(rig.transport)
-    robot = CartpoleRobot(transport, rig.clock)
-    robot.connect()
-    robot.home(10.0)
-    robot.arm(1.0)
-    assert rig.device.armed
-    transport.broken = True
-    assert make_passive(robot, rig.clock, PassiveConfig(timeout_s=1e-9)) is False
-    rig.device.advance_to(rig.clock.now_ns())
-    for _ in range(5):
-        rig.device.tick()
-    assert not rig.device.armed
-
-
 def test_the_heartbeat_names_each_phase(rig: Any) -> None:
     """Phases in order, each with the longest silence to be expected."""
     phases: list[tuple[str, float]] = []
@@ -394,8 +357,6 @@ def test_the_report_survives_json(rig: Any) -> None:
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
-    """A run of no time, and a passive command that is given up before it begins."""
+    """A run of no time."""
     with pytest.raises(ConfigurationError, match="longer than 0 s"):
         LoopConfig(duration_s=0.0)
-    with pytest.raises(ConfigurationError, match=r"PassiveConfig\.timeout_s"):
-        PassiveConfig(timeout_s=0.0)

@@ -1,0 +1,361 @@
+"""The passive command at the end of a run: against a clock, over every reconnect, on a virtual wire."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from deal_hw.clock import VirtualClock
+from deal_hw.control.behaviours import HoldBehaviour
+from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
+from deal_hw.control.passive import PassiveConfig, make_passive
+from deal_hw.control.safety import Safety
+from deal_hw.drivers.cartpole import protocol
+from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.command_log import DAMPING, STIFF
+from deal_hw.drivers.go2.device import Go2Device
+from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.robot import Go2HungRobot
+from deal_hw.drivers.go2.truth import nominal_truth as go2_truth
+from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
+from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError
+from deal_hw.transport import Message
+
+MS, S = 1_000_000, 1_000_000_000
+
+
+class Wire(VirtualTransport):
+    """A virtual wire that counts, and that can be silent both ways without an error.
+
+    Attributes:
+        sent: When which message left the host [ns, payload], lost ones included.
+        opened: When it was opened [ns].
+        silent: Whether what is sent is lost and nothing is heard.
+        deaf: Whether nothing is heard.
+        error: Raised by reading, where there is one.
+    """
+
+    def __init__(self, device: CartpoleDevice, clock: VirtualClock) -> None:
+        super().__init__(device, clock)
+        self.sent: list[tuple[int, bytes]] = []
+        self.opened: list[int] = []
+        self.silent = self.deaf = False
+        self.error: Exception | None = None
+
+    def open(self) -> None:
+        """Note when."""
+        self.opened.append(self._clock.now_ns())
+        super().open()
+
+    def send(self, message: Message) -> None:
+        """Note it; lose it where the wire is silent."""
+        self.sent.append((self._clock.now_ns(), message.payload))
+        if not self.silent:
+            super().send(message)
+
+    def receive(self, timeout_s: float) -> Message:
+        """Hear nothing where the wire is silent."""
+        if self.error is not None:
+            raise self.error
+        if not (self.silent or self.deaf):
+            return super().receive(timeout_s)
+        self._clock.sleep_until_ns(self._clock.now_ns() + round(timeout_s * 1e9))
+        self._catch_up()
+        self._queue.clear()
+        raise TransportTimeoutError("silence")
+
+
+@dataclass
+class Armed:
+    """An armed cart-pole, and what its operator was told."""
+
+    clock: VirtualClock = field(default_factory=lambda: VirtualClock(S))
+    told: list[tuple[int, str, float]] = field(default_factory=list)
+    then: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self.device = CartpoleDevice(nominal_truth("ideal"))
+        self.wire = Wire(self.device, self.clock)
+        self.robot = CartpoleRobot(self.wire, self.clock)
+        self.robot.connect()
+        self.robot.home(10.0)
+        self.robot.arm(1.0)
+        self.begin_ns = self.clock.now_ns()
+        self.wire.sent.clear()
+        self.wire.opened.clear()
+
+    @property
+    def passed_s(self) -> float:
+        """Time since it was armed [s]."""
+        return (self.clock.now_ns() - self.begin_ns) * 1e-9
+
+    def progress(self, text: str, silence_s: float) -> None:
+        """Note what the operator reads, and let something happen."""
+        self.told.append((self.clock.now_ns() - self.begin_ns, text, silence_s))
+        self.then()
+
+    def make_passive(self, **settings: Any) -> bool:
+        """Make it passive, under these settings."""
+        return make_passive(self.robot, self.clock, PassiveConfig(**settings), progress=self.progress)
+
+    def motor_off(self) -> bool:
+        """Let the device catch up; return whether its motor is off."""
+        self.device.advance_to(self.clock.now_ns() - S)
+        return not self.device.armed
+
+    def stops(self) -> list[int]:
+        """When a passive command left the host, since it was armed [ns]."""
+        decoder = protocol.FrameDecoder()
+        found = []
+        for stamp_ns, payload in self.wire.sent:
+            kinds = [protocol.decode(frame).TYPE for frame in decoder.feed(payload)]
+            found += [stamp_ns - self.begin_ns] * kinds.count(protocol.MessageType.STOP)
+        return found
+
+
+def test_a_robot_that_hears_is_passive_at_the_first_attempt() -> None:
+    """One command, at once, and nobody is told of any trouble; a state of 5 ms later confirms it."""
+    armed = Armed()
+    assert armed.make_passive()
+    assert armed.motor_off()
+    assert armed.stops() == [0]
+    assert armed.told == []
+    assert armed.passed_s < 0.05
+
+
+@pytest.mark.parametrize("down_s", [0.1, 0.5, 1.5, 3.0, 8.0, 25.0])
+@pytest.mark.parametrize("kind", ["error", "silence"])
+def test_a_link_that_comes_back_ends_passive(kind: str, down_s: float) -> None:
+    """The command is repeated all the time; the path is opened again; the robot confirms soon afterwards."""
+    armed = Armed()
+
+    def down(state: bool) -> None:
+        if kind == "silence":
+            armed.wire.silent = state
+        elif state:
+            armed.wire.unplug()
+        else:
+            armed.wire.plug_in()
+
+    def then() -> None:
+        if armed.passed_s >= down_s:
+            down(False)
+
+    armed.then = then
+    down(True)
+    assert armed.make_passive()
+    assert armed.motor_off()
+    # A lost path is tried every 0.5 s, an attempt takes 0.05 s.
+    assert down_s <= armed.passed_s <= down_s + 0.7
+    gaps = [b - a for a, b in zip(armed.stops(), armed.stops()[1:], strict=False)]
+    assert kind == "error" or max(gaps) <= 51 * MS
+
+
+def test_a_link_that_stays_away_is_given_up_after_the_stated_time() -> None:
+    """30 s of attempts every 50 ms; a new line for the operator each second; the path tried every 0.5 s."""
+    armed = Armed()
+    armed.wire.unplug()
+    assert not armed.make_passive()
+    assert 30.0 <= armed.passed_s <= 30.1
+    texts = list(dict.fromkeys(text for _, text, _ in armed.told))
+    why = "the link is down (virtual wire: the device vanished)"
+    assert texts == [f"{why}; passive command repeated for {s} s, {30 - s} s left" for s in range(30)]
+    assert [silence_s for _, _, silence_s in armed.told[:2]] == [10.0, 1.0]
+    opened = [(ns - armed.begin_ns) / S for ns in armed.wire.opened]
+    assert len(opened) == 60
+    assert {round(b - a, 9) for a, b in itertools.pairwise(opened)} == {0.5}
+    assert len(armed.wire.sent) == 601
+
+
+def test_a_silent_robot_is_told_apart_and_its_path_is_opened_every_three_seconds() -> None:
+    """No error, no state: perhaps the path is dead and does not know it."""
+    armed = Armed()
+    armed.wire.silent = True
+    assert not armed.make_passive(timeout_s=10.0)
+    assert armed.told[0][1] == "the robot does not show it; passive command repeated for 0 s, 10 s left"
+    opened = [(ns - armed.begin_ns) / S for ns in armed.wire.opened]
+    assert opened == pytest.approx([3.0, 6.0, 9.0], abs=0.11)
+    assert len(armed.stops()) == 200
+
+
+def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
+    """The robot is heard and does not obey: a new path would not help, and would cost the old one."""
+    armed = Armed()
+
+    class Deaf(CartpoleDevice):
+        def receive(self, data: bytes) -> None:
+            """Hear nothing, and be spared by the watchdog."""
+            self._alive_tick = 10**9
+
+    armed.device.__class__ = Deaf
+    assert not armed.make_passive(timeout_s=7.0)
+    assert armed.wire.opened == []
+    assert armed.told[-1][1] == "the robot does not show it; passive command repeated for 6 s, 1 s left"
+
+
+@pytest.mark.parametrize("error", [TransportLostError("the read side is gone"), ZeroDivisionError("a bug")])
+def test_a_path_that_cannot_be_read_is_still_written(error: Exception) -> None:
+    """Nothing confirms it, but the passive command goes out with the first attempt and the motor stops."""
+    armed = Armed()
+    armed.wire.error = error
+    assert not armed.make_passive(timeout_s=0.01)
+    assert armed.stops() == [0, 50 * MS]
+    armed.clock.advance_ns(5 * MS)
+    assert armed.motor_off()
+
+
+def test_samples_from_before_confirm_nothing() -> None:
+    """Unarmed samples wait on the wire of a supervisor; then the device falls silent."""
+    clock = VirtualClock(S)
+    device = CartpoleDevice(nominal_truth("ideal"))
+    robot = CartpoleRobot(VirtualTransport(device, clock), clock)
+    robot.connect()
+    clock.advance_ns(20 * MS)
+    assert robot.read_state(0.0).status == 0
+    tick = device.tick
+    device.tick = lambda: tick()[:0]  # type: ignore[method-assign]
+    assert not make_passive(robot, clock, PassiveConfig(timeout_s=0.1))
+
+
+def test_the_operator_may_give_up() -> None:
+    """Asked after each attempt that failed, never before the first."""
+    armed = Armed()
+    armed.wire.unplug()
+    asked: list[float] = []
+
+    def abandoned() -> bool:
+        asked.append(armed.passed_s)
+        return len(asked) == 3
+
+    assert not make_passive(armed.robot, armed.clock, abandoned=abandoned)
+    assert len(armed.stops()) == 3
+    assert asked == pytest.approx([0.0, 0.05, 0.1])
+
+
+def test_a_driver_that_fails_in_every_way_is_survived() -> None:
+    """Sending and opening raise what no driver should; the attempts go on until the time is over."""
+    armed = Armed()
+
+    def broken(*arguments: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    armed.wire.send = armed.wire.reopen = broken  # type: ignore[method-assign, assignment]
+    assert not armed.make_passive(timeout_s=1.0)
+    assert armed.told[0][1].startswith("the link is down (a bug); passive command repeated for 0 s, 1 s left")
+
+
+def test_the_defaults_are_as_documented() -> None:
+    """docs/safety.md names them."""
+    assert PassiveConfig() == PassiveConfig(timeout_s=30.0, confirm_s=0.05, reopen_s=0.5, silent_s=3.0)
+
+
+@pytest.mark.parametrize("name", ["timeout_s", "confirm_s", "reopen_s", "silent_s"])
+@pytest.mark.parametrize("value", [0.0, -1.0, 3600.0, math.nan, math.inf])
+def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
+    """Both ends are outside."""
+    with pytest.raises(ConfigurationError) as raised:
+        PassiveConfig(**{name: value})
+    assert str(raised.value) == f"PassiveConfig.{name} is {value!r} s; allowed: above 0, below 3600"
+
+
+# A robot that holds its last command for ever, through the whole loop.
+
+
+class Hung:
+    """A Go2 on a stand, run by the control loop, whose wire is cut at a moment of the run."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock(S)
+        self.device = Go2Device(go2_truth("ideal"), suspended=True)
+        self.wire = VirtualTopics(self.device, self.clock)
+        self.robot = Go2HungRobot(self.wire, self.clock)
+        self.beats: list[tuple[str, float]] = []
+        self.at: Callable[[str], None] = lambda phase: None
+
+    def progress(self, phase: str, silence_s: float) -> None:
+        """Note the heartbeat."""
+        self.beats.append((phase, silence_s))
+        self.at(phase)
+
+    def run(self, **config: Any) -> LoopReport:
+        """Hold the standing pose for half a second."""
+        return ControlLoop(
+            self.robot, HoldBehaviour(HUNG), Safety(HUNG), self.clock, lambda record: True,
+            LoopConfig(duration_s=0.5, **config), progress=self.progress,
+        ).run()  # fmt: skip
+
+    @property
+    def kinds(self) -> list[str]:
+        """The kinds of command that the robot heard, each change once."""
+        return [kind for *_, kind in self.device.log.changes]
+
+
+def test_a_go2_whose_link_drops_while_the_run_ends_is_damped_once_it_is_back() -> None:
+    """On commit d5a5f8c ten attempts were used up in no time, and the robot stayed stiff for good."""
+    rig = Hung()
+    cut_ns = 0
+
+    def at(phase: str) -> None:
+        nonlocal cut_ns
+        if phase == "making passive":
+            cut_ns = rig.clock.now_ns()
+            rig.wire.unplug()
+        elif cut_ns and rig.clock.now_ns() - cut_ns > 3 * S:
+            rig.wire.plug_in()
+
+    rig.at = at
+    report = rig.run()
+    assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True)
+    assert rig.kinds[-2:] == [STIFF, DAMPING]
+    told = [phase for phase, _ in rig.beats if phase.startswith("making passive: ")]
+    assert told[0].startswith("making passive: the link is down (virtual wire: the device vanished); passive")
+
+
+def test_a_go2_whose_link_is_lost_in_the_run_trips_at_once_and_is_damped_once_it_is_back() -> None:
+    """The reason names the link; what was sent before the cut is held until then."""
+    rig = Hung()
+    running = 0
+
+    def at(phase: str) -> None:
+        nonlocal running
+        running += phase == "running"
+        if running == 10:
+            running += 1
+            rig.wire.unplug()
+        if phase.endswith("for 2 s, 28 s left"):
+            rig.wire.plug_in()
+
+    rig.at = at
+    report = rig.run(hand_back=True)
+    assert (report.outcome, report.error, report.passive_confirmed) == (Outcome.TRIPPED, "", True)
+    assert report.reason == "the link is lost: virtual wire: the device vanished"
+    assert rig.kinds[-2:] == [STIFF, DAMPING]
+    assert "handing back" not in dict(rig.beats)
+
+
+@pytest.mark.parametrize("phase", ["connecting", "homing"])
+def test_a_go2_that_was_not_commanded_yet_is_left_alone(phase: str) -> None:
+    """Stopped while its own controller may still have it: not one motor command."""
+    rig = Hung()
+    heard: list[str] = []
+    receive = rig.device.receive
+    rig.device.receive = lambda t, p, s=0: (heard.append(t), receive(t, p, s))[1]  # type: ignore[method-assign]
+
+    def at(name: str) -> None:
+        if name == phase:
+            raise KeyboardInterrupt
+
+    rig.at = at
+    report = rig.run()
+    assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, True)
+    assert topics.LOW_COMMAND not in heard
+    assert "making passive" not in dict(rig.beats)

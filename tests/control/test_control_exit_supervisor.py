@@ -1,0 +1,310 @@
+"""The supervisor over control processes that die, stall, lie and linger: real processes, a few bytes each."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deal_hw.control import supervisor as module
+from deal_hw.control.handover import Beat
+from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
+from deal_hw.data.recorder_launch import RecorderOutcome
+
+CHILD = """
+import json, os, signal, socket, struct, sys, time
+
+orders = json.load(sys.stdin)
+channel = socket.socket(fileno=orders["status_fd"])
+channel.setblocking(True)
+
+
+def beat(phase, silence_s=20.0):
+    channel.send(struct.pack("<cqdI", b"H", time.monotonic_ns(), silence_s, 0) + phase.encode())
+
+
+def result(**values):
+    channel.send(b"R" + json.dumps(values).encode())
+
+
+def on_term(act):
+    signal.signal(signal.SIGTERM, lambda *_: act())
+
+
+def stopped():
+    result(passive_confirmed=True, how="asked")
+    os._exit(0)
+
+
+exec(orders["do"])
+"""
+
+
+class Run:
+    """A supervisor over a control process that does as it is told.
+
+    Attributes:
+        passive: What the supervisor was asked for once the process was dead: phase, tried in vain.
+    """
+
+    def __init__(
+        self, do: str, at: Callable[[Run, Beat], None] = lambda run, beat: None, **settings: Any
+    ) -> None:
+        self.passive: list[tuple[str, bool]] = []
+        self.beats: list[str] = []
+        self._at = at
+        self.supervisor = Supervisor(
+            module="deal_hw_obedient_child", plan={"do": do}, port_fd=None, passive=self._passive,
+            on_beat=self._on_beat, **settings,
+        )  # fmt: skip
+
+    def _passive(self, phase: str, in_vain: bool) -> bool:
+        child = self.supervisor._child
+        assert child is None or child.returncode is not None, "the control process is dead first"
+        self.passive.append((phase, in_vain))
+        return True
+
+    def _on_beat(self, beat: Beat) -> None:
+        self.beats.append(beat.phase)
+        self._at(self, beat)
+
+    def end(self) -> ChildEnd:
+        """Run to the end."""
+        return self.supervisor.run()
+
+
+@pytest.fixture(autouse=True)
+def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control process's module."""
+    (tmp_path / "deal_hw_obedient_child.py").write_text(CHILD)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+
+
+def test_a_process_that_ends_well_leaves_nothing_to_do() -> None:
+    """Its word that the robot is passive is believed, and nothing is sent."""
+    run = Run("beat('running'); result(passive_confirmed=True)")
+    end = run.end()
+    assert end == ChildEnd({"passive_confirmed": True}, 0, "", "", True, None, "")
+    assert run.passive == []
+    assert run.beats == ["running"]
+
+
+@pytest.mark.parametrize(
+    ("do", "phase", "in_vain", "code"),
+    [
+        ("sys.exit(7)", "starting", False, 7),
+        ("beat('connecting'); os.kill(os.getpid(), 9)", "connecting", False, -9),
+        ("beat('running'); os.kill(os.getpid(), 9)", "running", False, -9),
+        ("beat('making passive: x'); result(passive_confirmed=False)", "making passive: x", True, 0),
+        ("beat('arming'); result(outcome='failed')", "arming", True, 0),
+    ],
+)
+def test_who_makes_passive_is_told_when_it_died_and_whether_it_tried(
+    do: str, phase: str, in_vain: bool, code: int
+) -> None:
+    """The last phase that was heard; a report without the word is a try in vain."""
+    run = Run(do)
+    end = run.end()
+    assert run.passive == [(phase, in_vain)]
+    assert (end.passive_confirmed, end.exit_code, end.killed) == (True, code, "")
+
+
+def test_a_process_that_does_not_read_its_orders_is_survived() -> None:
+    """It is gone before the orders could be written: the pipe is broken, and that is all."""
+    run = Run("pass")
+    run.supervisor._module = "antigravity_that_is_not_there"
+    run.supervisor._plan = {"do": "x" * 1_000_000}
+    assert run.end().exit_code == 1
+    assert run.passive == [("starting", False)]
+
+
+def test_a_process_that_falls_silent_is_killed() -> None:
+    """20 ms were allowed; the phase is named."""
+    run = Run("beat('homing', 0.02); time.sleep(600)")
+    end = run.end()
+    assert (end.killed, end.exit_code) == ("it gave no sign of life while homing", -9)
+    assert run.passive == [("homing", False)]
+
+
+def test_a_process_that_lingers_after_its_last_word_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its report counts, though it never read our heartbeats: the kernel then reports a reset first."""
+    monkeypatch.setattr(module, "_GRACE_S", 0.05)
+    run = Run("result(passive_confirmed=True); channel.close(); time.sleep(600)")
+    end = run.end()
+    assert (end.killed, end.exit_code) == ("it did not end after its last word", -9)
+    assert end.result == {"passive_confirmed": True}
+    assert run.passive == []
+
+
+def test_a_failing_supervisor_leaves_no_process_and_a_passive_robot() -> None:
+    """What failed comes out afterwards."""
+
+    def fail(run: Run, beat: Beat) -> None:
+        raise ZeroDivisionError("in the display")
+
+    run = Run("beat('running'); time.sleep(600)", fail)
+    with pytest.raises(ZeroDivisionError, match="in the display"):
+        run.end()
+    assert run.passive == [("running", False)]
+    assert run.supervisor._killed == "the supervisor failed"
+
+
+@pytest.mark.parametrize(
+    ("number", "cause"),
+    [(signal.SIGINT, OPERATOR), (signal.SIGTERM, OPERATOR), (signal.SIGTSTP, SUSPENDED)],
+)
+def test_the_operators_signals_ask_once_and_are_named(number: signal.Signals, cause: str) -> None:
+    """The process ends by its passive route; Ctrl-Z stops nothing yet; the handlers of before are back."""
+    before = signal.getsignal(number)
+    run = Run(
+        "on_term(stopped); beat('running'); time.sleep(600)", lambda run, beat: os.kill(os.getpid(), number)
+    )
+    end = run.end()
+    assert end == ChildEnd({"passive_confirmed": True, "how": "asked"}, 0, "", cause, True, None, number.name)
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP])
+def test_the_operators_second_wish_kills(number: signal.Signals) -> None:
+    """The process does not end by its passive route: the robot is the supervisor's then."""
+
+    def twice(run: Run, beat: Beat) -> None:
+        os.kill(os.getpid(), number)
+
+    run = Run("on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)", twice)
+    end = run.end()
+    assert (end.killed, end.exit_code) == ("the operator asked twice", -9)
+    assert run.passive == [("running", False)]
+    assert not run.supervisor.abandoned
+
+
+def test_the_first_signal_is_the_one_that_is_named() -> None:
+    """Ctrl-Z, then Ctrl-C."""
+
+    def both(run: Run, beat: Beat) -> None:
+        os.kill(os.getpid(), signal.SIGTSTP if len(run.beats) == 1 else signal.SIGINT)
+
+    run = Run("on_term(lambda: beat('running')); beat('running'); time.sleep(600); time.sleep(600)", both)
+    end = run.end()
+    assert (end.signal, end.stop_cause, end.killed) == ("SIGTSTP", SUSPENDED, "the operator asked twice")
+
+
+def test_only_the_fourth_wish_gives_the_robot_up() -> None:
+    """Two end the control process; a third may be a nervous finger."""
+    run = Run("pass")
+    given_up = []
+    for _ in range(4):
+        run.supervisor.stop(OPERATOR)
+        given_up.append(run.supervisor.abandoned)
+    assert given_up == [False, False, False, True]
+
+
+def test_a_stop_before_the_start_is_obeyed() -> None:
+    """The process is asked as soon as it is there; a stop for another reason never kills."""
+    run = Run("pass")
+    run.supervisor.stop("the recorder failed")
+    run.supervisor.stop("the recorder failed")
+    end = run.end()
+    assert (end.exit_code, end.stop_cause, end.killed) == (-15, "the recorder failed", "")
+    assert run.passive == [("starting", False)]
+
+
+def test_a_second_stop_for_another_reason_does_not_kill() -> None:
+    """Only the operator's does."""
+
+    def fail_twice(run: Run, beat: Beat) -> None:
+        run.supervisor.stop("the recorder failed")
+        run.supervisor.stop("the recorder failed again")
+
+    end = Run("on_term(stopped); beat('running'); time.sleep(600)", fail_twice).end()
+    assert (end.stop_cause, end.killed, end.exit_code) == ("the recorder failed", "", 0)
+
+
+def test_words_reach_a_process_that_is_there_and_nobody_else() -> None:
+    """Too early and too late they are lost without a sound."""
+
+    def speak(run: Run, beat: Beat) -> None:
+        run.supervisor.tell("w")
+
+    do = "beat('running'); heard = [];\nwhile 'w' not in heard: heard.append(channel.recv(64).decode())\n"
+    run = Run(do + "result(passive_confirmed=True)", speak)
+    run.supervisor.tell("too early")
+    assert run.end().passive_confirmed
+    run.supervisor.tell("too late")
+
+
+def test_in_another_thread_signals_are_left_alone() -> None:
+    """Python allows handlers in the main thread only."""
+    ends: list[ChildEnd] = []
+    run = Run("result(passive_confirmed=True)")
+    thread = threading.Thread(target=lambda: ends.append(run.end()))
+    thread.start()
+    thread.join()
+    assert ends[0].passive_confirmed
+    run.supervisor.stop("too late")
+
+
+def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None:
+    """Three heartbeats reach the process; what it inherits is what was named, and the channel."""
+    do = (
+        "heard = [channel.recv(64) for _ in range(3)]; "
+        "result(passive_confirmed=True, heard=[h.decode() for h in heard], "
+        "opened=os.path.exists(f'/proc/self/fd/{orders[\"keep\"]}'), parent=orders['parent_pid'])"
+    )
+    with (tmp_path / "claim").open("w") as claim:
+        run = Run(do, keep_fds=[claim.fileno()])
+        run.supervisor._plan = {**run.supervisor._plan, "keep": claim.fileno()}
+        end = run.end()
+    assert end.result == {
+        "passive_confirmed": True,
+        "heard": ["\0"] * 3,
+        "opened": True,
+        "parent": os.getpid(),
+    }
+
+
+class Recorder:
+    """A recorder's handle, whose disk may fill."""
+
+    def __init__(self, errors: tuple[str, ...]) -> None:
+        self.control_socket, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._errors = errors
+        self.released = 0
+
+    def errors(self) -> tuple[str, ...]:
+        """Return what went wrong."""
+        return self._errors
+
+    def release(self) -> None:
+        """Close our copy."""
+        self.released += 1
+        self.control_socket.close()
+
+    def finish(self) -> RecorderOutcome:
+        """End it."""
+        assert self.far.recv(64) == b"a cycle"
+        self.far.close()
+        return RecorderOutcome(True, 1, 4, self._errors)
+
+
+@pytest.mark.parametrize(
+    ("errors", "cause"), [((), ""), (("no space left",), "the recorder failed: no space left")]
+)
+def test_a_recorder_that_fails_ends_the_run(errors: tuple[str, ...], cause: str) -> None:
+    """The process inherits its end of the socket; its outcome comes with the end."""
+    recorder = Recorder(errors)
+    do = (
+        "on_term(stopped); socket.socket(fileno=orders['record_fd']).send(b'a cycle'); beat('running'); "
+        "time.sleep(600) if orders['wait'] else result(passive_confirmed=True)"
+    )
+    run = Run(do, recorder=recorder)
+    run.supervisor._plan = {**run.supervisor._plan, "wait": bool(errors)}
+    end = run.end()
+    assert (end.stop_cause, end.recorder) == (cause, RecorderOutcome(True, 1, 4, errors))
+    assert recorder.released == 1
