@@ -94,6 +94,15 @@ class TransportSuite:
             pair.near.open()
             pair.near.close()
 
+    def test_reopening_a_path_that_works_loses_nothing(self, pair: TransportPair) -> None:
+        """Whoever is in doubt may open again: bytes pass in both directions afterwards."""
+        with pair.near as near:
+            near.reopen()
+            near.send(Message("", b"x", 0))
+            assert pair.read(1) == b"x"
+            pair.write(b"y")
+            assert receive_bytes(near, 1) == b"y"
+
     def test_unplugging_in_flight_is_reported(self, pair: TransportPair) -> None:
         """Once the peer vanished, receiving fails with TransportLostError, and sending fails too."""
         with pair.near as near:
@@ -244,6 +253,12 @@ class TopicTransportSuite:
             with pytest.raises(TransportTimeoutError):
                 pair.near.receive(0.0)
             pair.far.open()
+            meet(pair)
+
+    def test_reopening_a_path_that_works_loses_nothing(self, pair: TopicPair) -> None:
+        """Whoever is in doubt may open again: messages pass in both directions afterwards."""
+        with _met(pair):
+            pair.near.reopen()
             meet(pair)
 
     def test_oneself_is_not_among_the_writers(self, pair: TopicPair) -> None:

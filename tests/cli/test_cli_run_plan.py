@@ -31,7 +31,7 @@ FULL = RunPlan(
         key=Path("c.pem"),
     ),
     velocity="0.3,0,-0.1", stand=True, posture=POSTURE, robot_settings={"stop_buttons": "R2+A"},
-    hand_back=True, record_wire=False, realtime=False,
+    hand_back=True, record_wire=False, realtime=False, passive_timeout_s=12.0,
 )  # fmt: skip
 
 

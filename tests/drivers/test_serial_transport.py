@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tty
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -91,6 +92,34 @@ class TestReadingAhead(TransportSuite):
             for _ in range(3):
                 with pytest.raises(TransportLostError):
                     near.receive(5.0)
+
+
+@pytest.mark.parametrize("adopted", [False, True])
+def test_a_cable_that_is_put_back_is_found_under_the_same_path(adopted: bool, tmp_path: Path) -> None:
+    """As a USB adapter under /dev/serial/by-id: gone, refused while gone, back with another number, works."""
+    link = tmp_path / "by-id"
+    first, second = Pty(), Pty()
+    link.symlink_to(first.port)
+    owner = SerialTransport(str(link))
+    with owner:
+        near = SerialTransport.from_fd(os.dup(owner.fileno()), port=str(link)) if adopted else owner
+        with near:
+            near.reopen()
+            first.close()
+            with pytest.raises(TransportLostError):
+                near.receive(5.0)
+            link.unlink()
+            with pytest.raises(PortNotFoundError):
+                near.reopen()
+            with pytest.raises(TransportLostError):
+                near.receive(0.1)
+            link.symlink_to(second.port)
+            near.reopen()
+            near.send(Message("", b"stop", 0))
+            assert second.read(4) == b"stop"
+            second.write(b"state")
+            assert receive_bytes(near, 5) == b"state"
+    second.close()
 
 
 def test_a_missing_port_lists_the_ports_at_hand() -> None:

@@ -128,6 +128,26 @@ def test_a_lost_link_is_news_for_the_side_that_went_there_until_it_is_back(endpo
         assert next_message(pair, far).payload == payload(COMMAND, 5)
 
 
+def test_a_lost_link_is_opened_again_as_soon_as_the_end_point_answers(endpoint: str) -> None:
+    """Refused while nothing listens; then a new session, without waiting for Zenoh's own next try."""
+    near = ZenohTransport(endpoint)
+    far = ZenohTransport(endpoint, options=LISTEN)
+    with opened(far, STATE, COMMAND), opened(near, COMMAND, STATE):
+        meet(make_pair(near, far))
+        far.reopen()
+        far.close()
+        with pytest.raises(TransportLostError):
+            for _ in range(3):
+                near.receive(5.0)
+        with pytest.raises(PortNotFoundError, match="running there, and listening on that port"):
+            near.reopen()
+        with pytest.raises(TransportLostError):
+            near.send(Message(COMMAND, payload(COMMAND, 1), 0))
+        far.open()
+        near.reopen()
+        meet(make_pair(near, far))
+
+
 def test_a_reader_that_stays_away_finds_the_newest(endpoint: str) -> None:
     """Of 2000 unread messages the last ones are kept, in order."""
     with opened(ZenohTransport(endpoint, options=LISTEN), STATE, COMMAND) as far:
