@@ -87,7 +87,7 @@ def test_impossible_terms_are_refused() -> None:
     """A joint that is not there, and an action that has not been taken yet."""
     with pytest.raises(ConfigurationError, match="wheel"):
         dataclasses.replace(SPEC, observation=(ObservationTerm("position", "wheel", 1.0),))
-    with pytest.raises(ConfigurationError, match="delay must be at least 1"):
+    with pytest.raises(ConfigurationError, match="field delay is 0; allowed: 1 to 100 control periods"):
         dataclasses.replace(SPEC, observation=(ObservationTerm("action", "cart", 1.0, 0),))
 
 
