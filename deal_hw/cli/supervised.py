@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from deal_hw import __version__, errors
 from deal_hw.cli.keyboard import check_terminal, keys
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.cli.run_plan import RunPlan, check_plan
 from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.cadence import CadenceReport
@@ -174,7 +173,7 @@ def run_episodes(
     robot = make_robot(plan.robot, plan.transport, port, MonotonicClock(), plan.wire, plan.robot_settings)
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     VigorSearch(plan.vigor, attempts)
-    make_behaviour(plan, robot.description)
+    plan = check_plan(plan, robot.description)
     reports: list[EpisodeReport] = []
     # The supervisor greets the robot itself, so that a wrong port is known before any process is started.
     # From then on it only keeps the port, until the control process is dead.
@@ -246,7 +245,7 @@ class _Episode:
             "task": task,
             "profile": plan.profile,
             "policy": plan.policy,
-            "policy_digest": _digest(plan.policy),
+            "policy_digest": plan.policy_digest[:16],
             "recording": plan.recording,
             "excite": plan.excite,
             "seed": plan.seed,
@@ -299,10 +298,6 @@ class _Episode:
                 # As on a full disk. The report matters more, and the next open takes the recording in.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
-
-
-def _digest(policy: str) -> str:
-    return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16] if policy else ""
 
 
 def account(end: ChildEnd, path: Path | None) -> EpisodeReport:
