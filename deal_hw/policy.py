@@ -150,7 +150,7 @@ class PolicySpec:
             raise refusal("control_rate_hz", self.control_rate_hz, "a finite rate above 0 Hz")
         if not 1 <= len(self.observation) <= MAX_TERMS:
             raise refusal(
-                "observation", f"{len(self.observation)} terms long", f"1 to {MAX_TERMS}", quote=False
+                "observation", f"of length {len(self.observation)}", f"1 to {MAX_TERMS}", quote=False
             )
         for i, term in enumerate(self.observation):
             known = self.actuated if term.quantity == "action" else term.axes or self.joint_names

@@ -116,7 +116,7 @@ def check_numbers(
         ConfigurationError: They are not so.
     """
     if len(values) != length:
-        raise refusal(name, f"{len(values)} entries long", f"{length}", quote=False)
+        raise refusal(name, f"of length {len(values)}", f"{length}", quote=False)
     for i, value in enumerate(values):
         if not ((math.isfinite(value) and value >= lowest) or (endless and value == math.inf)):
             at_least = "" if lowest == -math.inf else f" of at least {lowest:g}"

@@ -136,6 +136,11 @@ class TrialPolicy:
         self._said.close()
 
     @property
+    def process_id(self) -> int:
+        """Id of the process that runs the network."""
+        return self._child.pid
+
+    @property
     def spec(self) -> PolicySpec:
         """What the policy observes and what its action means."""
         return self._spec
@@ -160,9 +165,11 @@ class TrialPolicy:
             PolicyError: The observation is not finite, or as :meth:`act_batch`.
         """
         for i in np.flatnonzero(~np.isfinite(observation)):
+            term = self._spec.observation[i]
             raise PolicyError(
-                f"{self.path}: field observation[{i}] ({self._spec.observation[i]}) is {observation[i]} in a "
-                "state that this robot can reach; allowed: finite numbers; mend its scale"
+                f"{self.path}: field observation[{i}] ({term.quantity} of {term.joint!r}, scale "
+                f"{term.scale:g}) is {observation[i]} in a state that this robot can reach; allowed: finite "
+                "numbers; mend its scale"
             )
         self.observations.append(observation)
         action: FloatArray = self.act_batch(observation[None])[0]
@@ -268,13 +275,8 @@ def _try(
     begun = time.perf_counter()
     # What is too large for the network's numbers is found by act(), and named.
     with np.errstate(all="ignore"):
-        command = behaviour.command(probe.state, 0.0)
+        behaviour.command(probe.state, 0.0)
     around_s = time.perf_counter() - begun - policy.waited_s
-    for i in np.flatnonzero(~np.isfinite(command.position_target)):
-        raise PolicyError(
-            f"{policy.path}: the target of {policy.spec.actuated[i]!r} is {command.position_target[i]}; "
-            "allowed: finite targets; mend the fields action_scale and default_position"
-        )
     times, allowed_s = [around_s + policy.seconds], description.limits.action_age_s
     while times[0] > allowed_s and len(times) < _REPEATS:
         # Once may be this computer's fault: another program ran meanwhile.
