@@ -51,17 +51,13 @@ class OnnxPolicy:
                 f"that of the file that was checked {digest[:16]}; start again"
             )
         self._session = _open(self.path, content)
-        text = self._session.get_modelmeta().custom_metadata_map.get(SPEC_KEY)
-        if text is None:
-            raise PolicyError(
-                f"{self.path} is an ONNX file without a policy spec (metadata {SPEC_KEY!r}); "
-                "export it with `deal-hw train`, or add one with deal_hw.policies.onnx_export.write_policy"
-            )
         try:
-            self._spec = PolicySpec.from_json(text)
-        except PolicyError as err:
-            raise PolicyError(f"{self.path}: {err}; train it again with this version of deal-hw") from err
-        self._input, self._output = _check_shapes(self.path, self._session, self._spec)
+            self._spec = _read_spec(self.path, self._session)
+            self._input, self._output = _check_shapes(self.path, self._session, self._spec)
+        except UnicodeDecodeError as err:
+            raise PolicyError(
+                f"{self.path} is damaged: a name inside is no UTF-8 text; copy or export the file again"
+            ) from err
         self._row = np.zeros((1, len(self._spec.observation)), dtype=np.float32)
         # The first run allocates; it must not happen inside the first control cycle.
         self.act_batch(self._row)
@@ -161,7 +157,10 @@ def _open(path: Path, content: bytes) -> onnxruntime.InferenceSession:
     # Fatal only: what is wrong is said once, in the error below.
     options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        # Its fallback prints, and tries the same again on the same processor.
+        return onnxruntime.InferenceSession(
+            content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+        )
     # onnxruntime's exceptions have no common base below Exception.
     except Exception as err:
         if "xternal" in str(err):
@@ -173,6 +172,19 @@ def _open(path: Path, content: bytes) -> onnxruntime.InferenceSession:
             f"{path} is not an ONNX network that can be run ({_first_line(err)}); "
             "give the .onnx file that `deal-hw train` wrote"
         ) from err
+
+
+def _read_spec(path: Path, session: onnxruntime.InferenceSession) -> PolicySpec:
+    text = session.get_modelmeta().custom_metadata_map.get(SPEC_KEY)
+    if text is None:
+        raise PolicyError(
+            f"{path} is an ONNX file without a policy spec (metadata {SPEC_KEY!r}); "
+            "export it with `deal-hw train`, or add one with deal_hw.policies.onnx_export.write_policy"
+        )
+    try:
+        return PolicySpec.from_json(text)
+    except PolicyError as err:
+        raise PolicyError(f"{path}: {err}; train it again with this version of deal-hw") from err
 
 
 def _first_line(err: Exception) -> str:

@@ -197,6 +197,18 @@ def test_weights_outside_of_the_file_are_refused(
             attempt()
 
 
+@pytest.mark.parametrize("name", [b"observation", b"deal_hw.policy_spec"])
+def test_names_that_are_no_text_are_refused(
+    tmp_path: Path, file: Callable[..., Path], capfd: pytest.CaptureFixture[str], name: bytes
+) -> None:
+    """A torn file; onnxruntime raises UnicodeDecodeError where names are read, and prints where it loads."""
+    path = file()
+    path.write_bytes(path.read_bytes().replace(name, b"\xff" + name[1:]))
+    with pytest.raises(PolicyError, match=r"policy\.onnx is (damaged|not an ONNX network that can be run)"):
+        OnnxPolicy(path)
+    assert capfd.readouterr() == ("", "")
+
+
 def make_folder(path: Path) -> None:
     path.mkdir()
 
