@@ -1,6 +1,8 @@
 """Contract of a policy: what it observes, what its action means, and for which robot it was made.
 
 The same code builds observations on the robot and, batched, in training, so that the two cannot drift apart.
+
+A spec is checked whole where it is made, in Python as from a file: names, lengths, ranges, finite numbers.
 """
 
 from __future__ import annotations
@@ -9,15 +11,17 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Literal, Protocol, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError
+from deal_hw.schema import SHOWN, STRICT, check_members, check_numbers, either, read_json, refusal, short
 from deal_hw.types import FloatArray
 
 Quantity = Literal[
@@ -32,6 +36,12 @@ BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", 
 vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
 BASE_SIZE = 6
 
+MAX_DELAY: Final = 100
+"""Most control periods that an observation may look back: 2 s at 50 Hz."""
+MAX_TERMS: Final = 4096
+MAX_JOINTS: Final = 256
+MAX_SPEC_CHARACTERS: Final = 1_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class ObservationTerm:
@@ -42,13 +52,38 @@ class ObservationTerm:
             "command" is the wanted velocity of the base: x and y [m/s], z [rad/s], the same at all delays.
         joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z.
         scale: The factor applied to it [1/unit].
-        delay: How many control periods ago; 0 is now (for actions 1 is the last one).
+        delay: How many control periods ago, at most :data:`MAX_DELAY`; 0 is now (for actions 1 is the last
+            one).
+
+    Raises:
+        ConfigurationError: Quantity or axis is unknown, the scale is zero or not finite, or the delay is out
+            of range.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     quantity: Quantity
     joint: str
     scale: float
     delay: int = 0
+
+    def __post_init__(self) -> None:
+        if self.quantity not in get_args(Quantity):
+            raise refusal("quantity", self.quantity, either(get_args(Quantity)))
+        if self.axes and self.joint not in self.axes:
+            raise refusal("joint", self.joint, f"an axis of {self.quantity!r}: {either(self.axes)}")
+        if not math.isfinite(self.scale) or self.scale == 0:
+            raise refusal("scale", self.scale, "a finite number that is not 0")
+        lowest = 1 if self.quantity == "action" else 0
+        if isinstance(self.delay, bool) or not lowest <= self.delay <= MAX_DELAY:
+            raise refusal("delay", self.delay, f"{lowest} to {MAX_DELAY} control periods")
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes of the quantity; () for a quantity of joints."""
+        if self.quantity == "height":
+            return ("z",)
+        return AXES if self.quantity in (*BASE_QUANTITIES, "command") else ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +105,13 @@ class PolicySpec:
         control_rate_hz: Rate at which the policy was trained.
         trained_under: Digest of the parameter distribution it was trained under.
         training: Plain JSON values about the training (algorithm, steps, seed, versions).
+        position_units: Unit of each joint's position in training, "m" or "rad", (J,); empty: not noted.
+
+    Raises:
+        ConfigurationError: A field cannot be; the message names the first.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     robot: str
     joint_names: tuple[str, ...]
@@ -85,19 +126,40 @@ class PolicySpec:
     control_rate_hz: float
     trained_under: str = ""
     training: Mapping[str, Any] = field(default_factory=dict)
+    position_units: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for term in self.observation:
-            of_base = term.quantity in (*BASE_QUANTITIES, "command")
-            known = ("z",) if term.quantity == "height" else AXES if of_base else self.joint_names
+        for name, names in (
+            ("robot", (self.robot,)), ("joint_names", self.joint_names), ("actuated", self.actuated),
+        ):  # fmt: skip
+            if not 1 <= len(names) <= MAX_JOINTS or not all(names) or len(set(names)) < len(names):
+                allowed = f"1 to {MAX_JOINTS} names, all different and none empty"
+                raise refusal(name, getattr(self, name), allowed)
+        check_members("actuated", self.actuated, self.joint_names)
+        check_members("position_units", self.position_units, ("m", "rad"))
+        J, A = len(self.joint_names), len(self.actuated)
+        check_numbers("action_scale", self.action_scale, A)
+        check_numbers("default_position", self.default_position, J)
+        for name in ("stiffness", "damping", "effort_limit"):
+            check_numbers(name, getattr(self, name), A, lowest=0.0)
+        # A robot without a set-point generator has no speed limit.
+        check_numbers("speed_limit", self.speed_limit, A, lowest=0.0, endless=True)
+        if len(self.position_units) not in (0, J):
+            raise refusal("position_units", self.position_units, f"{J} entries, one a joint, or none")
+        if not 0 < self.control_rate_hz < math.inf:
+            raise refusal("control_rate_hz", self.control_rate_hz, "a finite rate above 0 Hz")
+        if not 1 <= len(self.observation) <= MAX_TERMS:
+            raise refusal(
+                "observation", f"of length {len(self.observation)}", f"1 to {MAX_TERMS}", quote=False
+            )
+        for i, term in enumerate(self.observation):
+            known = self.actuated if term.quantity == "action" else term.axes or self.joint_names
             if term.joint not in known:
-                raise ConfigurationError(
-                    f"observation term {term} names {'axis' if of_base else 'joint'} {term.joint!r}; "
-                    f"known: {known}"
-                )
-            lowest = 1 if term.quantity == "action" else 0
-            if term.delay < lowest:
-                raise ConfigurationError(f"observation term {term}: delay must be at least {lowest}")
+                raise refusal(f"observation[{i}].joint", term.joint, either(known))
+        try:
+            json.dumps(dict(self.training), allow_nan=False)
+        except (TypeError, ValueError, RecursionError) as err:
+            raise refusal("training", self.training, f"plain JSON values ({err})") from err
 
     @property
     def observes_base(self) -> bool:
@@ -111,23 +173,28 @@ class PolicySpec:
 
     def to_json(self) -> str:
         """Return the spec as JSON text."""
-        return json.dumps({**dataclasses.asdict(self), "training": dict(self.training)}, sort_keys=True)
+        values = {**dataclasses.asdict(self), "training": dict(self.training)}
+        # A default stays out: a spec written before the field existed keeps its digest.
+        if not self.position_units:
+            del values["position_units"]
+        return json.dumps(values, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> PolicySpec:
         """Return the spec that :meth:`to_json` wrote.
 
+        Nothing is converted: a number that is written as text is refused, and so is an unknown field.
+
         Raises:
-            PolicyError: The text is not a policy spec.
+            PolicyError: The text is not a policy spec; the message names the fields.
         """
+        if len(text) > MAX_SPEC_CHARACTERS:
+            raise PolicyError(
+                f"not a policy spec: {len(text)} characters; allowed: at most {MAX_SPEC_CHARACTERS}"
+            )
         try:
-            values = json.loads(text)
-            values["observation"] = tuple(ObservationTerm(**term) for term in values["observation"])
-            for name, value in values.items():
-                if isinstance(value, list):
-                    values[name] = tuple(value)
-            return cls(**values)
-        except (ValueError, TypeError, KeyError, AttributeError) as err:
+            return read_json(cls, text)
+        except ConfigurationError as err:
             raise PolicyError(f"not a policy spec: {err}") from err
 
     def digest(self) -> str:
@@ -140,26 +207,33 @@ class PolicySpec:
         Raises:
             PolicyMismatchError: It was not; the message names every field that differs.
         """
-        pairs = {
-            "robot": (self.robot, description.name),
-            "joint_names": (self.joint_names, description.joint_names),
-            "actuated": (self.actuated, description.actuated),
-            "default_position": (self.default_position, description.default_position),
-            "control_rate_hz": (self.control_rate_hz, description.control_rate_hz),
+        wrong = {
+            name: f"policy has {short(given)}, robot has {short(own)}"
+            for name, (given, own) in {
+                "robot": (self.robot, description.name),
+                "joint_names": (self.joint_names, description.joint_names),
+                "actuated": (self.actuated, description.actuated),
+                "position_units": (self.position_units, description.position_units),
+                "default_position": (self.default_position, description.default_position),
+                "control_rate_hz": (self.control_rate_hz, description.control_rate_hz),
+            }.items()
+            if given != own and not (name == "position_units" and not given)
         }
-        wrong = [f"{k}: policy has {a!r}, robot has {b!r}" for k, (a, b) in pairs.items() if a != b]
         limits = description.limits
         for name, allowed in (
             ("stiffness", limits.stiffness), ("damping", limits.damping), ("effort_limit", limits.effort),
             ("speed_limit", limits.speed),
         ):  # fmt: skip
             given = getattr(self, name)
-            if len(given) != len(allowed) or any(
-                g > a or not g >= 0 for g, a in zip(given, allowed, strict=False)
-            ):
-                wrong.append(f"{name}: policy asks for {given!r}, the robot allows at most {allowed!r}")
+            if len(given) != len(allowed) or any(g > a for g, a in zip(given, allowed, strict=True)):
+                wrong[name] = f"policy asks for {short(given)}, the robot allows at most {short(allowed)}"
         if wrong:
-            raise PolicyMismatchError("the policy does not fit the robot: " + "; ".join(wrong))
+            shown = "; ".join(f"{name}: {words}" for name, words in list(wrong.items())[:SHOWN])
+            others = "; also: " + ", ".join(list(wrong)[SHOWN:]) if len(wrong) > SHOWN else ""
+            raise PolicyMismatchError(
+                f"the policy does not fit the robot: {shown}{others}; give a policy that was trained for "
+                f"{description.name!r}"
+            )
 
 
 class Policy(Protocol):
@@ -254,21 +328,43 @@ class ObservationBuilder:
         return np.stack(columns, axis=-1).astype(np.float32)
 
     def _term(self, term: ObservationTerm) -> FloatArray:
-        if term.quantity == "action":
-            return np.asarray(term.scale * self._action[term.delay][..., self._actuator[term.joint]])
-        if term.quantity == "command":
-            return np.asarray(term.scale * self.command[..., AXES.index(term.joint)])
-        if term.quantity in BASE_QUANTITIES:
-            first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
-            offset = 0 if term.quantity == "height" else AXES.index(term.joint)
-            return np.asarray(term.scale * self._base[term.delay][..., first + offset])
-        source = self._velocity if term.quantity == "velocity" else self._position
-        value = source[term.delay][..., self._joint[term.joint]]
-        if term.quantity == "sin_position":
-            value = np.sin(value)
-        elif term.quantity == "cos_position":
-            value = np.cos(value)
-        return np.asarray(term.scale * value)
+        return np.asarray(term.scale * _READERS[term.quantity](self, term))
+
+    def _read_position(self, term: ObservationTerm) -> FloatArray:
+        return np.asarray(self._position[term.delay][..., self._joint[term.joint]])
+
+    def _read_sine(self, term: ObservationTerm) -> FloatArray:
+        return np.asarray(np.sin(self._read_position(term)))
+
+    def _read_cosine(self, term: ObservationTerm) -> FloatArray:
+        return np.asarray(np.cos(self._read_position(term)))
+
+    def _read_velocity(self, term: ObservationTerm) -> FloatArray:
+        return np.asarray(self._velocity[term.delay][..., self._joint[term.joint]])
+
+    def _read_action(self, term: ObservationTerm) -> FloatArray:
+        return np.asarray(self._action[term.delay][..., self._actuator[term.joint]])
+
+    def _read_command(self, term: ObservationTerm) -> FloatArray:
+        return np.asarray(self.command[..., AXES.index(term.joint)])
+
+    def _read_base(self, term: ObservationTerm) -> FloatArray:
+        first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
+        return np.asarray(self._base[term.delay][..., first + term.axes.index(term.joint)])
+
+
+_READERS: Final[Mapping[str, Callable[[ObservationBuilder, ObservationTerm], FloatArray]]] = MappingProxyType(
+    {
+        "position": ObservationBuilder._read_position,
+        "velocity": ObservationBuilder._read_velocity,
+        "sin_position": ObservationBuilder._read_sine,
+        "cos_position": ObservationBuilder._read_cosine,
+        "action": ObservationBuilder._read_action,
+        "command": ObservationBuilder._read_command,
+        **dict.fromkeys(BASE_QUANTITIES, ObservationBuilder._read_base),
+    }
+)
+"""What reads each quantity. There is no default: a quantity without a row cannot be observed."""
 
 
 def in_base_frame(rotation_vector: FloatArray, vector: FloatArray) -> FloatArray:

@@ -100,6 +100,7 @@ def balance_spec(
         effort_limit=description.effort_limit,
         speed_limit=description.speed_limit,
         control_rate_hz=description.control_rate_hz,
+        position_units=description.position_units,
         trained_under=trained_under,
         training=dict(training or {}),
     )

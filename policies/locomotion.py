@@ -147,6 +147,7 @@ def locomotion_spec(
         effort_limit=tuple(map(min, description.effort_limit, limits.effort)),
         speed_limit=description.speed_limit,
         control_rate_hz=description.control_rate_hz,
+        position_units=description.position_units,
         trained_under=trained_under,
         training=dict(training or {}),
     )

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import stat
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import onnxruntime
@@ -14,6 +17,9 @@ from deal_hw.types import FloatArray
 
 SPEC_KEY = "deal_hw.policy_spec"
 """Key of the ONNX file's metadata under which the spec stands, as JSON."""
+MAX_FILE_BYTES: Final = 100_000_000
+"""Largest policy file: some 25 million weights, a hundred times what a policy at 50 Hz has."""
+_NO_FOLDER: Final = os.devnull + "/weights-outside-of-the-file"
 
 
 class OnnxPolicy:
@@ -23,34 +29,48 @@ class OnnxPolicy:
     of this size a second thread costs more than it computes.
 
     Args:
+        path: The file. It is read once, and the network is made from what was read.
+        digest: What :attr:`digest` must be; "" for any file.
+
+    Attributes:
         path: The file.
+        digest: SHA-256 of its bytes, in hexadecimal.
 
     Raises:
-        PolicyError: There is no such file, it is not ONNX, it carries no spec, or network and spec disagree.
+        PolicyError: There is no such file, it is too large or not ONNX, it is not the one of the digest, it
+            carries no spec, or network and spec disagree.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, digest: str = "") -> None:
         self.path = Path(path)
-        self._session = _open(self.path)
-        text = self._session.get_modelmeta().custom_metadata_map.get(SPEC_KEY)
-        if text is None:
+        content = read_policy_file(self.path)
+        self.digest = hashlib.sha256(content).hexdigest()
+        if digest not in ("", self.digest):
             raise PolicyError(
-                f"{self.path} is an ONNX file without a policy spec (metadata {SPEC_KEY!r}); "
-                "export it with `deal-hw train`, or add one with deal_hw.policies.onnx_export.write_policy"
+                f"{self.path} was changed after it was checked: its SHA-256 begins {self.digest[:16]}, "
+                f"that of the file that was checked {digest[:16]}; start again"
             )
+        self._session = _open(self.path, content)
         try:
-            self._spec = PolicySpec.from_json(text)
-        except PolicyError as err:
-            raise PolicyError(f"{self.path}: {err}; train it again with this version of deal-hw") from err
-        self._input, self._output = _check_shapes(self.path, self._session, self._spec)
+            self._spec = _read_spec(self.path, self._session)
+            self._input, self._output = _check_shapes(self.path, self._session, self._spec)
+        except UnicodeDecodeError as err:
+            raise PolicyError(
+                f"{self.path} is damaged: a name inside is no UTF-8 text; copy or export the file again"
+            ) from err
         self._row = np.zeros((1, len(self._spec.observation)), dtype=np.float32)
         # The first run allocates; it must not happen inside the first control cycle.
-        self._session.run([self._output], {self._input: self._row})
+        self.act_batch(self._row)
 
     @property
     def spec(self) -> PolicySpec:
         """What the policy observes and what its action means."""
         return self._spec
+
+    @property
+    def takes_batches(self) -> bool:
+        """Whether the network takes more than one observation at a time."""
+        return bool(self._session.get_inputs()[0].shape[0] != 1)
 
     def reset(self) -> None:
         """Nothing to forget: the observation carries the past."""
@@ -59,7 +79,7 @@ class OnnxPolicy:
         """Return the action, (A,), for an observation, (O,).
 
         Raises:
-            PolicyError: The observation has another length.
+            PolicyError: The observation has another length, or the network fails on it.
         """
         if np.shape(observation) != (self._row.shape[1],):
             raise PolicyError(
@@ -70,28 +90,106 @@ class OnnxPolicy:
         return action
 
     def act_batch(self, observations: Observation) -> FloatArray:
-        """Return the actions, (B, A), for observations, (B, O)."""
-        action: Any = self._session.run([self._output], {self._input: observations})[0]
+        """Return the actions, (B, A), for observations, (B, O).
+
+        Raises:
+            PolicyError: The network fails on them, or answers with another shape.
+        """
+        try:
+            action: Any = self._session.run([self._output], {self._input: observations})[0]
+        # onnxruntime's exceptions have no common base below Exception.
+        except Exception as err:
+            raise PolicyError(
+                f"{self.path}: the network fails on an observation of the right shape ({_first_line(err)}); "
+                "give another policy"
+            ) from err
+        wanted = (len(observations), len(self._spec.actuated))
+        if np.shape(action) != wanted:
+            raise PolicyError(
+                f"{self.path}: output {self._output!r} came with shape {np.shape(action)}, the spec says "
+                f"{wanted}; give another policy"
+            )
         return np.asarray(action, dtype=np.float64)
 
 
-def _open(path: Path) -> onnxruntime.InferenceSession:
-    if not path.is_file():
-        raise PolicyError(f"no such policy file: {path}; train one with `deal-hw train` or check the path")
+def read_policy_file(path: Path) -> bytes:
+    """Return the bytes of a policy file.
+
+    Raises:
+        PolicyError: There is no such file, it is no file, or it is larger than :data:`MAX_FILE_BYTES`.
+    """
+    try:
+        with open(path, "rb", opener=_open_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise PolicyError(
+                    f"{path} is not a regular file; give the .onnx file that `deal-hw train` wrote"
+                )
+            content = file.read(MAX_FILE_BYTES + 1)
+    except FileNotFoundError as err:
+        raise PolicyError(
+            f"no such policy file: {path}; train one with `deal-hw train` or check the path"
+        ) from err
+    except (OSError, ValueError) as err:
+        why = err.strerror if isinstance(err, OSError) else err
+        raise PolicyError(f"the policy file {path} cannot be read ({why}); check path and rights") from err
+    if len(content) > MAX_FILE_BYTES:
+        raise PolicyError(
+            f"{path} is larger than {MAX_FILE_BYTES // 1_000_000} MB, the largest policy that is taken; "
+            "give the .onnx file that `deal-hw train` wrote"
+        )
+    return content
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    # Opening a FIFO would otherwise wait for somebody who writes to it.
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def _open(path: Path, content: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 3
+    # A network may name other files that hold its weights. They stand outside of the digest, so none is read:
+    # onnxruntime is told to look for them where no file can be.
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", _NO_FOLDER)
+    # Fatal only: what is wrong is said once, in the error below.
+    options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        # Its fallback prints, and tries the same again on the same processor.
+        return onnxruntime.InferenceSession(
+            content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+        )
     # onnxruntime's exceptions have no common base below Exception.
     except Exception as err:
+        if "xternal" in str(err):
+            raise PolicyError(
+                f"{path} keeps its weights in another file; export the network as one file "
+                f"({_first_line(err)})"
+            ) from err
         raise PolicyError(
-            f"{path} is not an ONNX network that can be run ({str(err).splitlines()[0]}); "
+            f"{path} is not an ONNX network that can be run ({_first_line(err)}); "
             "give the .onnx file that `deal-hw train` wrote"
         ) from err
+
+
+def _read_spec(path: Path, session: onnxruntime.InferenceSession) -> PolicySpec:
+    text = session.get_modelmeta().custom_metadata_map.get(SPEC_KEY)
+    if text is None:
+        raise PolicyError(
+            f"{path} is an ONNX file without a policy spec (metadata {SPEC_KEY!r}); "
+            "export it with `deal-hw train`, or add one with deal_hw.policies.onnx_export.write_policy"
+        )
+    try:
+        return PolicySpec.from_json(text)
+    except PolicyError as err:
+        raise PolicyError(f"{path}: {err}; train it again with this version of deal-hw") from err
+
+
+def _first_line(err: Exception) -> str:
+    lines = str(err).splitlines() or [type(err).__name__]
+    return lines[0] if len(lines[0]) <= 200 else lines[0][:197] + "..."
 
 
 def _check_shapes(path: Path, session: onnxruntime.InferenceSession, spec: PolicySpec) -> tuple[str, str]:
@@ -103,12 +201,16 @@ def _check_shapes(path: Path, session: onnxruntime.InferenceSession, spec: Polic
             f"{[o.name for o in outputs]}"
         )
     wrong = [
-        f"{what} {tensor.name!r} has shape {tensor.shape}, the spec says (batch, {length})"
+        f"{what} {tensor.name!r} is {tensor.type} of shape {tensor.shape}, the spec says tensor(float) of "
+        f"shape (batch, {length})"
         for what, tensor, length in (
             ("input", inputs[0], len(spec.observation)),
             ("output", outputs[0], len(spec.actuated)),
         )
-        if len(tensor.shape) != 2 or tensor.shape[1] != length or tensor.type != "tensor(float)"
+        if len(tensor.shape) != 2
+        or tensor.shape[1] != length
+        or tensor.type != "tensor(float)"
+        or (isinstance(tensor.shape[0], int) and tensor.shape[0] != 1)
     ]
     if wrong:
         raise PolicyError(f"{path}: network and spec disagree: " + "; ".join(wrong))

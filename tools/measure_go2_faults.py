@@ -39,7 +39,7 @@ from deal_hw.drivers.go2.topics import LOW_COMMAND
 from deal_hw.errors import DealHwError
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.testing.faulty_policy import faulty_policy
+from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
 from deal_hw.transport import Message, TopicTransport, WireOptions
 
 STANDING_S = 2.0
@@ -98,7 +98,7 @@ class Rig:
             path = self.folder / "policy.onnx"
             write_faulty(path, self.case.policy)
             script = self.folder / "walk.csv"
-            script.write_text("time_s,x,y,yaw\n1.0,1.0,0,0\n", encoding="utf-8")
+            script.write_text(f"time_s,x,y,yaw\n1.0,{RARE_M_S},0,0\n", encoding="utf-8")
             command += ["deploy", "go2", "--policy", str(path), "--velocity", str(script)]
         else:
             command += ["collect", "go2", "--profile", "hold"]
@@ -142,15 +142,15 @@ def write_faulty(path: Path, fault: str) -> None:
     """Write a faulty policy; the one that comes late takes :data:`LATE_S` of a processor here."""
     rounds = 1000
     if fault == "late":
-        write_policy(*faulty_policy(DRIVEN, "late", rounds), path)
-        policy, wish = OnnxPolicy(path), np.array([1.0, 0.0, 0.0], dtype=np.float32)
+        write_policy(*faulty_policy(DRIVEN, "late", rounds, rare=True), path)
+        policy, wish = OnnxPolicy(path), np.array([RARE_M_S, 0.0, 0.0], dtype=np.float32)
         times = []
         for _ in range(5):
             begun = time.thread_time()
             policy.act(wish)
             times.append(time.thread_time() - begun)
         rounds = round(rounds * LATE_S / min(times))
-    write_policy(*faulty_policy(DRIVEN, "late" if fault == "late" else "nan", rounds), path)
+    write_policy(*faulty_policy(DRIVEN, "late" if fault == "late" else "nan", rounds, rare=True), path)
 
 
 def kill_control(rig: Rig) -> None:

@@ -184,8 +184,10 @@ def balancer(description: RobotDescription, policy: Path | None) -> Callable[[],
     if path is None:
         return None
     from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.policies.trial import check_policy
 
-    return lambda: PolicyBehaviour(OnnxPolicy(path), description)
+    digest = check_policy(path, description).digest
+    return lambda: PolicyBehaviour(OnnxPolicy(path, digest), description)
 
 
 def _balance_s(seconds: float) -> float:

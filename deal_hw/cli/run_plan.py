@@ -5,7 +5,9 @@ Plain values, for they cross a process boundary as JSON. Imports neither torch, 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -26,6 +28,7 @@ from deal_hw.control.velocity import VelocitySource, make_source
 from deal_hw.control.vigor import with_vigor
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
+from deal_hw.policy import Policy
 from deal_hw.transport import WireOptions
 
 Profile = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
@@ -41,6 +44,8 @@ class RunPlan:
         transport: Name of the transport.
         profile: What it does.
         policy: Policy file; "" for none.
+        policy_digest: SHA-256 of the policy file that was checked, the only one that will be opened; "" where
+            none was.
         recording: Episode to replay; "" for none.
         seconds: Length of the run [s].
         seed: Fixes what is random in the behaviour.
@@ -66,6 +71,7 @@ class RunPlan:
     transport: str = "serial"
     profile: Profile = "balance"
     policy: str = ""
+    policy_digest: str = ""
     recording: str = ""
     seconds: float = 4.0
     seed: int = 0
@@ -133,8 +139,44 @@ def shipped_policy(robot: str) -> Path | None:
     return path if path.is_file() else None
 
 
+def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
+    """Check all that a plan names before anybody touches the robot.
+
+    A policy is tried in a process of its own, see :mod:`deal_hw.policies.trial`: its network is not opened in
+    this one.
+
+    Returns:
+        The plan, with the digest of the policy that was checked.
+
+    Raises:
+        DealHwError: As :func:`make_behaviour`; also where the policy fails its trial.
+    """
+    with contextlib.ExitStack() as stack:
+        digests = [""]
+
+        def load(plan: RunPlan) -> Policy:
+            from deal_hw.policies.trial import TrialPolicy, try_policy
+
+            policy = stack.enter_context(TrialPolicy(Path(plan.policy)))
+            try_policy(policy, description)
+            digests.append(policy.digest)
+            return policy
+
+        make_behaviour(plan, description, load=load)
+    return dataclasses.replace(plan, policy_digest=digests[-1])
+
+
+def _open_policy(plan: RunPlan) -> Policy:
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    return OnnxPolicy(plan.policy, plan.policy_digest)
+
+
 def make_behaviour(
-    plan: RunPlan, description: RobotDescription, source: VelocitySource | None = None
+    plan: RunPlan,
+    description: RobotDescription,
+    source: VelocitySource | None = None,
+    load: Callable[[RunPlan], Policy] = _open_policy,
 ) -> Behaviour:
     """Return what the plan asks of the robot.
 
@@ -142,17 +184,21 @@ def make_behaviour(
         plan: The plan.
         description: The robot.
         source: The wanted velocity of a policy that walks; by default made from the plan.
+        load: Called for the plan's policy, where its profile needs one.
 
     Raises:
         PolicyError: The policy is missing or cannot run.
         PolicyMismatchError: It was made for another robot.
         DatasetError: The recording cannot be replayed.
     """
-    inner = _inner_behaviour(plan, description, source or plan.velocity_source())
+    source = source or plan.velocity_source()
+    inner = _inner_behaviour(plan, description, source, lambda: _loaded(plan, load))
     return PostureBehaviour(inner, description, plan.seconds, plan.posture) if plan.stand else inner
 
 
-def _inner_behaviour(plan: RunPlan, description: RobotDescription, source: VelocitySource) -> Behaviour:
+def _inner_behaviour(
+    plan: RunPlan, description: RobotDescription, source: VelocitySource, policy: Callable[[], Policy]
+) -> Behaviour:
     if plan.profile == "hold":
         return HoldBehaviour(description)
     if plan.profile == "chirp":
@@ -163,14 +209,14 @@ def _inner_behaviour(plan: RunPlan, description: RobotDescription, source: Veloc
         return ReplayBehaviour(read_trajectory(Path(plan.recording)), description)
     if plan.profile == "excite":
         excitation = find_excitation(plan, description)
-        balance = _policy(plan, description) if excitation.balance_s > 0 else None
+        balance = PolicyBehaviour(policy(), description) if excitation.balance_s > 0 else None
         return ExcitationBehaviour(excitation, description, balance)
     if plan.profile == "rich":
         config = with_vigor(plan.rich, plan.vigor, description)
         config = dataclasses.replace(config, duration_s=plan.seconds)
-        balance = _policy(plan, description) if config.balance_s > 0 else None
+        balance = PolicyBehaviour(policy(), description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)
-    return _policy(plan, description, source)
+    return PolicyBehaviour(policy(), description, source)
 
 
 def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:
@@ -200,12 +246,10 @@ def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationP
     return found
 
 
-def _policy(plan: RunPlan, description: RobotDescription, source: VelocitySource | None = None) -> Behaviour:
+def _loaded(plan: RunPlan, load: Callable[[RunPlan], Policy]) -> Policy:
     if not plan.policy:
         raise PolicyError(
             f"profile {plan.profile!r} needs a policy, and none is shipped for robot {plan.robot!r}; "
             "give --policy FILE, or use --profile chirp or hold"
         )
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-
-    return PolicyBehaviour(OnnxPolicy(plan.policy), description, source)
+    return load(plan)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from deal_hw import __version__, errors
 from deal_hw.cli.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
 from deal_hw.cli.keyboard import check_terminal, keys
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.cli.run_plan import RunPlan, check_plan
 from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.cadence import CadenceReport
@@ -204,7 +203,7 @@ def run_episodes(
     )
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     VigorSearch(plan.vigor, attempts)
-    make_behaviour(plan, robot.description)
+    plan = check_plan(plan, robot.description)
     reports: list[EpisodeReport] = []
     if not robot.watchdog_s and not plan.dry_run and not quiet:
         print(HOLDS_LAST_COMMAND.format(robot=plan.robot), file=sys.stderr)
@@ -291,7 +290,7 @@ class _Episode:
             "task": task,
             "profile": plan.profile,
             "policy": plan.policy,
-            "policy_digest": _digest(plan.policy),
+            "policy_digest": plan.policy_digest[:16],
             "recording": plan.recording,
             "excite": plan.excite,
             "seed": plan.seed,
@@ -364,10 +363,6 @@ class _Episode:
 
         config = _IN_VAIN if in_vain else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
         return make_passive(self._robot, clock, config, progress=tell, abandoned=lambda: supervisor.abandoned)
-
-
-def _digest(policy: str) -> str:
-    return hashlib.sha256(Path(policy).read_bytes()).hexdigest()[:16] if policy else ""
 
 
 def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeReport:

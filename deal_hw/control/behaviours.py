@@ -10,7 +10,7 @@ import numpy as np
 from deal_hw.control.velocity import FixedVelocity, VelocitySource
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, PolicyError, PolicyMismatchError
-from deal_hw.policy import ObservationBuilder, Policy, rotation_vector
+from deal_hw.policy import BASE_QUANTITIES, ObservationBuilder, Policy, rotation_vector
 from deal_hw.types import FloatArray, JointCommand, RobotState, Trajectory
 
 
@@ -78,7 +78,10 @@ class PolicyBehaviour:
     ) -> None:
         spec = policy.spec
         spec.check_fits(description)
-        unseen = sorted({term.quantity for term in spec.observation} & {"linear_velocity", "height"})
+        observed = {term.quantity for term in spec.observation}
+        unseen = sorted(observed & {"linear_velocity", "height"})
+        if description.limits.legs is None and description.floating_base is None:
+            unseen = sorted(observed & set(BASE_QUANTITIES))
         if unseen:
             raise PolicyMismatchError(
                 f"the policy observes {' and '.join(unseen)} of the base, which no sensor of "

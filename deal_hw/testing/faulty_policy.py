@@ -1,12 +1,13 @@
 """Policies that go wrong when told to: for tests of what stands between policy and motors.
 
-They observe the wanted velocity alone. While it is zero they ask for the default pose; from then on that it
-is not, the first answers with NaN, and the second takes its time.
+They observe the wanted velocity alone. While it is zero they ask for the default pose. With a wanted velocity
+ahead the fault shows; a rare one shows at :data:`RARE_M_S` alone, which the trial of a policy does not meet:
+what only the safety filter can stop.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -14,19 +15,27 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import MissingExtraError
 from deal_hw.policy import AXES, ObservationTerm, PolicySpec
 
-Fault = Literal["nan", "late"]
+Fault = Literal["nan", "late", "endless", "fails", "shape", "memory"]
+"""Answers NaN; takes its time; loops for ever; fails; answers twice as many actions; wants 4 GB of memory."""
+RARE_M_S: Final = 0.3
+"""The wanted velocity ahead at which a rare fault shows; it is gone 1 mm/s away from it."""
+_RARE_WIDTH_M_S: Final = 1e-3
 _SIDE = 128
 _OPSET = 17
 _IR_VERSION = 10
 
 
-def faulty_policy(description: RobotDescription, fault: Fault, rounds: int = 4000) -> tuple[Any, PolicySpec]:
+def faulty_policy(
+    description: RobotDescription, fault: Fault, rounds: int = 4000, *, rare: bool = False
+) -> tuple[Any, PolicySpec]:
     """Return such a policy as an ONNX model, and its spec.
 
     Args:
         description: The robot that it shall fit.
-        fault: "nan", or "late": it multiplies matrices in vain.
-        rounds: Products of 128 x 128 matrices a step at a wanted velocity of 1 m/s; some 0.1 ms each.
+        fault: What goes wrong.
+        rounds: For "late": products of 128 x 128 matrices a step at a wanted velocity of 1 m/s (of
+            :data:`RARE_M_S` where it is rare); some 0.1 ms each.
+        rare: Whether the fault shows at one wanted velocity alone.
 
     Raises:
         MissingExtraError: onnx is not installed.
@@ -37,21 +46,43 @@ def faulty_policy(description: RobotDescription, fault: Fault, rounds: int = 400
     except ModuleNotFoundError as error:
         raise MissingExtraError("onnx", "train") from error
     actuated = len(description.actuated)
-    nodes, constants = _nan_nodes(helper) if fault == "nan" else _late_nodes(helper, rounds)
+    node = helper.make_node
+    trigger = [node("Relu", ["wish"], ["active"])]
+    if rare:
+        trigger = [
+            node("Sub", ["wish", "rare"], ["off"]),
+            node("Abs", ["off"], ["far"]),
+            node("Div", ["far", "width"], ["share"]),
+            node("Sub", ["unit", "share"], ["near"]),
+            node("Relu", ["near"], ["active"]),
+        ]
     graph = helper.make_graph(
         [
-            helper.make_node("Slice", ["observation", "zero", "one", "axis"], ["wish"]),
-            *nodes,
-            helper.make_node("Mul", ["fault", "zeros"], ["action"]),
+            node("Slice", ["observation", "zero", "one", "axis"], ["wish"]),
+            *trigger,
+            node("Ceil", ["active"], ["alarm"]),
+            node("Cast", ["alarm"], ["alarm_count"], to=onnx.TensorProto.INT64),
+            node("Reshape", ["alarm_count", "flat"], ["alarms"]),
+            *_fault_nodes(onnx, fault),
+            node("Mul", ["fault", "zeros"], ["calm"]),
+            node("Concat", ["one", "copies"], ["repeats"], axis=0),
+            node("Tile", ["calm", "repeats"], ["action"]),
         ],
         "faulty",
         [helper.make_tensor_value_info("observation", onnx.TensorProto.FLOAT, [1, 3])],
         [helper.make_tensor_value_info("action", onnx.TensorProto.FLOAT, [1, actuated])],
         [
             *(helper.make_tensor(name, onnx.TensorProto.INT64, [1], [value])
-              for name, value in (("zero", 0), ("one", 1), ("axis", 1))),
+              for name, value in (("zero", 0), ("one", 1), ("axis", 1), ("flat", -1), ("endless", 2**62),
+                                  ("huge", 2**30))),
+            *(helper.make_tensor(name, onnx.TensorProto.FLOAT, [1], [value])
+              for name, value in (("rare", RARE_M_S), ("width", _RARE_WIDTH_M_S), ("unit", 1.0),
+                                  ("rounds", float(rounds)))),
             helper.make_tensor("zeros", onnx.TensorProto.FLOAT, [1, actuated], [0.0] * actuated),
-            *constants,
+            helper.make_tensor("scalar", onnx.TensorProto.INT64, [0], []),
+            helper.make_tensor("yes", onnx.TensorProto.BOOL, [], [True]),
+            helper.make_tensor("eye", onnx.TensorProto.FLOAT, [_SIDE, _SIDE],
+                               np.eye(_SIDE, dtype=np.float32).ravel().tolist()),
         ],
     )  # fmt: skip
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
@@ -72,19 +103,45 @@ def _spec(description: RobotDescription) -> PolicySpec:
         effort_limit=tuple(np.minimum(description.effort_limit, limits.effort)),
         speed_limit=description.speed_limit,
         control_rate_hz=description.control_rate_hz,
+        position_units=description.position_units,
         training={"algorithm": "none: goes wrong on purpose"},
     )
 
 
-def _nan_nodes(helper: Any) -> tuple[list[Any], list[Any]]:
-    # The root of minus the wish: 0 while the robot shall stand, NaN once it shall walk.
-    return [helper.make_node("Neg", ["wish"], ["minus"]), helper.make_node("Sqrt", ["minus"], ["fault"])], []
+def _fault_nodes(onnx: Any, fault: Fault) -> list[Any]:
+    """Return what makes `fault`, a number that is 0 in good times, and the number of `copies` of the action.
+
+    It is made of `active`, (1, 1), and `alarms`, (1,), which are 0 in good times.
+    """
+    node = onnx.helper.make_node
+    copies = [node("Identity", ["one"], ["copies"])]
+    if fault == "nan":
+        return [node("Neg", ["active"], ["minus"]), node("Sqrt", ["minus"], ["fault"]), *copies]
+    if fault == "late":
+        many = [
+            node("Mul", ["active", "rounds"], ["many"]),
+            node("Cast", ["many"], ["rows"], to=onnx.TensorProto.INT64),
+        ]
+        return [*many, *_loop(onnx, "rows"), *copies]
+    if fault == "endless":
+        return [node("Mul", ["alarms", "endless"], ["rows"]), *_loop(onnx, "rows"), *copies]
+    if fault == "fails":
+        # There is one element: number 1 is none.
+        return [node("Gather", ["unit", "alarms"], ["fault"]), *copies]
+    if fault == "memory":
+        return [
+            node("Mul", ["alarms", "huge"], ["much"]),
+            node("Max", ["much", "one"], ["length"]),
+            node("Expand", ["unit", "length"], ["long"]),
+            node("ReduceSum", ["long"], ["fault"], keepdims=0),
+            *copies,
+        ]
+    return [node("Identity", ["active"], ["fault"]), node("Add", ["alarms", "one"], ["copies"])]
 
 
-def _late_nodes(helper: Any, rounds: int) -> tuple[list[Any], list[Any]]:
-    import onnx
-
-    side = [_SIDE, _SIDE]
+def _loop(onnx: Any, count: str) -> list[Any]:
+    """Return what multiplies matrices in vain, so many times."""
+    helper, side = onnx.helper, [_SIDE, _SIDE]
     body = helper.make_graph(
         [
             helper.make_node("MatMul", ["before", "eye"], ["after"]),
@@ -101,18 +158,8 @@ def _late_nodes(helper: Any, rounds: int) -> tuple[list[Any], list[Any]]:
             helper.make_tensor_value_info("after", onnx.TensorProto.FLOAT, side),
         ],
     )
-    nodes = [
-        helper.make_node("Mul", ["wish", "rounds"], ["many"]),
-        helper.make_node("Cast", ["many"], ["count_1"], to=onnx.TensorProto.INT64),
-        helper.make_node("Reshape", ["count_1", "scalar"], ["count"]),
+    return [
+        helper.make_node("Reshape", [count, "scalar"], ["count"]),
         helper.make_node("Loop", ["count", "yes", "eye"], ["product"], body=body),
         helper.make_node("ReduceMax", ["product"], ["fault"], keepdims=0),
     ]
-    eye = np.eye(_SIDE, dtype=np.float32).ravel().tolist()
-    constants = [
-        helper.make_tensor("rounds", onnx.TensorProto.FLOAT, [1], [float(rounds)]),
-        helper.make_tensor("scalar", onnx.TensorProto.INT64, [0], []),
-        helper.make_tensor("yes", onnx.TensorProto.BOOL, [], [True]),
-        helper.make_tensor("eye", onnx.TensorProto.FLOAT, side, eye),
-    ]
-    return nodes, constants

@@ -31,6 +31,7 @@ def feedback_spec(description: RobotDescription, action_scale: float = 0.25) -> 
         effort_limit=description.effort_limit,
         speed_limit=description.speed_limit,
         control_rate_hz=description.control_rate_hz,
+        position_units=description.position_units,
     )
 
 

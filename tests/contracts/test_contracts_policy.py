@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.go2.driven import DRIVEN
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError
-from deal_hw.policy import ObservationBuilder, ObservationTerm, PolicySpec
+from deal_hw.policy import (
+    MAX_SPEC_CHARACTERS,
+    ObservationBuilder,
+    ObservationTerm,
+    PolicySpec,
+    Quantity,
+)
+from deal_hw.testing.linear_policy import feedback_spec
 
 SPEC = PolicySpec(
     robot="cartpole",
@@ -83,12 +98,197 @@ def test_fit_is_checked_field_by_field() -> None:
     assert "'go2'" in words and "100.0" in words and "500.0" in words and "joint_names" not in words
 
 
-def test_impossible_terms_are_refused() -> None:
-    """A joint that is not there, and an action that has not been taken yet."""
+NAN, INFINITY = math.nan, math.inf
+
+
+def edited(path: tuple[str | int, ...], value: object) -> str:
+    """Return the text of a good spec with one value changed; a new field where there was none."""
+    values = json.loads(SPEC.to_json())
+    place: Any = values
+    for part in path[:-1]:
+        place = place[part]
+    place[path[-1]] = value
+    return json.dumps(values)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (("observation", 2, "quantity"), "velocty", r"observation\[2\].quantity is 'velocty'; .*'velocity'"),
+        (("observation", 2, "quantity"), "torque", r"observation\[2\].quantity is 'torque'; .*'position'"),
+        (("observation", 2, "quantity"), None, r"observation\[2\].quantity is None"),
+        (("observation", 0, "joint"), "wheel", r"observation\[0\].joint is 'wheel'; allowed: 'cart', 'pole'"),
+        (("observation", 3, "joint"), "pole", r"observation\[3\].joint is 'pole'; allowed: 'cart'$"),
+        (("observation", 0, "scale"), "2.0", r"observation\[0\].scale is '2.0'"),
+        (("observation", 0, "scale"), True, r"observation\[0\].scale is True"),
+        (("observation", 0, "scale"), 0.0, r"observation\[0\]: field scale is 0.0; allowed: a finite number"),
+        (("observation", 0, "scale"), NAN, r"observation\[0\]: field scale is nan"),
+        (("observation", 0, "delay"), 101, r"observation\[0\]: field delay is 101; allowed: 0 to 100"),
+        (("observation", 0, "delay"), -1, r"observation\[0\]: field delay is -1"),
+        (("observation", 3, "delay"), 0, r"observation\[3\]: field delay is 0; allowed: 1 to 100"),
+        (("observation", 0, "delay"), 1.0, r"observation\[0\].delay is 1.0"),
+        (("observation", 0, "delay"), True, r"observation\[0\].delay is True"),
+        (("observation", 0, "delya"), 1, r"observation\[0\].delya is 1; Unexpected"),
+        (("observation",), [], r"observation is of length 0; allowed: 1 to 4096"),
+        (("observation",), "position", r"observation is 'position'"),
+        (("robot",), "", r"robot is ''"),
+        (("robot",), 3, r"robot is 3"),
+        (("joint_names",), [], r"joint_names is \(\)"),
+        (("joint_names",), ["cart", "cart"], r"joint_names is \('cart', 'cart'\); .* all different"),
+        (("joint_names", 1), "", r"joint_names is \('cart', ''\)"),
+        (("actuated", 0), "wheel", r"actuated\[0\] is 'wheel'; allowed: 'cart', 'pole'"),
+        (("action_scale", 0), NAN, r"action_scale\[0\] is nan; allowed: a finite number"),
+        (("action_scale",), [], r"action_scale is of length 0; allowed: 1"),
+        (("default_position", 1), INFINITY, r"default_position\[1\] is inf"),
+        (("default_position",), [0.0], r"default_position is of length 1; allowed: 2"),
+        (("stiffness",), [80.0, 80.0], r"stiffness is of length 2; allowed: 1"),
+        (("stiffness", 0), -1.0, r"stiffness\[0\] is -1.0; allowed: a finite number of at least 0"),
+        (("damping", 0), None, r"damping\[0\] is None"),
+        (("effort_limit", 0), INFINITY, r"effort_limit\[0\] is inf"),
+        (("speed_limit", 0), NAN, r"speed_limit\[0\] is nan"),
+        (("control_rate_hz",), 0, r"control_rate_hz is 0.0; allowed: a finite rate above 0 Hz"),
+        (("control_rate_hz",), "50", r"control_rate_hz is '50'"),
+        (("training",), [], r"training is \[\]"),
+        (("training",), {"loss": NAN}, r"training is \{'loss': nan\}; allowed: plain JSON values"),
+        (("position_units",), ["m", "deg"], r"position_units\[1\] is 'deg'; allowed: 'm', 'rad'"),
+        (("position_units",), ["m"], r"position_units is \('m',\); allowed: 2 entries"),
+        (("units",), "SI", r"units is 'SI'; Unexpected"),
+    ],
+)
+def test_a_wrong_field_is_named(path: tuple[str | int, ...], value: object, words: str) -> None:
+    """What was found and what is allowed, in one line that fits a terminal."""
+    with pytest.raises(PolicyError, match=f"not a policy spec: (field )?{words}") as caught:
+        PolicySpec.from_json(edited(path, value))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
+
+
+def test_several_wrong_fields_are_named_together() -> None:
+    """Three are explained, the others counted."""
+    values = json.loads(SPEC.to_json())
+    for term in values["observation"]:
+        term["scale"] = "big"
+    with pytest.raises(PolicyError, match=r"\[0\].scale .*\[1\].scale .*\[2\].scale .*; and 2 more$"):
+        PolicySpec.from_json(json.dumps(values))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[" * 100_000, '{"robot": "\\ud800"}', " " * MAX_SPEC_CHARACTERS + "{}"]
+)
+def test_text_that_is_no_json_is_refused(text: str) -> None:
+    """Nothing, deep nesting, a torn character, a text without end."""
+    with pytest.raises(PolicyError, match="not a policy spec"):
+        PolicySpec.from_json(text)
+
+
+def test_specs_made_in_python_are_checked_too() -> None:
+    """A quantity or a joint that is not there, an action that is not taken yet, an endless history."""
+    for words, term in (
+        ("quantity is 'torque'", {"quantity": "torque", "joint": "cart"}),
+        ("allowed: an axis of 'gravity': 'x', 'y', 'z'", {"quantity": "gravity", "joint": "cart"}),
+        ("delay is 0; allowed: 1 to 100", {"quantity": "action", "joint": "cart"}),
+        ("delay is 1000000000", {"quantity": "position", "joint": "cart", "delay": 10**9}),
+        ("delay is True", {"quantity": "position", "joint": "cart", "delay": True}),
+    ):
+        with pytest.raises(ConfigurationError, match=words):
+            ObservationTerm(**{"scale": 1.0, **term})  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match="wheel"):
         dataclasses.replace(SPEC, observation=(ObservationTerm("position", "wheel", 1.0),))
-    with pytest.raises(ConfigurationError, match="delay must be at least 1"):
-        dataclasses.replace(SPEC, observation=(ObservationTerm("action", "cart", 1.0, 0),))
+    with pytest.raises(ConfigurationError, match=r"training is .* plain JSON values"):
+        dataclasses.replace(SPEC, training={"network": object()})
+
+
+@pytest.mark.parametrize("quantity", get_args(Quantity))
+def test_every_known_quantity_is_built(quantity: Quantity) -> None:
+    """And all differ: two that read the same would be a quantity that is taken for another."""
+    spec = dataclasses.replace(
+        feedback_spec(DRIVEN),
+        observation=tuple(
+            ObservationTerm(q, "z" if q in BASE else DRIVEN.joint_names[0], 1.0, int(q == "action"))
+            for q in (quantity, *(other for other in get_args(Quantity) if other != quantity))
+        ),
+    )
+    builder = ObservationBuilder(spec)
+    builder.command = np.array([0.1, 0.2, 0.77])
+    builder.record_action(np.full(12, 0.35))
+    rng = np.random.default_rng(1)
+    built = builder.build(rng.uniform(0.2, 1.0, 18), rng.uniform(0.2, 1.0, 18))
+    assert len(set(built.tolist())) == len(get_args(Quantity))
+
+
+BASE = ("gravity", "heading", "angular_velocity", "linear_velocity", "height", "command")
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+def places(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Yield the path of each value inside a JSON value."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in inside:
+        yield (*path, key)
+        yield from places(child, (*path, key))
+
+
+PLACES = tuple(places(json.loads(SPEC.to_json())))
+
+
+def check_either_refused_or_sound(text: str) -> None:
+    try:
+        spec = PolicySpec.from_json(text)
+    except PolicyError as err:
+        assert "\n" not in str(err)
+        return
+    assert PolicySpec.from_json(spec.to_json()) == spec
+    J = len(spec.joint_names)
+    builder = ObservationBuilder(spec)
+    base = 6 if spec.observes_base else 0
+    with np.errstate(over="ignore"):
+        for _ in range(2):
+            built = builder.build(np.full(base + J, 0.1), np.full(base + J, 0.2))
+            assert built.shape == (len(spec.observation),) and not np.isnan(built).any()
+            builder.record_action(np.zeros(len(spec.actuated)))
+
+
+@given(plain)
+def test_any_json_is_refused_or_a_spec(value: Any) -> None:
+    """No other error than PolicyError, whatever the JSON."""
+    check_either_refused_or_sound(json.dumps(value))
+
+
+@settings(max_examples=400)
+@given(st.lists(st.tuples(st.sampled_from(PLACES), plain | st.just("velocity")), min_size=1, max_size=3))
+def test_a_damaged_spec_is_refused_or_works(damages: list[tuple[tuple[str | int, ...], Any]]) -> None:
+    """Any values in the places of others: what is accepted builds observations and survives JSON."""
+    values = copy.deepcopy(json.loads(SPEC.to_json()))
+    for path, value in damages:
+        place: Any = values
+        try:
+            for part in path[:-1]:
+                place = place[part]
+            place[path[-1]] = value
+        except (TypeError, KeyError, IndexError):
+            continue  # An earlier damage took this place away.
+    check_either_refused_or_sound(json.dumps(values))
+
+
+def test_the_units_of_positions_are_compared_where_they_are_noted() -> None:
+    """A policy trained on a pole in metres is another robot's; one that notes nothing passes."""
+    dataclasses.replace(SPEC, position_units=("m", "rad")).check_fits(DESCRIPTION)
+    with pytest.raises(PolicyMismatchError, match=r"position_units: policy has \('m', 'm'\), robot has"):
+        dataclasses.replace(SPEC, position_units=("m", "m")).check_fits(DESCRIPTION)
+    assert "position_units" not in SPEC.to_json()
+
+
+def test_a_policy_of_another_robot_is_refused_in_a_few_words() -> None:
+    """Three fields with short values, the others by name."""
+    with pytest.raises(PolicyMismatchError, match="policy has 'go2', robot has 'cartpole'") as caught:
+        feedback_spec(DRIVEN).check_fits(DESCRIPTION)
+    words = str(caught.value)
+    assert len(words) < 500
+    assert "also: position_units, default_position" in words and "speed_limit" in words
 
 
 def test_description_digest_changes_with_facts_not_with_sources() -> None:

@@ -1,0 +1,291 @@
+"""Tries a policy before it may move a robot: its network runs in a process of its own, which can be killed.
+
+A policy file comes from anywhere. Its network may loop for ever, crash the process that loads it, ask for all
+memory, or answer with NaN where nobody looked. So the process that will watch over the robot never opens it:
+it learns the spec from another process, has it tried there on observations of this robot, and notes the
+file's digest, by which the control process knows later that it opens the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Pipe
+from pathlib import Path
+from statistics import median
+from typing import Any, Final, Self
+
+import numpy as np
+
+from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.control.behaviours import PolicyBehaviour
+from deal_hw.description import RobotDescription
+from deal_hw.errors import PolicyError
+from deal_hw.policies.trial_states import GivenVelocity, Probe, ProbeStates
+from deal_hw.policy import Observation, PolicySpec
+from deal_hw.types import FloatArray
+
+_MAX_REPLY_BYTES: Final = 100_000_000
+_REPEATS: Final = 3
+"""How often a late action is timed, to tell a slow network from a busy computer."""
+_ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrialSettings:
+    """How far a policy is tried.
+
+    Attributes:
+        time_limit_s: Time for start, loading and all observations together [s]. Half a second is usual.
+        memory_bytes: Memory that loading and running may take beyond what onnxruntime has in use itself.
+        nominal: Observations of the robot at rest in its default pose.
+        random: Observations at random, within the ranges of the description.
+        seed: Fixes these.
+    """
+
+    time_limit_s: float = 20.0
+    memory_bytes: int = 2**30
+    nominal: int = 20
+    random: int = 100
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrialReport:
+    """What a trial found.
+
+    Attributes:
+        spec: The policy's spec.
+        digest: SHA-256 of the file's bytes, in hexadecimal.
+        observations: On how many observations it was tried.
+        median_s: Median time of an action, by kind of observation [s].
+    """
+
+    spec: PolicySpec
+    digest: str
+    observations: int
+    median_s: dict[str, float]
+
+
+class TrialPolicy:
+    """A policy whose network runs in a process of its own; a context manager.
+
+    Args:
+        path: The file.
+        settings: Its limits.
+        clock: For the time limit; the machine's monotonic clock by default.
+
+    Attributes:
+        path: The file.
+        seconds: How long the network took for its last answer [s].
+        waited_s: How long its answers were waited for, all together [s].
+        observations: What it was asked, one at a time, so far, each (O,).
+    """
+
+    def __init__(
+        self, path: Path, settings: TrialSettings = TrialSettings(), clock: Clock | None = None
+    ) -> None:
+        self.path = path
+        self.seconds = self.waited_s = 0.0
+        self.observations: list[Observation] = []
+        self._settings, self._clock = settings, clock or MonotonicClock()
+        self._facts: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Start the process and read the spec from it.
+
+        Raises:
+            PolicyError: The file holds no policy that can be loaded.
+        """
+        self._end_ns = self._clock.now_ns() + round(self._settings.time_limit_s * 1e9)
+        self._connection, theirs = Pipe()
+        self._said = tempfile.TemporaryFile()
+        with theirs:
+            fd, settings = theirs.fileno(), self._settings
+            # A session of its own: Ctrl-C in the terminal reaches this process alone, which then kills it.
+            self._child = subprocess.Popen(
+                [
+                    sys.executable, "-m", "deal_hw.policies.trial_process", str(fd), str(os.getpid()),
+                    str(settings.memory_bytes), str(settings.time_limit_s), str(self.path),
+                ],
+                pass_fds=[fd], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._said,
+                start_new_session=True, env={**os.environ, **_ONE_THREAD},
+            )  # fmt: skip
+        try:
+            self._facts = self._receive()
+            self._spec = PolicySpec.from_json(self._facts["spec"])
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Kill the process."""
+        self._child.kill()
+        self._child.wait()
+        self._connection.close()
+        self._said.close()
+
+    @property
+    def process_id(self) -> int:
+        """Id of the process that runs the network."""
+        return self._child.pid
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy observes and what its action means."""
+        return self._spec
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the file's bytes, in hexadecimal."""
+        return str(self._facts["digest"])
+
+    @property
+    def takes_batches(self) -> bool:
+        """Whether the network takes more than one observation at a time."""
+        return bool(self._facts["batches"])
+
+    def reset(self) -> None:
+        """Nothing to forget: the observation carries the past."""
+
+    def act(self, observation: Observation) -> FloatArray:
+        """Return the action, (A,), for an observation, (O,).
+
+        Raises:
+            PolicyError: The observation is not finite, or as :meth:`act_batch`.
+        """
+        for i in np.flatnonzero(~np.isfinite(observation)):
+            term = self._spec.observation[i]
+            raise PolicyError(
+                f"{self.path}: field observation[{i}] ({term.quantity} of {term.joint!r}, scale "
+                f"{term.scale:g}) is {observation[i]} in a state that this robot can reach; allowed: finite "
+                "numbers; mend its scale"
+            )
+        self.observations.append(observation)
+        action: FloatArray = self.act_batch(observation[None])[0]
+        return action
+
+    def act_batch(self, observations: Observation) -> FloatArray:
+        """Return the actions, (B, A), for observations, (B, O).
+
+        Raises:
+            PolicyError: The network fails, its answer is not finite, or it comes too late.
+        """
+        begun = time.perf_counter()
+        self._connection.send_bytes(json.dumps(observations.tolist()).encode())
+        reply = self._receive()
+        actions: FloatArray = np.array(reply["actions"], dtype=float)
+        self.seconds = float(reply["seconds"])
+        self.waited_s += time.perf_counter() - begun
+        for row, i in np.argwhere(~np.isfinite(actions)):
+            raise PolicyError(
+                f"{self.path}: the network answers {actions[row, i]} for {self._spec.actuated[i]!r}; "
+                "allowed: finite actions; train it again or give another policy"
+            )
+        return actions
+
+    def _receive(self) -> dict[str, Any]:
+        left_s = (self._end_ns - self._clock.now_ns()) * 1e-9
+        try:
+            if not self._connection.poll(max(left_s, 0.0)):
+                raise PolicyError(
+                    f"{self.path}: the network gave no answer; loading and trying it was stopped after "
+                    f"{self._settings.time_limit_s:g} s, it loops for ever or is far too slow; give another "
+                    "policy"
+                )
+            reply: dict[str, Any] = json.loads(self._connection.recv_bytes(_MAX_REPLY_BYTES))
+        except (EOFError, ConnectionError) as err:
+            raise PolicyError(f"{self.path}: {self._obituary()}") from err
+        if "error" in reply:
+            raise PolicyError(reply["error"])
+        return reply
+
+    def _obituary(self) -> str:
+        """Say how the process died."""
+        code = self._child.wait()
+        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        self._said.seek(0)
+        last = self._said.read()[-400:].decode(errors="replace").strip().splitlines()
+        words = f": {last[-1]}" if last else ""
+        return f"the network crashes the process that runs it ({how}{words}); give another policy"
+
+
+def check_policy(
+    path: Path, description: RobotDescription, settings: TrialSettings = TrialSettings()
+) -> TrialReport:
+    """Check a policy file whole: what :class:`TrialPolicy` and :func:`try_policy` do, one after the other.
+
+    Raises:
+        PolicyError: It must not run on this robot; the message says why in one line.
+    """
+    with TrialPolicy(path, settings) as policy:
+        return try_policy(policy, description, settings)
+
+
+def try_policy(
+    policy: TrialPolicy, description: RobotDescription, settings: TrialSettings = TrialSettings()
+) -> TrialReport:
+    """Run a policy on nominal, extreme and random states of a robot, through the code that runs it later.
+
+    Raises:
+        PolicyMismatchError: It was made for another robot, or observes what this one cannot sense.
+        PolicyError: It fails, its answer is not finite, or it takes longer than the robot allows.
+    """
+    source = GivenVelocity()
+    behaviour = PolicyBehaviour(policy, description, source)
+    states = ProbeStates(description)
+    rng = np.random.default_rng(settings.seed)
+    times: dict[str, list[float]] = {}
+    for probe in (
+        *states.nominal(settings.nominal), *states.extreme(), *states.random(settings.random, rng)
+    ):  # fmt: skip
+        if probe.fresh:
+            behaviour.reset()
+        source.wanted = probe.velocity
+        try:
+            times.setdefault(probe.kind, []).append(_try(policy, behaviour, probe, description))
+        except PolicyError as err:
+            raise PolicyError(f"{err} (seen with {probe.name})") from err
+    observations = np.stack(policy.observations)
+    if policy.takes_batches:
+        policy.act_batch(observations)
+    return TrialReport(
+        spec=policy.spec,
+        digest=policy.digest,
+        observations=len(observations),
+        median_s={kind: median(taken) for kind, taken in times.items()},
+    )
+
+
+def _try(
+    policy: TrialPolicy, behaviour: PolicyBehaviour, probe: Probe, description: RobotDescription
+) -> float:
+    """Return how long a policy takes from a state to a command, without the way to its process [s]."""
+    policy.waited_s = 0.0
+    begun = time.perf_counter()
+    # What is too large for the network's numbers is found by act(), and named.
+    with np.errstate(all="ignore"):
+        behaviour.command(probe.state, 0.0)
+    around_s = time.perf_counter() - begun - policy.waited_s
+    times, allowed_s = [around_s + policy.seconds], description.limits.action_age_s
+    while times[0] > allowed_s and len(times) < _REPEATS:
+        # Once may be this computer's fault: another program ran meanwhile.
+        policy.act(policy.observations[-1])
+        times.append(around_s + policy.seconds)
+    if median(times) > allowed_s:
+        raise PolicyError(
+            f"{policy.path}: an action takes {1e3 * median(times):.1f} ms (median of {len(times)}), robot "
+            f"{description.name!r} allows {1e3 * allowed_s:g} ms (limits.action_age_s); give a smaller "
+            "network or a faster computer"
+        )
+    return times[0]

@@ -1,0 +1,93 @@
+"""A policy that must not run is refused by the command before anybody looks for the robot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import onnx
+import pytest
+
+from deal_hw.cli.main import main
+from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.policies.onnx_export import write_policy
+from deal_hw.policies.onnx_runtime import SPEC_KEY
+from deal_hw.testing.faulty_policy import faulty_policy
+
+REFUSED = 2
+
+
+@pytest.fixture
+def deploy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Return what deploys a policy to a port that is not there, and returns what the operator reads."""
+
+    def run(policy: Path, *arguments: str) -> str:
+        verb = arguments or ("deploy", "cartpole")
+        assert main([*verb, "--port", str(tmp_path / "no-port"), "--policy", str(policy)]) == REFUSED
+        said = capsys.readouterr().err.strip()
+        assert "Traceback" not in said and "\n" not in said
+        return said
+
+    return run
+
+
+def edited(path: Path, edit: Callable[[dict[str, Any]], object]) -> Path:
+    """Write the shipped policy with a changed spec."""
+    model = onnx.load(str(shipped_policy("cartpole")))
+    (entry,) = [entry for entry in model.metadata_props if entry.key == SPEC_KEY]
+    spec = json.loads(entry.value)
+    edit(spec)
+    entry.value = json.dumps(spec)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def test_a_sound_policy_comes_as_far_as_the_port(deploy: Callable[..., str]) -> None:
+    """So the refusals below come before it."""
+    assert "no-port" in deploy(Path(str(shipped_policy("cartpole"))))
+
+
+@pytest.mark.parametrize("quantity", ["torque", "velocty"])
+def test_an_unknown_quantity_never_reaches_a_robot(
+    tmp_path: Path, deploy: Callable[..., str], quantity: str
+) -> None:
+    """It was read as joint position and drove the robot."""
+    path = edited(tmp_path / "p.onnx", lambda spec: spec["observation"][5].update(quantity=quantity))
+    said = deploy(path)
+    assert f"field observation[5].quantity is '{quantity}'" in said and "'velocity'" in said
+    assert "no-port" not in said
+
+
+@pytest.mark.parametrize("name", ["stiffness", "damping", "action_scale", "default_position"])
+@pytest.mark.parametrize("value", [[], ["1"], [None], [float("nan")], [1.0, 1.0, 1.0], "1", None])
+def test_wrong_numbers_never_reach_a_robot(
+    tmp_path: Path, deploy: Callable[..., str], name: str, value: object
+) -> None:
+    """Text, null, NaN, too many, none: they came as far as the armed robot, or ended in a traceback."""
+    said = deploy(edited(tmp_path / "p.onnx", lambda spec: spec.update({name: value})))
+    assert f"field {name}" in said and "no-port" not in said
+
+
+@pytest.mark.parametrize("fault", ["nan", "fails"])
+@pytest.mark.parametrize(
+    "verb", [("deploy", "cartpole"), ("deploy", "cartpole", "--dry-run"), ("collect", "cartpole")]
+)
+def test_a_faulty_network_never_reaches_a_robot(
+    tmp_path: Path, deploy: Callable[..., str], fault: Any, verb: tuple[str, ...]
+) -> None:
+    """Whichever verb runs it, also where nothing would be sent."""
+    path = tmp_path / "faulty.onnx"
+    write_policy(*faulty_policy(DESCRIPTION, fault), path)
+    arguments = (*verb, "--out", str(tmp_path / "run"), "--profile", "rich") if verb[0] == "collect" else verb
+    said = deploy(path, *arguments)
+    assert "faulty.onnx: the network" in said and "seen with fastest command" in said
+    assert "no-port" not in said and not (tmp_path / "run").exists()
+
+
+def test_a_missing_policy_that_is_not_needed_is_no_matter(tmp_path: Path, deploy: Callable[..., str]) -> None:
+    """The profile `hold` runs none."""
+    verb = ("collect", "cartpole", "--profile", "hold", "--out", str(tmp_path / "run"))
+    assert "no-port" in deploy(tmp_path / "nothing.onnx", *verb)

@@ -1,0 +1,297 @@
+"""Feeds damaged policies to the checks that stand before a robot, and counts what becomes of them.
+
+Specs are damaged as JSON; what is accepted runs the behaviour that would drive the robot, in this process.
+Networks are damaged as bytes: quickly in a worker that may crash or hang and is then started again; one in so
+many, and all that the worker could not finish, by the check that `deal-hw deploy` makes. A failure is any
+error that is not a refusal in one line, a check that outlasts its limit, or a gigabyte of memory here.
+
+    .venv/bin/python tools/fuzz_policies.py --specs 100000 --networks 20000 --seed 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import copy
+import json
+import random
+import resource
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.control.behaviours import PolicyBehaviour
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import driver_description
+from deal_hw.errors import PolicyError
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policies.trial import TrialSettings, check_policy
+from deal_hw.policies.trial_states import ProbeStates
+from deal_hw.policy import Observation, PolicySpec
+from deal_hw.types import FloatArray
+
+ROBOTS = ("cartpole", "go2")
+MEMORY_BYTES = 2**30
+WORKER_S = 5.0
+SETTINGS = TrialSettings(time_limit_s=10.0, nominal=2, random=5)
+ODD: tuple[Any, ...] = (
+    None, True, False, 0, 1, -1, 10**9, 10**400, 0.0, -0.0, 1e-320, 1e300, float("nan"), float("inf"),
+    float("-inf"), "", "1", "nan", "cart", "pole", "x", "z", "position", "velocity", "action", "gravity",
+    "height", "command", "torque", "FL_hip_joint", "\x00", "\ud800", "x" * 10_000, [], {}, [0.0], [[]],
+    [None], {"a": 1}, [1.0] * 2, [1.0] * 12, ["x"] * 300, ["cart", "pole"], [0.0] * 100_000,
+)  # fmt: skip
+OPERATORS = (
+    b"Relu",
+    b"Tanh",
+    b"Sqrt",
+    b"Ceil",
+    b"Sign",
+    b"Asin",
+    b"Acos",
+    b"Gemm",
+    b"Loop",
+    b"Size",
+    b"Cast",
+)
+
+
+class Still:
+    """A policy that asks for the default pose, and refuses observations that are not finite."""
+
+    def __init__(self, spec: PolicySpec) -> None:
+        self.spec = spec
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> FloatArray:
+        """Return zeros."""
+        if not np.isfinite(observation).all():
+            raise PolicyError("an observation is not finite")
+        return np.zeros(len(self.spec.actuated))
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the path of each value inside a JSON value."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [found for key, child in inside for found in ((*path, key), *places(child, (*path, key)))]
+
+
+def damaged_spec(rng: random.Random, good: dict[str, Any], spots: list[tuple[Any, ...]]) -> str:
+    """Return a spec's text with one to three damages."""
+    values = copy.deepcopy(good)
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        # Whole fields as often as the many entries of the observation.
+        path = rng.choice(spots) if rng.random() < 0.5 else (rng.choice(list(good)),)
+        place: Any = values
+        try:
+            for part in path[:-1]:
+                place = place[part]
+            how = rng.randrange(5)
+            if how == 0:
+                del place[path[-1]]
+            elif how == 1 and isinstance(place, list):
+                place.insert(rng.randrange(len(place) + 1), copy.deepcopy(rng.choice(place)))
+            elif how == 2 and isinstance(place, dict):
+                place["field" + str(rng.randrange(3))] = rng.choice(ODD)
+            elif how == 3 and isinstance(place[path[-1]], float):
+                place[path[-1]] *= rng.choice((-1, 0, 1.5, 1e3, 1e30, 57.3))
+            else:
+                place[path[-1]] = rng.choice(ODD)
+        except (LookupError, TypeError):
+            continue  # An earlier damage took this place away.
+    text = json.dumps(values)
+    if rng.random() < 0.05:
+        at = rng.randrange(len(text))
+        text = text[:at] + rng.choice(("", "[" * 5000, "\x00", "NaN", '"', "}", "1e999")) + text[at + 1 :]
+    return text
+
+
+def judge_spec(text: str, description: RobotDescription, probes: list[Any]) -> str:
+    """Return what becomes of a spec; raises what nobody should."""
+    try:
+        spec = PolicySpec.from_json(text)
+        behaviour = PolicyBehaviour(Still(spec), description)
+        behaviour.reset()
+        with np.errstate(all="ignore"):
+            for probe in probes:
+                command = behaviour.command(probe.state, 0.0)
+    except PolicyError as err:
+        if "\n" in str(err) or len(str(err)) > 1000:
+            raise ValueError(f"not one line: {err}") from err
+        return f"refused ({type(err).__name__})"
+    if PolicySpec.from_json(spec.to_json()) != spec:
+        raise ValueError("does not survive JSON")
+    for name in ("position_target", "stiffness", "damping", "effort_limit"):
+        if not np.isfinite(getattr(command, name)).all():
+            raise ValueError(f"{name} of the command is not finite")
+    return "runs"
+
+
+def fuzz_specs(count: int, seed: int) -> tuple[collections.Counter[str], list[str]]:
+    """Return the outcomes of so many specs, and the failures."""
+    outcomes: collections.Counter[str] = collections.Counter()
+    failures = []
+    bases = []
+    for robot in ROBOTS:
+        description = driver_description(robot)
+        states = ProbeStates(description)
+        probes = [*states.nominal(1), *states.random(2, np.random.default_rng(0))]
+        good = json.loads(OnnxPolicy(str(shipped_policy(robot))).spec.to_json())
+        bases.append((good, places(good), description, probes))
+    for number in range(count):
+        rng = random.Random(f"{seed}/{number}")
+        good, spots, description, probes = rng.choice(bases)
+        text = damaged_spec(rng, good, spots)
+        begun = time.perf_counter()
+        try:
+            outcomes[judge_spec(text, description, probes)] += 1
+        except Exception as err:
+            failures.append(f"spec {seed}/{number}: {type(err).__name__}: {str(err)[:200]}")
+        if time.perf_counter() - begun > 1.0:
+            failures.append(f"spec {seed}/{number}: took {time.perf_counter() - begun:.1f} s")
+    return outcomes, failures
+
+
+def damaged_network(seed: int, number: int) -> tuple[str, bytes]:
+    """Return a robot and its shipped policy with damaged bytes."""
+    rng = random.Random(f"network {seed}/{number}")
+    robot = rng.choice(ROBOTS)
+    data = bytearray(Path(str(shipped_policy(robot))).read_bytes())
+    for _ in range(rng.choice((1, 1, 2, 4, 16))):
+        # Graph and metadata are short, and stand at both ends; between them are weights.
+        at = rng.choice((rng.randrange(min(800, len(data))), -1 - rng.randrange(min(8000, len(data))),
+                         rng.randrange(len(data)))) % len(data)  # fmt: skip
+        how = rng.randrange(6)
+        if how == 0:
+            data[at] ^= 1 << rng.randrange(8)
+        elif how == 1:
+            data[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFF))
+        elif how == 2:
+            del data[at : at + rng.choice((1, 4, 100, 5000))]
+        elif how == 3:
+            data[at:at] = rng.randbytes(rng.choice((1, 4, 100)))
+        elif how == 4:
+            data[at : at + 4] = rng.choice((b"\xff\xff\xc0\x7f", b"\x00\x00\x80\x7f", b"\xff\xff\x7f\x7f"))
+        else:
+            found = data.find(rng.choice((b"Relu", b"Tanh", b"Gemm")))
+            if found >= 0:
+                data[found : found + 4] = rng.choice(OPERATORS)
+        if len(data) < 8:
+            break
+    return robot, bytes(data)
+
+
+def work(seed: int, first: int, last: int) -> None:
+    """Judge networks in this process and print each outcome at once."""
+    resource.setrlimit(resource.RLIMIT_AS, (4 * MEMORY_BYTES, resource.RLIM_INFINITY))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.onnx"
+        for number in range(first, last):
+            robot, data = damaged_network(seed, number)
+            path.write_bytes(data)
+            try:
+                policy = OnnxPolicy(path)
+                policy.spec.check_fits(driver_description(robot))
+                rng = np.random.default_rng(number)
+                for _ in range(5):
+                    policy.act(rng.standard_normal(len(policy.spec.observation)).astype(np.float32))
+                outcome = "runs"
+            except PolicyError as err:
+                outcome = "refused" if "\n" not in str(err) else f"failure: two lines: {err!r}"
+            except MemoryError:
+                outcome = "refused (memory)"
+            except Exception as err:
+                outcome = f"failure: {type(err).__name__}: {str(err)[:200]!r}"
+            print(outcome, flush=True)
+
+
+def fuzz_networks(count: int, seed: int, every: int) -> tuple[collections.Counter[str], list[str]]:
+    """Return the outcomes of so many networks, and the failures."""
+    outcomes: collections.Counter[str] = collections.Counter()
+    failures: list[str] = []
+    number = 0
+    while number < count:
+        command = [sys.executable, __file__, "--work", str(seed), str(number), str(count)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
+            assert worker.stdout is not None
+            while number < count:
+                patience_s = WORKER_S + 15.0  # The first answer waits for imports.
+                ready = select.select([worker.stdout], [], [], patience_s)[0]
+                # Unbuffered reads: a line is one short write.
+                line = worker.stdout.readline().decode().strip() if ready else ""
+                if not line:
+                    line = "hangs the worker" if not ready else "crashes the worker"
+                    worker.kill()
+                outcomes[line if not line.startswith("failure") else "failure"] += 1
+                if line.startswith("failure"):
+                    failures.append(f"network {seed}/{number}: {line}")
+                if number % every == 0 or "worker" in line:
+                    outcome = judge_network(seed, number)
+                    outcomes[f"whole check: {outcome.partition(':')[0]}"] += 1
+                    if outcome.startswith("failure"):
+                        failures.append(f"network {seed}/{number}: {outcome}")
+                number += 1
+                if "worker" in line:
+                    break
+    return outcomes, failures
+
+
+def judge_network(seed: int, number: int) -> str:
+    """Return what the check of `deal-hw deploy` says of a network."""
+    robot, data = damaged_network(seed, number)
+    begun = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.onnx"
+        path.write_bytes(data)
+        try:
+            check_policy(path, driver_description(robot), SETTINGS)
+            outcome = "runs"
+        except PolicyError as err:
+            outcome = "refused" if "\n" not in str(err) else f"failure: two lines: {err!r}"
+        except Exception as err:
+            outcome = f"failure: {type(err).__name__}: {str(err)[:200]!r}"
+    took = time.perf_counter() - begun
+    return outcome if took < SETTINGS.time_limit_s + 1.0 else f"failure: took {took:.1f} s"
+
+
+def main() -> int:
+    """Print the table; return 1 where anything failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--specs", type=int, default=10_000)
+    parser.add_argument("--networks", type=int, default=1_000)
+    parser.add_argument("--every", type=int, default=50, help="one network in so many gets the whole check")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=int, nargs=3, default=None, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.work is not None:
+        work(*given.work)
+        return 0
+    failures: list[str] = []
+    for what, run in (
+        ("specs", lambda: fuzz_specs(given.specs, given.seed)),
+        ("networks", lambda: fuzz_networks(given.networks, given.seed, given.every)),
+    ):
+        begun = time.perf_counter()
+        outcomes, wrong = run()
+        failures += wrong
+        print(f"{what} in {time.perf_counter() - begun:.0f} s:")
+        for outcome, times in outcomes.most_common():
+            print(f"  {times:7} {outcome}")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    if peak > MEMORY_BYTES:
+        failures.append(f"this process took {peak / 2**20:.0f} MiB")
+    print(f"memory of this process: {peak / 2**20:.0f} MiB; failures: {len(failures)}")
+    print("\n".join(failures[:20]))
+    return int(bool(failures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
