@@ -31,6 +31,9 @@ class LegOptions:
     """Buttons of the robot's remote that make it passive while held together; by default the driver's (Go2:
     L2+B)."""
 
+    support_check: bool = True
+    """Refuse a Go2 on a stand, and a go2_hung on the floor. Leave it out only to try a policy in the air."""
+
     posture: PostureConfig = field(default_factory=PostureConfig)
     """How long standing up and lying down take."""
 
@@ -65,8 +68,15 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions) -> dict[str, A
         "velocity": legs.velocity,
         "hand_back": legs.hand_back,
         "posture": legs.posture,
-        "robot_settings": {"stop_buttons": legs.stop_buttons} if legs.stop_buttons else {},
+        "robot_settings": _settings(legs),
     }
+
+
+def _settings(legs: LegOptions) -> dict[str, Any]:
+    """Return the driver's own settings that were given; a driver without such a setting refuses it."""
+    given: dict[str, Any] = {"stop_buttons": legs.stop_buttons, "support_check": legs.support_check}
+    default = {"stop_buttons": "", "support_check": True}
+    return {name: value for name, value in given.items() if value != default[name]}
 
 
 def _stands(description: RobotDescription) -> bool:

@@ -32,12 +32,19 @@ def test_what_is_given_wins() -> None:
         **plan_options(
             "go2",
             LinkOptions(transport="zenoh", record_wire=False, wire=wire),
-            LegOptions(stand=False, velocity="remote", hand_back=True, posture=posture, stop_buttons="R2+A"),
+            LegOptions(
+                stand=False,
+                velocity="remote",
+                hand_back=True,
+                posture=posture,
+                stop_buttons="R2+A",
+                support_check=False,
+            ),
         )
     )
     assert plan == RunPlan(
         robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=False, velocity="remote",
-        hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A"},
+        hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A", "support_check": False},
     )  # fmt: skip
 
 

@@ -228,9 +228,9 @@ def test_a_state_with_nan_passes() -> None:
     """It is sound as a message; what to do about it is the safety module's decision."""
     wire = ScriptedBench(mode="")
     wire.robot.connect()
+    wire.robot.home(5.0)
     wire.device.pose[4] = np.nan
     assert np.isnan(drained(wire.robot, 2)[-1].position[4])
-    wire.robot.home(5.0)
     wire.robot.arm(1.0)
     assert all(np.isfinite(command.position).all() for _, command in wire.device.heard)
 
@@ -406,12 +406,12 @@ def test_another_process_can_make_it_passive() -> None:
 
 
 def test_the_hung_robot_is_another_description() -> None:
-    """Same wire; no floor, no tilt limit, the gains of the suspended recording."""
+    """Same wire; no floor, a level stand, the gains of the suspended recording."""
     wire = ScriptedBench(Go2HungRobot, mode="")
     robot = wire.armed()
     assert robot.description.name == "go2_hung"
     assert robot.description.floating_base is None
-    assert robot.description.limits.legs is not None and np.isinf(robot.description.limits.legs.tilt)
+    assert robot.description.limits.legs is not None and robot.description.limits.legs.tilt == 0.35
     assert robot.description.stiffness == (20.0,) * 12
 
 
