@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -45,6 +45,10 @@ class LinkOptions:
     transport: str = ""
     """How the robot is reached: serial, dds or zenoh; by default the robot's usual way."""
 
+    state_check: Literal["strict", "length"] = "strict"
+    """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
+    checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
+
     record_wire: bool = True
     """Record the raw bytes, too."""
 
@@ -68,14 +72,18 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions) -> dict[str, A
         "velocity": legs.velocity,
         "hand_back": legs.hand_back,
         "posture": legs.posture,
-        "robot_settings": _settings(legs),
+        "robot_settings": _settings(link, legs),
     }
 
 
-def _settings(legs: LegOptions) -> dict[str, Any]:
+def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
     """Return the driver's own settings that were given; a driver without such a setting refuses it."""
-    given: dict[str, Any] = {"stop_buttons": legs.stop_buttons, "support_check": legs.support_check}
-    default = {"stop_buttons": "", "support_check": True}
+    given: dict[str, Any] = {
+        "stop_buttons": legs.stop_buttons,
+        "support_check": legs.support_check,
+        "state_check": link.state_check,
+    }
+    default = {"stop_buttons": "", "support_check": True, "state_check": "strict"}
     return {name: value for name, value in given.items() if value != default[name]}
 
 

@@ -16,6 +16,7 @@ from deal_hw.drivers.go2.body import body_state, is_damped
 from deal_hw.drivers.go2.driven import DRIVEN
 from deal_hw.drivers.go2.greeting import await_robot
 from deal_hw.drivers.go2.protocol import LowStateFrame
+from deal_hw.drivers.go2.refusals import StateCheck
 from deal_hw.drivers.go2.remote import decode_remote, parse_combination
 from deal_hw.drivers.go2.sending import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.go2.state_stream import StateStream
@@ -74,7 +75,8 @@ class Go2Robot(Robot):
         transport: Topics of the robot, or of a bridge to it.
         clock: The clock of the transport's stamps.
         stop_buttons: Buttons of the remote that stop a run while held together; "" for none.
-        check_crc: Whether states with a wrong checksum are dropped.
+        state_check: What a state must pass: "strict", or "length" for firmware or a simulator that makes head
+            or checksum by another rule. A state that was corrupted on the way then passes for a true one.
         support_check: Whether ``home`` makes sure that the robot is on the floor, or on a stand, as the
             description says.
     """
@@ -87,12 +89,12 @@ class Go2Robot(Robot):
         clock: Clock,
         *,
         stop_buttons: str = STOP_BUTTONS,
-        check_crc: bool = True,
+        state_check: StateCheck = "strict",
         support_check: bool = True,
     ) -> None:
         self._transport, self._clock = transport, clock
         self._stop_text, self._stop_mask = stop_buttons, parse_combination(stop_buttons)
-        self._stream = StateStream(check_crc)
+        self._stream = StateStream(state_check)
         self._states: deque[RobotState] = deque(maxlen=_QUEUE)
         self._wire: deque[Message] = deque(maxlen=_QUEUE)
         self._sender = CommandSender(transport, clock, self.description, self._wire.append)

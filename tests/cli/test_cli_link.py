@@ -8,7 +8,9 @@ import pytest
 
 from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan
+from deal_hw.clock import VirtualClock
 from deal_hw.control.posture import PostureConfig
+from deal_hw.drivers import make_robot
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
 
@@ -54,3 +56,14 @@ def test_a_robot_without_a_driver_is_refused() -> None:
         plan_options("so101", LinkOptions(), LegOptions())
     with pytest.raises(UnknownNameError, match="go3"):
         plan_options("go3", LinkOptions(), LegOptions())
+
+
+def test_the_drivers_own_settings_are_carried_where_they_were_given() -> None:
+    """As the driver's keyword arguments; a robot whose driver knows no such setting refuses them."""
+    options = plan_options("go2", LinkOptions(state_check="length"), LegOptions(support_check=False))
+    settings = options["robot_settings"]
+    assert settings == {"support_check": False, "state_check": "length"}
+    clock = VirtualClock()
+    assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, settings).info is None  # type: ignore[attr-defined]
+    with pytest.raises(ConfigurationError, match="no setting of support_check, state_check"):
+        make_robot("cartpole", "serial", "/dev/ttyUSB0", clock, None, settings)
