@@ -111,9 +111,12 @@ class Checkup:
             yield Finding("dds", Level.OK, str(peer))
         for complaint in seen.complaints:
             yield Finding("dds", Level.FAIL, complaint, "see docs/go2-dds.md")
-        typed = {end.topic: end.type_hash for end in seen.endpoints if end.topic in topics.TYPES}
-        for topic, type_hash in sorted(typed.items()):
-            yield Finding("dds", Level.OK, f"{topic}: type hash {type_hash or 'not told'}")
+        typed: dict[str, set[str]] = {}
+        for end in seen.endpoints:
+            if end.topic in topics.TYPES:
+                typed.setdefault(end.shown_hash, set()).add(end.topic)
+        for shown, names in typed.items():
+            yield Finding("dds", Level.OK, f"{', '.join(sorted(names))}: {shown}")
 
     def _ask_mode(self) -> Generator[Finding, None, str | None]:
         """Yield what the motion switcher tells; return the active mode's name, None without an answer."""
