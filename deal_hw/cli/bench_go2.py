@@ -67,7 +67,7 @@ def _calls() -> dict[str, Callable[[], object]]:
     command_bytes, state_bytes = encoder.encode(command), encode_low_state(state)
     return {
         "encode LowCmd with CRC": lambda: encoder.encode(command),
-        "decode LowState": lambda: decode_low_state(state_bytes, check_crc=False),
+        "decode LowState": lambda: decode_low_state(state_bytes, strict=False),
         "decode LowState with CRC": lambda: decode_low_state(state_bytes),
         "encode LowState with CRC": lambda: encode_low_state(state),
         "decode LowCmd with CRC": lambda: decode_low_command(command_bytes),

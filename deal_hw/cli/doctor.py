@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -36,6 +36,9 @@ class Doctor:
 
     transport: str = ""
     """How it is reached; by default the robot's usual way."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """What the states of a Go2 must pass: strict, or length to leave head and checksum out."""
 
     seconds: float = 3.0
     """How long to listen to the robot [s]."""
@@ -113,7 +116,7 @@ def _examine(config: Doctor) -> Iterator[Finding]:
     clock = MonotonicClock()
     try:
         link = make_topic_transport(name, config.port, clock, config.wire)
-        yield from Checkup(link, clock, config.seconds).run()
+        yield from Checkup(link, clock, config.seconds, config.state_check).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
 

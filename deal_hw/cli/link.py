@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -31,6 +31,9 @@ class LegOptions:
     """Buttons of the robot's remote that make it passive while held together; by default the driver's (Go2:
     L2+B)."""
 
+    support_check: bool = True
+    """Refuse a Go2 on a stand, and a go2_hung on the floor. Leave it out only to try a policy in the air."""
+
     posture: PostureConfig = field(default_factory=PostureConfig)
     """How long standing up and lying down take."""
 
@@ -41,6 +44,10 @@ class LinkOptions:
 
     transport: str = ""
     """How the robot is reached: serial, dds or zenoh; by default the robot's usual way."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
+    checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
 
     record_wire: bool = True
     """Record the raw bytes, too."""
@@ -65,8 +72,19 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions) -> dict[str, A
         "velocity": legs.velocity,
         "hand_back": legs.hand_back,
         "posture": legs.posture,
-        "robot_settings": {"stop_buttons": legs.stop_buttons} if legs.stop_buttons else {},
+        "robot_settings": _settings(link, legs),
     }
+
+
+def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
+    """Return the driver's own settings that were given; a driver without such a setting refuses it."""
+    given: dict[str, Any] = {
+        "stop_buttons": legs.stop_buttons,
+        "support_check": legs.support_check,
+        "state_check": link.state_check,
+    }
+    default = {"stop_buttons": "", "support_check": True, "state_check": "strict"}
+    return {name: value for name, value in given.items() if value != default[name]}
 
 
 def _stands(description: RobotDescription) -> bool:

@@ -43,6 +43,8 @@ WIRELESS_MS: Final = 10
 PUSH_MS: Final = 100
 SETTLE_TICKS: Final = 1500
 STOP_COMBINATION: Final = "L2+B"
+HANGING: Final = np.tile((0.0, 0.34, -0.85), 4)
+"""Where limp legs come to rest in the air, but for the hips: the calf's weight opens the knee to its stop."""
 
 Outgoing = tuple[str, bytes]
 
@@ -62,7 +64,8 @@ class Go2Device:
     Args:
         truth: Hidden parameters, profile, seed.
         suspended: Whether the base is held in the air.
-        start: Lying limp on the floor (or hanging), or standing with sport mode in control.
+        start: Lying limp on the floor (suspended: limp legs hang down), or standing with sport mode in
+            control.
         sport: Name of the sport mode that is active at power-up; "" for none.
         sport_on_wire: Whether sport mode's own commands are seen on ``rt/lowcmd``.
         plan: What goes wrong.
@@ -82,7 +85,7 @@ class Go2Device:
         remote: Sequence[RemoteMoment] | None = (),
         tick_ms: int = 0,
     ) -> None:
-        self._truth = truth
+        self._truth, self._suspended = truth, suspended
         self._profile = profile = find_profile(truth.profile)
         self._plan = plan or FaultPlan()
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0x602]).spawn(4)]
@@ -250,7 +253,8 @@ class Go2Device:
     def _begin(self, start: str) -> None:
         """Settle in the start posture; device time does not move."""
         sim, drives, controller = self._sim, self._drives, self._sport.controller
-        sim.set_pose(STANDING if start == "standing" else LYING, 0.34 if start == "standing" else 0.13)
+        limp = HANGING if self._suspended else LYING
+        sim.set_pose(STANDING if start == "standing" else limp, 0.34 if start == "standing" else 0.13)
         if start == "standing":
             controller.take(Posture.STANDING, STANDING, -10_000)
         drives.accept(controller.command(0))

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.go2.device import PUBLISHED, SUBSCRIBED, Go2Device
-from deal_hw.errors import TransportError, TransportTimeoutError
+from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 
 STALL_NS: Final = 50_000_000
@@ -72,7 +72,8 @@ class Go2Emulator:
         for topic, payload in self._device.advance_to(now_ns - self._origin_ns):
             try:
                 self._transport.send(Message(topic, payload, now_ns))
-            except TransportError:
+            except (TransportError, FrameError):
+                # DDS checks the CDR header, which a fault may have changed: such a message is lost.
                 self.unsent += 1
 
     def report(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The real Go2 with its base held in the air: targets at 50 Hz, states at 500 Hz, no floor.
 
-The stand must hold the base still: the model's base does not move. The 200 Hz recording of iit-DLSLab is
-``go2_suspended``.
+The stand must hold the base level and still: the model's base does not move. The 200 Hz recording of
+iit-DLSLab is ``go2_suspended``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
         "damping": suspended.DESCRIPTION.sources["damping"],
         "device_rate_hz": "1 kHz as the emulator's drives; the rate of the robot's own is not published",
         "excitation_range": "corners and draws inside it: least distance of two legs' shapes in go2.xml 3 cm",
-        "legs.tilt": "no limit: the base is held",
+        "legs.tilt": (
+            "assumed: the model's base is level; at 0.35 rad a third of a leg's weight pulls it aside"
+        ),
         "legs.free_fall": "no limit: the base is held",
     },
 )

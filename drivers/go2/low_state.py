@@ -212,24 +212,24 @@ class LowStateFrame:
         )  # fmt: skip
 
 
-def decode_low_state(payload: bytes, check_crc: bool = True) -> LowStateFrame:
+def decode_low_state(payload: bytes, strict: bool = True) -> LowStateFrame:
     """Return the state in a LowState. Reserved fields are ignored: newer firmware may use them.
 
     Numbers that are not finite pass: what to do about them is the safety module's decision.
 
     Args:
         payload: CDR with its header.
-        check_crc: Whether to verify the checksum.
+        strict: Whether to verify head and checksum, too.
 
     Raises:
         FrameError: Wrong length, header, head or checksum.
     """
     if len(payload) != LOW_STATE_BYTES or payload[:6] != BEGIN:
-        check_frame(payload, "LowState")
-    if check_crc:
+        check_frame(payload, "LowState", head=strict)
+    if strict:
         verify_crc(payload, "LowState")
     hot = np.frombuffer(payload, _F4)[_HOT].astype(_F8)
-    return LowStateFrame(payload, hot, check_crc)
+    return LowStateFrame(payload, hot, strict)
 
 
 def encode_low_state(state: LowState) -> bytes:

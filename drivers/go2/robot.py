@@ -16,9 +16,11 @@ from deal_hw.drivers.go2.body import body_state, is_damped
 from deal_hw.drivers.go2.driven import DRIVEN
 from deal_hw.drivers.go2.greeting import await_robot
 from deal_hw.drivers.go2.protocol import LowStateFrame
+from deal_hw.drivers.go2.refusals import StateCheck
 from deal_hw.drivers.go2.remote import decode_remote, parse_combination
 from deal_hw.drivers.go2.sending import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.go2.state_stream import StateStream
+from deal_hw.drivers.go2.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.go2.takeover import Takeover
 from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.robot import Robot
@@ -73,7 +75,10 @@ class Go2Robot(Robot):
         transport: Topics of the robot, or of a bridge to it.
         clock: The clock of the transport's stamps.
         stop_buttons: Buttons of the remote that stop a run while held together; "" for none.
-        check_crc: Whether states with a wrong checksum are dropped.
+        state_check: What a state must pass: "strict", or "length" for firmware or a simulator that makes head
+            or checksum by another rule. A state that was corrupted on the way then passes for a true one.
+        support_check: Whether ``home`` makes sure that the robot is on the floor, or on a stand, as the
+            description says.
     """
 
     description: ClassVar[RobotDescription] = DRIVEN
@@ -85,14 +90,22 @@ class Go2Robot(Robot):
         clock: Clock,
         *,
         stop_buttons: str = STOP_BUTTONS,
-        check_crc: bool = True,
+        state_check: StateCheck = "strict",
+        support_check: bool = True,
     ) -> None:
         self._transport, self._clock = transport, clock
         self._stop_text, self._stop_mask = stop_buttons, parse_combination(stop_buttons)
-        self._stream = StateStream(check_crc)
+        self._stream = StateStream(state_check)
         self._states: deque[RobotState] = deque(maxlen=_QUEUE)
         self._wire: deque[Message] = deque(maxlen=_QUEUE)
         self._sender = CommandSender(transport, clock, self.description, self._wire.append)
+        self._support = SupportGuard(
+            self.description.name,
+            Support.HELD if self.description.floating_base is None else Support.FLOOR,
+            clock,
+            self._pump,
+            SupportConfig() if support_check else None,
+        )
         self._forget()
 
     def _forget(self) -> None:
@@ -141,12 +154,14 @@ class Go2Robot(Robot):
 
         Raises:
             TransportTimeoutError: The robot's services do not answer, or do not let go in time.
-            SafetyError: The robot does not lie down, a service refuses, or another program commands the
-                motors; the text names it.
+            SafetyError: The robot does not lie down, a service refuses, another program commands the motors
+                (the text names it), or the robot is on a stand instead of the floor, or the reverse.
         """
         self._check_connected()
         self._in_charge, self._homed, self._operator_stop = True, False, ""
+        self._support.before_release()
         self._takeover.run(timeout_s)
+        self._support.require()
         self._homed = True
         self._states.clear()
 
@@ -291,6 +306,7 @@ class Go2Robot(Robot):
 
     def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:
         self._frame = frame
+        self._support.take(frame)
         remote = decode_remote(frame.remote)
         if remote is not None and remote.holds(self._stop_mask):
             self._operator_stop = f"{self._stop_text} was pressed on the remote"

@@ -16,6 +16,7 @@ import numpy as np
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.leg_geometry import WEIGHT_N, efforts_under
 from deal_hw.drivers.go2.protocol import (
     LowCommand,
     LowCommandEncoder,
@@ -31,6 +32,8 @@ from deal_hw.types import FloatArray
 
 RESTING: Final = np.array(DRIVEN.rest_position)
 STANDING: Final = np.array(DRIVEN.default_position)
+STANDING_EFFORT: Final = efforts_under(STANDING, np.array([[0.0, 0.0, WEIGHT_N / 4]] * 4))
+"""What the drives of a standing robot give [N·m]."""
 ANSWER_NS: Final = 3_000_000
 STIFF: Final = LowCommandEncoder().encode(
     LowCommand(STANDING, np.zeros(12), np.full(12, 60.0), np.full(12, 5.0), np.zeros(12))
@@ -50,6 +53,7 @@ class ScriptedGo2:
         tick_step: By how much that advances with each state; 0: it stands still.
         remote: What the operator holds; None: nothing is heard.
         changes: Fields of the state that are otherwise, by name.
+        hangs: Whether its body is held, so that its legs carry nothing where they stand.
         talks: Whether it sends states.
         hears: Whether commands reach the motors.
         deaf: Services that do not answer.
@@ -61,12 +65,14 @@ class ScriptedGo2:
 
     Args:
         mode: The active mode at the beginning.
-        pose: The pose, (12,) [rad].
+        pose: The pose, (12,) [rad]; by default at rest, or the legs down where it hangs.
+        hangs: As the attribute.
     """
 
-    def __init__(self, mode: str = "normal", pose: FloatArray = RESTING) -> None:
+    def __init__(self, mode: str = "normal", pose: FloatArray | None = None, *, hangs: bool = False) -> None:
         self.device_ns = 0
-        self.mode, self.pose, self.velocity = mode, pose.copy(), np.zeros(12)
+        self.mode, self.hangs, self.velocity = mode, hangs, np.zeros(12)
+        self.pose = (STANDING if hangs else RESTING).copy() if pose is None else pose.copy()
         self.tick_ms, self.tick_step = 1000, 2
         self.remote: Remote | None = None
         self.changes: dict[str, Any] = {}
@@ -132,7 +138,8 @@ class ScriptedGo2:
     def effort(self) -> FloatArray:
         """Return what the drives do with the command in force, (12,) [N·m]."""
         if (c := self.command) is None:
-            return np.zeros(12)
+            stands = not self.hangs and np.array_equal(self.pose, STANDING)
+            return STANDING_EFFORT if stands else np.zeros(12)
         return np.asarray(
             c.stiffness * (c.position - self.pose) + c.damping * (c.velocity - self.velocity) + c.effort
         )
@@ -207,7 +214,7 @@ class ScriptedBench:
 
     def __init__(self, kind: type[Go2Robot] = Go2Robot, **settings: Any) -> None:
         self.clock = VirtualClock(5_000_000_000)
-        self.device = ScriptedGo2(**settings)
+        self.device = ScriptedGo2(**{"hangs": kind.description.floating_base is None, **settings})
         self.topics = ScriptedTopics(self.device, self.clock)
         self.robot = kind(self.topics, self.clock)
 

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from typing import Final
+from collections import deque
+from typing import Final, get_args
 
-from deal_hw.drivers.go2.protocol import LOW_STATE_BYTES, LowStateFrame, decode_low_state
-from deal_hw.errors import (
-    FrameError,
-    ProtocolError,
-    TransportLostError,
-    VersionMismatchError,
-    WrongDeviceError,
-)
+from deal_hw.drivers.go2.protocol import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.refusals import Refusals, StateCheck
+from deal_hw.errors import FrameError, ProtocolError, TransportLostError, UnknownNameError
 from deal_hw.transport import Message
 
 PERIOD_MS: Final = 2
@@ -35,11 +30,16 @@ class StateStream:
         offset_ns: Host clock minus robot clock, at the fastest transit seen [ns].
 
     Args:
-        check_crc: Whether to verify checksums.
+        check: What a state must pass.
+
+    Raises:
+        UnknownNameError: There is no such check.
     """
 
-    def __init__(self, check_crc: bool = True) -> None:
-        self._check_crc = check_crc
+    def __init__(self, check: StateCheck = "strict") -> None:
+        if check not in get_args(StateCheck):
+            raise UnknownNameError("check of the Go2's states", check, get_args(StateCheck))
+        self._strict = check == "strict"
         self.reset()
 
     def reset(self) -> None:
@@ -48,9 +48,7 @@ class StateStream:
         self.sequence = -1
         self._tick: int | None = None
         self._offset_at_ns = 0
-        self._lengths: Counter[int] = Counter()
-        self._refused: FrameError | None = None
-        self._bad_crc = 0
+        self._refused = Refusals()
 
     def take(self, message: Message) -> LowStateFrame | None:
         """Return the state in a message; None where it is corrupt or not new.
@@ -59,9 +57,10 @@ class StateStream:
             TransportLostError: The robot's clock was restarted.
         """
         try:
-            frame = decode_low_state(message.payload, self._check_crc)
+            frame = decode_low_state(message.payload, self._strict)
         except FrameError as error:
-            self._refuse(message.payload, error)
+            self.errors += 1
+            self._refused.add(message.payload, error)
             return None
         tick = frame.tick_ms
         # Signed: a state that was overtaken is a little older, not four thousand million milliseconds newer.
@@ -88,26 +87,7 @@ class StateStream:
 
     def complaint(self) -> ProtocolError | None:
         """Return what is wrong where states come and none is sound; None where none came, or some are."""
-        if self.accepted or self._refused is None:
-            return None
-        if self._bad_crc:
-            return VersionMismatchError(
-                f"go2: {self._bad_crc} states have the right length, and none the checksum that its layout "
-                "asks for; the robot's firmware and deal-hw disagree: update deal-hw"
-            )
-        length = self._lengths.most_common(1)[0][0]
-        if length != LOW_STATE_BYTES:
-            return WrongDeviceError(
-                f"go2: the messages on rt/lowstate have {length} bytes, those of a Go2 {LOW_STATE_BYTES}: "
-                "another robot type (G1 and H1 use this topic, too)? Choose the right robot or network"
-            )
-        return WrongDeviceError(f"go2: what comes on rt/lowstate is no state of a Go2: {self._refused}")
-
-    def _refuse(self, payload: bytes, error: FrameError) -> None:
-        self.errors += 1
-        self._refused = error
-        self._lengths[len(payload)] += 1
-        self._bad_crc += "checksum" in str(error)
+        return None if self.accepted or not self._refused.count else self._refused.error()
 
     def _keep_time(self, receive_ns: int, first: bool) -> None:
         offset = receive_ns - self.device_ns

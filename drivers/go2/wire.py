@@ -62,12 +62,13 @@ def low_state_image(payload: bytes) -> bytes:
     return payload[4:81] + b"\0\0\0" + payload[81:82] + b"\0\0\0" + payload[84:1176]
 
 
-def check_frame(payload: bytes, name: str) -> None:
+def check_frame(payload: bytes, name: str, *, head: bool = True) -> None:
     """Refuse a payload that is not a whole CDR message of this type.
 
     Args:
         payload: What came.
         name: "LowCmd" or "LowState".
+        head: Whether the message's own head counts.
 
     Raises:
         FrameError: Wrong length, header or head; says which.
@@ -86,7 +87,7 @@ def check_frame(payload: bytes, name: str) -> None:
             f"{name}: the CDR header is {payload[:4].hex(' ')}, expected {CDR_HEADER.hex(' ')} "
             "(version 1, little-endian)"
         )
-    if payload[4:6] != HEAD:
+    if head and payload[4:6] != HEAD:
         raise FrameError(f"{name}: the head is {payload[4:6].hex(' ')}, expected {HEAD.hex(' ')}")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from deal_hw.drivers.transports.dds_types import COMPLETE, UINT8, hash_text
+from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL, UINT8, hash_text
 from deal_hw.drivers.transports.interfaces import list_interfaces
 
 OUR_NOTE: Final = b"deal-hw"
@@ -89,6 +89,13 @@ class DdsEndpoint:
     writes: bool
     peer: DdsPeer
 
+    @property
+    def shown_hash(self) -> str:
+        """In words: the type's minimal hash where it is the robot's, as in the vendor's headers."""
+        if self.type_hash and self.type_hash == COMPLETE.get(self.type_name):
+            return f"type hash {MINIMAL[self.type_name]}, the robot's"
+        return f"complete type hash {self.type_hash}" if self.type_hash else "type hash not told"
+
     def complaint(self, type_name: str) -> str | None:
         """Return in words why this endpoint and a type of ours do not fit, None if they do."""
         role = f"{'writer' if self.writes else 'reader'} of {self.topic} ({self.peer})"
@@ -101,7 +108,8 @@ class DdsEndpoint:
                 f"{role}: declares octets as uint8, which crashes Cyclone DDS 0.10.2, the robot's version; "
                 "stop it and declare them as types.byte"
             )
-        return f"{role}: type hash {self.type_hash}, not {COMPLETE.get(type_name)}; is its firmware newer?"
+        known = COMPLETE.get(type_name)
+        return f"{role}: complete type hash {self.type_hash}, not {known}; is its firmware newer?"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from deal_hw.drivers.transports.dds_types import load_types
 from deal_hw.drivers.transports.interfaces import find_interface
 from deal_hw.errors import (
     ConfigurationError,
+    FrameError,
     TransportError,
     TransportLostError,
     TransportTimeoutError,
@@ -87,7 +88,8 @@ class DdsTransport(TopicTransport):
         """Write at once.
 
         Raises:
-            ConfigurationError: The topic is not declared, or the payload is no message of its type.
+            ConfigurationError: The topic is not declared.
+            FrameError: The payload is no message of the topic's type.
             TransportTimeoutError: A peer confirms nothing and the queue is full; after 1 ms.
         """
         live = self._opened()
@@ -128,11 +130,11 @@ class DdsTransport(TopicTransport):
         return self._live
 
 
-def _send_error(message: Message, code: int) -> TransportError | ConfigurationError:
+def _send_error(message: Message, code: int) -> TransportError | FrameError:
     if code == _TIMEOUT:
         return TransportTimeoutError(f"{message.channel}: a peer confirms nothing and the queue is full")
     if code == _BAD_PARAMETER:
-        return ConfigurationError(
+        return FrameError(
             f"{message.channel}: {len(message.payload)} bytes starting {message.payload[:4].hex(' ')!r} are "
             f"no {TYPES[message.channel]} in CDR with its 4-byte header"
         )

@@ -8,7 +8,9 @@ import pytest
 
 from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan
+from deal_hw.clock import VirtualClock
 from deal_hw.control.posture import PostureConfig
+from deal_hw.drivers import make_robot
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
 
@@ -32,12 +34,19 @@ def test_what_is_given_wins() -> None:
         **plan_options(
             "go2",
             LinkOptions(transport="zenoh", record_wire=False, wire=wire),
-            LegOptions(stand=False, velocity="remote", hand_back=True, posture=posture, stop_buttons="R2+A"),
+            LegOptions(
+                stand=False,
+                velocity="remote",
+                hand_back=True,
+                posture=posture,
+                stop_buttons="R2+A",
+                support_check=False,
+            ),
         )
     )
     assert plan == RunPlan(
         robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=False, velocity="remote",
-        hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A"},
+        hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A", "support_check": False},
     )  # fmt: skip
 
 
@@ -47,3 +56,14 @@ def test_a_robot_without_a_driver_is_refused() -> None:
         plan_options("so101", LinkOptions(), LegOptions())
     with pytest.raises(UnknownNameError, match="go3"):
         plan_options("go3", LinkOptions(), LegOptions())
+
+
+def test_the_drivers_own_settings_are_carried_where_they_were_given() -> None:
+    """As the driver's keyword arguments; a robot whose driver knows no such setting refuses them."""
+    options = plan_options("go2", LinkOptions(state_check="length"), LegOptions(support_check=False))
+    settings = options["robot_settings"]
+    assert settings == {"support_check": False, "state_check": "length"}
+    clock = VirtualClock()
+    assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, settings).info is None  # type: ignore[attr-defined]
+    with pytest.raises(ConfigurationError, match="no setting of support_check, state_check"):
+        make_robot("cartpole", "serial", "/dev/ttyUSB0", clock, None, settings)

@@ -11,7 +11,7 @@ import pytest
 from deal_hw.drivers.go2.topics import LOW_COMMAND, TYPES
 from deal_hw.drivers.transports import dds_discovery
 from deal_hw.drivers.transports.dds_discovery import DdsEndpoint, DdsPeer, _unicast, _vendor
-from deal_hw.drivers.transports.dds_types import COMPLETE, UINT8
+from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL, UINT8
 
 NAME = TYPES[LOW_COMMAND]
 KEY = uuid.UUID("01102866-bb83-421f-7037-3285000001c1")
@@ -59,6 +59,19 @@ def test_a_fitting_endpoint_gives_no_complaint() -> None:
     """The robot's own type, and one that tells no hash."""
     assert endpoint().complaint(NAME) is None
     assert endpoint(type_hash="").complaint(NAME) is None
+
+
+@pytest.mark.parametrize(
+    ("end", "shown"),
+    [
+        (endpoint(), f"type hash {MINIMAL[NAME]}, the robot's"),
+        (endpoint(type_hash="00" * 14), f"complete type hash {'00' * 14}"),
+        (endpoint(type_hash=""), "type hash not told"),
+    ],
+)
+def test_the_hash_shown_is_that_of_the_docs_and_the_headers(end: DdsEndpoint, shown: str) -> None:
+    """Peers tell the complete hash; the page for people and the vendor's headers have the minimal one."""
+    assert end.shown_hash == shown
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from deal_hw.drivers.transports.dds_types import load_types
 from deal_hw.drivers.transports.interfaces import Interface
 from deal_hw.errors import (
     ConfigurationError,
+    FrameError,
     MissingExtraError,
     PortNotFoundError,
     TransportError,
@@ -105,7 +106,7 @@ def test_a_topic_without_a_known_type_is_refused() -> None:
 @pytest.mark.parametrize("data", [b"", HEADER, payload("rt/lowcmd", 1)[:-1]])
 def test_a_payload_that_is_no_message_of_the_type_is_refused(domain: int, data: bytes) -> None:
     """Cyclone checks the bytes against the type before they reach a robot."""
-    with make(domain, publish=("rt/lowcmd",)) as wire, pytest.raises(ConfigurationError, match="LowCmd_"):
+    with make(domain, publish=("rt/lowcmd",)) as wire, pytest.raises(FrameError, match="LowCmd_"):
         wire.send(Message("rt/lowcmd", data, 0))
 
 

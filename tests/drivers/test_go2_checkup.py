@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -14,6 +15,7 @@ from deal_hw.drivers.go2.checkup import Checkup
 from deal_hw.drivers.go2.device import Go2Device
 from deal_hw.drivers.go2.faults import FaultPlan
 from deal_hw.drivers.go2.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.refusals import StateCheck
 from deal_hw.drivers.go2.rpc import decode_response, encode_response
 from deal_hw.drivers.go2.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
@@ -56,6 +58,7 @@ def examine(
     tamper: Tamper = lambda topic, payload: (payload,),
     said: dict[int, tuple[str, bytes]] | None = None,
     others: tuple[str, ...] = (),
+    state_check: StateCheck = "strict",
     **options: Any,
 ) -> list[Finding]:
     """Return the findings on an emulated Go2, without sport mode, with a remote, unless told otherwise."""
@@ -63,7 +66,7 @@ def examine(
     device = Go2Device(nominal_truth(), **{"sport": "", "remote": (), **options})
     wire = Wire(Air(device, tamper, said or {}), clock)
     wire.known = others
-    return list(Checkup(wire, clock, 1.0).run())
+    return list(Checkup(wire, clock, 1.0, state_check).run())
 
 
 def only(findings: Iterable[Finding], area: str, word: str) -> Finding:
@@ -117,7 +120,43 @@ def test_no_states_is_said_with_what_to_look_at() -> None:
 def test_another_robot_on_the_topic_is_said() -> None:
     """Messages that are no Go2 states are counted, with the reason."""
     findings = examine(tamper=lambda topic, p: (p[:-4],) if topic == topics.LOW_STATE else (p,))
-    assert only(findings, "states", "no Go2 states").level is Level.FAIL
+    (found,) = [f for f in findings if f.area == "states"]
+    assert found.level is Level.FAIL and "1176 bytes" in found.message and "G1" in found.remedy
+
+
+def other_rule(topic: str, payload: bytes) -> Iterable[bytes]:
+    """Turn a bit of each checksum."""
+    return (payload[:-1] + bytes([payload[-1] ^ 1]),) if topic == topics.LOW_STATE else (payload,)
+
+
+def test_another_checksum_rule_is_one_finding() -> None:
+    """However many states there are, each with a checksum of its own; it names the switch and its risk."""
+    (found,) = [f for f in examine(tamper=other_rule) if f.area == "states"]
+    assert found.level is Level.FAIL
+    assert re.match(
+        r"\d+ of \d+ messages on rt/lowstate \(100\.0%\) .*the first: .*checksum is 0x", found.message
+    )
+    assert "--state-check length" in found.remedy and "corrupted" in found.remedy
+
+
+def test_with_the_switch_another_rule_is_a_warning() -> None:
+    """What the states say is examined all the same."""
+    findings = examine(tamper=other_rule, state_check="length")
+    assert only(findings, "states", "not checked").level is Level.WARN
+    assert only(findings, "states", "states a second").level is Level.OK
+
+
+def test_a_few_corrupt_states_are_a_warning() -> None:
+    """One in two hundred: it works, but worse than it could."""
+    count = 0
+
+    def rarely(topic: str, payload: bytes) -> Iterable[bytes]:
+        nonlocal count
+        count += topic == topics.LOW_STATE
+        return other_rule(topic, payload) if count % 200 == 0 else (payload,)
+
+    found = only(examine(tamper=rarely), "states", "no Go2 states")
+    assert (found.level, "cable" in found.remedy) == (Level.WARN, True)
 
 
 def test_a_clock_that_stands_still_is_said() -> None:

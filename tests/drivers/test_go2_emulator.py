@@ -18,7 +18,7 @@ from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.device import Go2Device
 from deal_hw.drivers.go2.emulator import Go2Emulator
-from deal_hw.drivers.go2.faults import Go2Faults
+from deal_hw.drivers.go2.faults import SHARES, FaultPlan, Go2Faults
 from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, decode_low_state
 from deal_hw.drivers.go2.rpc import Request, decode_response, encode_request
 from deal_hw.drivers.go2.sport_controller import STANDING
@@ -156,6 +156,32 @@ def test_a_cut_wire_does_not_stop_the_robot() -> None:
     bench.run(11)
     # Six states, and one copy at the slow rate.
     assert bench.emulator.report()["unsent"] == 7
+
+
+@pytest.mark.parametrize("transport", ["dds", "zenoh"])
+@pytest.mark.parametrize(
+    "shares", [{"corrupt": 0.6}, dict.fromkeys(SHARES, 1.0), dict.fromkeys(SHARES[1:], 1.0)]
+)
+def test_its_own_faults_do_not_end_it(transport: str, shares: dict[str, float], dds_domain: int) -> None:
+    """On a real wire, whatever bytes are changed: what the wire refuses is counted, the robot goes on."""
+    pytest.importorskip({"dds": "cyclonedds", "zenoh": "zenoh"}[transport])
+    clock = VirtualClock(5_000 * MS)
+    device = Go2Device(nominal_truth(), sport="", plan=FaultPlan(**shares))  # type: ignore[arg-type]
+    port = free_port({"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:0"}[transport])
+    wire = make_transport(transport, port, WireOptions(domain=dds_domain, listen=transport == "zenoh"))
+    emulator = Go2Emulator(device, wire, clock)
+    emulator.open()
+    try:
+        # At a share of 0.6, one state in 500 has another CDR header, which DDS refuses.
+        for _ in range(4000):
+            emulator.step()
+    finally:
+        emulator.close()
+    report = emulator.report()
+    assert report["device_ms"] == 4000
+    faults = report["wire_faults"]
+    assert faults["drop"] == 2000 if "drop" in shares else faults["corrupt"] >= 1000
+    assert (report["unsent"] > 0) == (transport == "dds" and "drop" not in shares)
 
 
 def test_the_summary_says_what_happened() -> None:

@@ -150,7 +150,7 @@ def test_any_flipped_bit_of_a_state_is_found(bit: int, at: int) -> None:
     else:
         with pytest.raises(FrameError, match="checksum"):
             decode_low_state(changed)
-        assert not decode_low_state(changed, check_crc=False).crc_checked
+        assert not decode_low_state(changed, strict=False).crc_checked
 
 
 def test_padding_of_a_foreign_serialiser_is_ignored() -> None:

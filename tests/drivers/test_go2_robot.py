@@ -20,6 +20,7 @@ from deal_hw.errors import (
     TransportError,
     TransportLostError,
     TransportTimeoutError,
+    UnknownNameError,
     VersionMismatchError,
     WrongDeviceError,
 )
@@ -228,20 +229,65 @@ def test_a_state_with_nan_passes() -> None:
     """It is sound as a message; what to do about it is the safety module's decision."""
     wire = ScriptedBench(mode="")
     wire.robot.connect()
+    wire.robot.home(5.0)
     wire.device.pose[4] = np.nan
     assert np.isnan(drained(wire.robot, 2)[-1].position[4])
-    wire.robot.home(5.0)
     wire.robot.arm(1.0)
     assert all(np.isfinite(command.position).all() for _, command in wire.device.heard)
 
 
-def test_checksums_can_be_left_alone() -> None:
-    """For a robot whose firmware makes others."""
+def ruled_otherwise(payload: bytes) -> list[bytes]:
+    """Make a state as a simulator does that leaves head and checksum out."""
+    return [payload[:4] + bytes(2) + payload[6:-4] + bytes(4)]
+
+
+def lenient(change: Callable[[bytes], Iterable[bytes]]) -> tuple[ScriptedBench, Go2Robot]:
+    """Return a wire whose states are changed, and a driver that looks at their length only."""
     wire = ScriptedBench(mode="")
-    robot = Go2Robot(wire.topics, wire.clock, check_crc=False)
-    wire.topics.tamper = lambda topic, payload: [payload[:-1] + b"\x55"]
+    wire.topics.tamper = lambda topic, payload: change(payload) if topic == topics.LOW_STATE else (payload,)
+    return wire, Go2Robot(wire.topics, wire.clock, state_check="length")
+
+
+def test_head_and_checksum_can_be_left_alone() -> None:
+    """For firmware and simulators that make others: such a robot is armed, and obeys."""
+    wire, robot = lenient(ruled_otherwise)
     robot.connect()
+    robot.home(5.0)
+    robot.arm(1.0)
     assert robot.read_state(0.1).position.shape == (12,)
+    assert robot.link_errors == 0 and len(wire.device.heard) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda payload: [payload + bytes(4)], "1184 bytes"),
+        (lambda payload: [payload[4:] + bytes(4)], "C struct|CDR header"),
+        (lambda payload: [b"\0\0" + payload[2:]], "CDR header"),
+    ],
+    ids=["length", "struct", "encoding"],
+)
+def test_length_and_encoding_count_whatever_is_left_alone(
+    change: Callable[[bytes], Iterable[bytes]], match: str
+) -> None:
+    """Without them there is nothing to read."""
+    with pytest.raises(WrongDeviceError, match=match):
+        lenient(change)[1].connect()
+
+
+def test_the_clock_counts_whatever_is_left_alone() -> None:
+    """A simulator that leaves the tick at 0, too, is still refused."""
+    wire, robot = lenient(ruled_otherwise)
+    wire.device.tick_step = 0
+    with pytest.raises(TransportTimeoutError, match="clock stands still"):
+        robot.connect()
+
+
+def test_an_unknown_check_is_refused() -> None:
+    """By its name, with those there are."""
+    wire = ScriptedBench()
+    with pytest.raises(UnknownNameError, match="strict, length"):
+        Go2Robot(wire.topics, wire.clock, state_check="crc")  # type: ignore[arg-type]
 
 
 # Commands.
@@ -406,12 +452,12 @@ def test_another_process_can_make_it_passive() -> None:
 
 
 def test_the_hung_robot_is_another_description() -> None:
-    """Same wire; no floor, no tilt limit, the gains of the suspended recording."""
+    """Same wire; no floor, a level stand, the gains of the suspended recording."""
     wire = ScriptedBench(Go2HungRobot, mode="")
     robot = wire.armed()
     assert robot.description.name == "go2_hung"
     assert robot.description.floating_base is None
-    assert robot.description.limits.legs is not None and np.isinf(robot.description.limits.legs.tilt)
+    assert robot.description.limits.legs is not None and robot.description.limits.legs.tilt == 0.35
     assert robot.description.stiffness == (20.0,) * 12
 
 
@@ -431,7 +477,12 @@ def test_recorded_bytes_can_be_decoded_again() -> None:
     assert ("rx", "LowStateFrame") in kinds and ("tx", "LowCommand") in kinds
 
 
-def test_a_changed_layout_asks_for_an_update() -> None:
-    """States of the right length without one right checksum."""
-    with pytest.raises(VersionMismatchError, match=r"checksum.*update deal-hw"):
-        scripted(flip).connect()
+@pytest.mark.parametrize("change", [flip, ruled_otherwise], ids=["checksum", "head"])
+def test_another_rule_is_said_with_the_switch_and_its_risk(
+    change: Callable[[bytes], Iterable[bytes]],
+) -> None:
+    """States of the right length without one right checksum, or head: update, or leave both out."""
+    with pytest.raises(
+        VersionMismatchError, match=r"another rule.*update deal-hw.*--state-check length.*true"
+    ):
+        scripted(change).connect()

@@ -1,0 +1,297 @@
+"""What carries a Go2: the floor, or a stand that holds its body in the air.
+
+The two are different robots to deal-hw (``go2``, ``go2_hung``), and commands for one are dangerous to the
+other. No sensor tells which it is. Two quantities do: how far the feet reach below the base, along gravity,
+and the force that the legs carry, by the drives' estimated efforts.
+
+- Legs that carry half of the weight stand on the floor.
+- Folded legs are those of a robot that lies. Legs that were folded when the robot was lifted look the same.
+- Feet that reach below the belly and carry nothing are those of a body that something else holds.
+
+Whatever is between is undecided. The foot force sensors count only against "held": on robots of this family
+they drift, and some report 0 (unitree_legged_sdk, issues 34, 50 and 86).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.control.leg_checks import UNIT_TOLERANCE, tilt
+from deal_hw.drivers.go2.driven import HELD_TILT_RAD
+from deal_hw.drivers.go2.leg_geometry import WEIGHT_N, foot_loads, foot_positions
+from deal_hw.drivers.go2.low_state import LowState, LowStateFrame
+from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
+from deal_hw.types import FloatArray
+
+GRAVITY_M_S2: Final = 9.81
+_PATIENCE_S: Final = 3.0
+"""How long a robot may take to be still [s]."""
+
+
+class Support(enum.Enum):
+    """What carries the robot."""
+
+    FLOOR = "floor"
+    """It stands or lies on the floor."""
+    HELD = "held"
+    """Something holds its body; its feet are free."""
+    UNDECIDED = "undecided"
+    """The states do not tell."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SupportConfig:
+    """Where the lines are drawn. Figures of the emulator: docs/go2.md; no real robot was measured."""
+
+    window_s: float = 0.3
+    """States of this time are judged by their median [s]."""
+
+    least_states: int = 50
+    """Fewer states in that time say nothing."""
+
+    level_rad: float = HELD_TILT_RAD
+    """A body that leans more is neither well laid down nor well hung up [rad]."""
+
+    joint_rad_s: float = 0.5
+    """A faster joint moves; the noise of a real one at rest is a tenth of that [rad/s]."""
+
+    body_rad_s: float = 0.5
+    """A body that turns faster swings; forces say nothing then [rad/s]."""
+
+    force_m_s2: float = 1.0
+    """The specific force may differ from gravity by this [m/s²]."""
+
+    sensors_rad: float = 0.2
+    """Orientation and specific force may differ by this about where down is [rad]."""
+
+    held_reach_m: float = 0.16
+    """Three feet of a hanging robot reach further below the base than this. At 0.35 rad of tilt the trunk's
+    lowest point is 0.12 m below it [m]."""
+
+    lying_reach_m: float = 0.125
+    """The feet of a lying robot reach no further on average; 0.10 m in the vendor's rest pose [m]."""
+
+    unloaded: float = 0.25
+    """Legs that carry less than this share of the weight carry nothing; 1 N·m of friction in each knee looks
+    like 0.2 of it."""
+
+    loaded: float = 0.5
+    """Legs that carry more than this share of the weight stand on something."""
+
+    foot_pressed: float = 60.0
+    """A foot sensor above this is pressed, whatever its offset: free ones may show 30 [sensor units]."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            if not getattr(self, entry.name) > 0:
+                raise ConfigurationError(f"{entry.name} must be positive, got {getattr(self, entry.name)}")
+        if not (self.unloaded < self.loaded and self.lying_reach_m < self.held_reach_m):
+            raise ConfigurationError("unloaded is less than loaded, and lying_reach_m than held_reach_m")
+
+
+@dataclass(frozen=True, slots=True)
+class SupportReading:
+    """What some states tell.
+
+    Attributes:
+        support: What carries the robot.
+        seen: What was seen, in words.
+        remedy: What to do about states that do not tell; "" for those that do.
+    """
+
+    support: Support
+    seen: str
+    remedy: str = ""
+
+
+def read_support(
+    states: Sequence[LowState | LowStateFrame], config: SupportConfig | None = None
+) -> SupportReading:
+    """Return what carries the robot, by the states of a short while.
+
+    Args:
+        states: In order of time.
+        config: Where the lines are drawn.
+    """
+    config = config or SupportConfig()
+    if len(states) < config.least_states:
+        return _undecided(f"only {len(states)} states came within {config.window_s:g} s", "check the cable")
+    position = np.median([state.position for state in states], axis=0)
+    effort = np.median([state.effort for state in states], axis=0)
+    orientation = np.median([state.orientation for state in states], axis=0)
+    force = np.median([state.specific_force for state in states], axis=0)
+    joint_speed = float(np.max(np.abs(np.median([state.velocity for state in states], axis=0))))
+    body_speed = float(np.linalg.norm(np.median([state.angular_velocity for state in states], axis=0)))
+    values = np.concatenate((position, effort, orientation, force, (joint_speed, body_speed)))
+    if not np.isfinite(values).all() or abs(float(orientation @ orientation) - 1.0) > UNIT_TOLERANCE:
+        return _undecided("a joint, an effort or the inertial sensor gives no number", "restart the robot")
+    doubt = _unsteady(orientation, force, joint_speed, body_speed, config)
+    if doubt is not None:
+        return doubt
+    up = _up(orientation)
+    reach = -foot_positions(position) @ up
+    load = float((foot_loads(position, effort) @ up).sum())
+    feet = np.median([state.foot_force for state in states], axis=0)
+    return _judge(reach, load, feet, config)
+
+
+def _judge(reach: FloatArray, load: float, feet: FloatArray, config: SupportConfig) -> SupportReading:
+    """Judge feet that reach so far below the base (4,) [m], a load [N] and foot sensors (4,)."""
+    # Second to last, not least: one leg may have been left folded.
+    third, mean = float(np.sort(reach)[1]), float(reach.mean())
+    carried = f"its legs carry {load:.0f} N of its {WEIGHT_N:.0f} N"
+    if load > config.loaded * WEIGHT_N:
+        return SupportReading(Support.FLOOR, carried)
+    if mean < config.lying_reach_m:
+        return SupportReading(
+            Support.FLOOR, f"its legs are folded: its feet reach {mean:.2f} m below its body"
+        )
+    seen = f"its feet reach {mean:.2f} m below its body, and {carried}"
+    if abs(load) > config.unloaded * WEIGHT_N:
+        return _undecided(
+            seen, "raise the stand until the feet are free, or lower the robot until it lies on the floor"
+        )
+    if third < config.held_reach_m:
+        return _undecided(
+            seen, "on the floor: fold its legs until it lies on its belly; on a stand: pull its legs down"
+        )
+    if (pressed := int(np.sum(feet > config.foot_pressed))) >= 2:
+        return _undecided(
+            f"{seen}, but the sensors of {pressed} feet are pressed",
+            "raise the stand until the feet are free",
+        )
+    return SupportReading(Support.HELD, seen)
+
+
+def _unsteady(
+    orientation: FloatArray, force: FloatArray, joint_speed: float, body_speed: float, config: SupportConfig
+) -> SupportReading | None:
+    """Return why forces and geometry say nothing; None where the robot is level and still."""
+    size = float(np.linalg.norm(force))
+    if joint_speed > config.joint_rad_s or body_speed > config.body_rad_s or (
+        abs(size - GRAVITY_M_S2) > config.force_m_s2
+    ):  # fmt: skip
+        return _undecided(
+            f"it moves: a joint at {joint_speed:.1f} rad/s, the body at {body_speed:.1f} rad/s, "
+            f"specific force {size:.1f} m/s²",
+            "wait until it is still",
+        )
+    if (lean := tilt(orientation)) > config.level_rad:
+        return _undecided(
+            f"it leans by {lean:.2f} rad, more than {config.level_rad:g} rad",
+            "lay it down level, or level the stand",
+        )
+    if (apart := float(np.arccos(np.clip(_up(orientation) @ force / size, -1.0, 1.0)))) > config.sensors_rad:
+        return _undecided(
+            f"orientation and specific force differ by {apart:.2f} rad about where down is",
+            "restart the robot level and at rest, or calibrate its inertial sensor in the vendor's app",
+        )
+    return None
+
+
+def _undecided(seen: str, remedy: str) -> SupportReading:
+    return SupportReading(Support.UNDECIDED, seen, remedy)
+
+
+def _up(orientation: FloatArray) -> FloatArray:
+    """Return the vertical in the base's frame, (3,)."""
+    w, x, y, z = orientation
+    return np.array((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
+
+
+class SupportGuard:
+    """Refuses a robot that is carried by something else than its description says.
+
+    Args:
+        name: The robot's name in deal-hw.
+        expected: FLOOR or HELD.
+        clock: For waiting.
+        pump: Receives one message, waiting at most so long [s]; TransportTimeoutError where none comes.
+        config: Where the lines are drawn; None: nothing is checked.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        expected: Support,
+        clock: Clock,
+        pump: Callable[[float], None],
+        config: SupportConfig | None,
+    ) -> None:
+        self._name, self._expected, self._clock, self._pump = name, expected, clock, pump
+        self._config = config
+        self._states: list[LowStateFrame] | None = None
+
+    def take(self, state: LowStateFrame) -> None:
+        """Take a new state; it counts while states are being judged."""
+        if self._states is not None:
+            self._states.append(state)
+
+    def before_release(self) -> None:
+        """Refuse what must not be released from its own controller.
+
+        On a stand that needs certainty: a robot that stands on the floor would fall. A robot for the floor is
+        laid down first, so only one that surely hangs is refused.
+
+        Raises:
+            SafetyError: The robot is carried by something else, or, for a stand, it is not sure.
+        """
+        if self._expected is Support.HELD:
+            self.require()
+        elif self._config is not None and (found := self._read(self._config)).support is Support.HELD:
+            raise SafetyError(self._refusal(found))
+
+    def require(self) -> None:
+        """Return once the robot is still and carried by what is expected.
+
+        Raises:
+            SafetyError: It is carried by something else, or for 3 s it was not sure by what.
+        """
+        if self._config is None:
+            return
+        deadline_ns = self._clock.now_ns() + round(_PATIENCE_S * 1e9)
+        while (found := self._read(self._config)).support is not self._expected:
+            if found.support is not Support.UNDECIDED or self._clock.now_ns() >= deadline_ns:
+                raise SafetyError(self._refusal(found))
+
+    def _read(self, config: SupportConfig) -> SupportReading:
+        """Receive new states for the window's length, and judge them."""
+        states: list[LowStateFrame] = []
+        until_ns = self._clock.now_ns() + round(config.window_s * 1e9)
+        self._states = states
+        try:
+            while (left_ns := until_ns - self._clock.now_ns()) > 0:
+                with contextlib.suppress(TransportTimeoutError):
+                    self._pump(left_ns * 1e-9)
+        finally:
+            self._states = None
+        return read_support(states, config)
+
+    def _refusal(self, found: SupportReading) -> str:
+        floor = self._expected is Support.FLOOR
+        skip = "To go without this check: --no-support-check"
+        if found.support is Support.UNDECIDED:
+            where = "lies on the floor" if floor else "is held in the air"
+            return (
+                f"{self._name}: it is not sure that the robot {where}: {found.seen}. Nothing was commanded. "
+                f"What to do: {found.remedy}. {skip}"
+            )
+        if floor:
+            return (
+                f"{self._name}: something holds the robot in the air: {found.seen}. `{self._name}` is the "
+                "robot on the floor: it would stand up and walk in the air. Lay it on the floor, or take the "
+                f"robot `go2_hung`. {skip}"
+            )
+        return (
+            f"{self._name}: the robot is on the floor: {found.seen}. `{self._name}` lets go of it as it "
+            "stands, and moves its legs as if nothing could touch them: it would fall. Hang it up with its "
+            "feet free (if it hangs already, pull its legs down by hand), or take the robot `go2`. "
+            f"{skip}"
+        )

@@ -1,0 +1,286 @@
+"""What carries a Go2, floor or stand: the judgement on states, and the driver's refusal."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deal_hw.clock import VirtualClock
+from deal_hw.control.passive import make_passive
+from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.description import DESCRIPTION, JOINTS, LEGS, joint_ranges
+from deal_hw.drivers.go2.device import HANGING, Go2Device
+from deal_hw.drivers.go2.leg_geometry import (
+    WEIGHT_N,
+    efforts_under,
+    foot_jacobians,
+    foot_loads,
+    foot_positions,
+)
+from deal_hw.drivers.go2.low_state import LowState, decode_low_state
+from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
+from deal_hw.drivers.go2.scripted import RESTING, STANDING, ScriptedBench, ScriptedGo2
+from deal_hw.drivers.go2.support import Support, SupportConfig, read_support
+from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
+from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.errors import ConfigurationError, SafetyError
+from deal_hw.types import FloatArray
+
+STARTS = pytest.mark.parametrize(
+    ("start", "sport"), [("lying", "normal"), ("lying", ""), ("standing", "normal")]
+)
+POSES = st.tuples(*(st.floats(low, high) for low, high in joint_ranges())).map(np.array)
+
+
+# Geometry.
+
+
+@given(POSES)
+def test_feet_are_where_the_model_has_them(pose: FloatArray) -> None:
+    """In any pose, by the simulator; the model's feet are 2 mm behind the calf's line."""
+    model = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
+    data = mujoco.MjData(model)
+    data.qpos[:7] = (0, 0, 1, 1, 0, 0, 0)
+    data.qpos[[model.joint(name).qposadr[0] for name in JOINTS]] = pose
+    mujoco.mj_kinematics(model, data)
+    feet = np.array([data.geom(f"{leg}_foot").xpos for leg in LEGS]) - (0, 0, 1)
+    np.testing.assert_allclose(foot_positions(pose), feet, atol=2.1e-3)
+
+
+@given(POSES)
+def test_jacobians_are_the_derivatives(pose: FloatArray) -> None:
+    """By central differences."""
+    for joint in range(12):
+        step = np.zeros(12)
+        step[joint] = 1e-6
+        moved = (foot_positions(pose + step) - foot_positions(pose - step)) / 2e-6
+        expected = np.zeros((4, 3))
+        expected[joint // 3] = foot_jacobians(pose)[joint // 3, :, joint % 3]
+        np.testing.assert_allclose(moved, expected, atol=1e-8)
+
+
+@given(POSES, st.lists(st.floats(-100, 100), min_size=12, max_size=12))
+def test_loads_and_efforts_are_each_others_inverse(pose: FloatArray, forces: list[float]) -> None:
+    """Wherever the leg is not stretched along the line from hip to foot."""
+    loads = np.array(forces).reshape(4, 3)
+    if np.abs(np.linalg.det(foot_jacobians(pose))).min() > 1e-3:
+        np.testing.assert_allclose(foot_loads(pose, efforts_under(pose, loads)), loads, atol=1e-8)
+
+
+def test_the_weight_is_the_models() -> None:
+    """15.2 kg."""
+    model = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
+    assert float(model.body_mass.sum()) * 9.81 == pytest.approx(WEIGHT_N, rel=0.005)
+
+
+# The judgement.
+
+
+def states(pose: FloatArray, *, load: float = 0.0, count: int = 150, **changes: Any) -> list[LowState]:
+    """Return states of a level robot at rest whose feet carry a load together [N]."""
+    effort = efforts_under(pose, np.array([[0.0, 0.0, load / 4]] * 4))
+    return [dataclasses.replace(ScriptedGo2(pose=pose).state(), effort=effort, **changes)] * count
+
+
+def leaning(angle: float, axis: int = 0) -> dict[str, FloatArray]:
+    """Return orientation and specific force of a body that leans [rad]: 0 to its side, 1 forwards."""
+    orientation = np.zeros(4)
+    orientation[0], orientation[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+    sideways = np.array((0.0, 1.0, 0.0) if axis == 0 else (-1.0, 0.0, 0.0))
+    force = 9.81 * (math.cos(angle) * np.array((0.0, 0.0, 1.0)) + math.sin(angle) * sideways)
+    return {"orientation": orientation, "specific_force": force}
+
+
+ONE_FOLDED = np.concatenate((HANGING[:9], RESTING[9:]))
+HALF_FOLDED = np.tile((-0.82, 0.83, -2.59, 0.82, 0.83, -2.59), 2)
+"""Where friction leaves the legs of an emulated robot that is lifted while it lies."""
+CASES: dict[str, tuple[Support, list[LowState]]] = {
+    "lying": (Support.FLOOR, states(RESTING)),
+    "lying, sport mode still stiff": (Support.FLOOR, states(RESTING, load=50.0)),
+    "lying as seen on a robot": (Support.FLOOR, states(np.tile((0.0, 1.25, -2.81), 4))),
+    "lying, leaning a little": (Support.FLOOR, states(RESTING, **leaning(0.3))),
+    "standing": (Support.FLOOR, states(STANDING, load=WEIGHT_N)),
+    "standing, dead foot sensors": (
+        Support.FLOOR, states(STANDING, load=WEIGHT_N, foot_force=np.zeros(4, np.int64))
+    ),
+    "standing, efforts read a third low": (Support.FLOOR, states(STANDING, load=0.67 * WEIGHT_N)),
+    "hanging": (Support.HELD, states(HANGING)),
+    "hanging, held in the standing pose": (Support.HELD, states(STANDING, load=-12.0)),
+    "hanging, feet sensors with offsets": (
+        Support.HELD, states(HANGING, foot_force=np.array((30, 17, 22, 0)))
+    ),
+    "hanging, one sensor stuck": (Support.HELD, states(HANGING, foot_force=np.array((400, 0, 0, 0)))),
+    "hanging, one leg left folded": (Support.HELD, states(ONE_FOLDED)),
+    "hanging, leaning a little": (Support.HELD, states(HANGING, **leaning(0.3, axis=1))),
+    "hanging, legs left half folded": (Support.UNDECIDED, states(HALF_FOLDED)),
+    "feet on the floor, half in a sling": (Support.UNDECIDED, states(STANDING, load=0.4 * WEIGHT_N)),
+    "legs pulled down": (Support.UNDECIDED, states(STANDING, load=-0.4 * WEIGHT_N)),
+    "limp legs on the floor": (
+        Support.UNDECIDED, states(STANDING, foot_force=np.array((90, 80, 20, 20)))
+    ),
+    "on its side": (Support.UNDECIDED, states(STANDING, **leaning(1.5))),
+    "the reported case": (Support.UNDECIDED, states(RESTING, **leaning(0.85))),
+    "on its back": (Support.UNDECIDED, states(STANDING, **leaning(3.1))),
+    "swinging": (Support.UNDECIDED, states(HANGING, angular_velocity=np.array((0.0, 0.6, 0.0)))),
+    "walking": (Support.UNDECIDED, states(STANDING, load=WEIGHT_N, velocity=np.full(12, 2.0))),
+    "falling": (Support.UNDECIDED, states(STANDING, specific_force=np.array((0.0, 0.0, 1.0)))),
+    "orientation upside down": (
+        Support.UNDECIDED, states(HANGING, specific_force=np.array((0.0, 0.0, -9.81)))
+    ),
+    "orientation frozen": (
+        Support.UNDECIDED, states(HANGING, specific_force=leaning(0.3)["specific_force"])
+    ),
+    "no orientation": (Support.UNDECIDED, states(HANGING, orientation=np.zeros(4))),
+    "a broken encoder": (Support.UNDECIDED, states(np.where(np.arange(12) == 4, np.nan, HANGING))),
+    "few states": (Support.UNDECIDED, states(HANGING, count=49)),
+    "no states": (Support.UNDECIDED, []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_truth_table(name: str) -> None:
+    """Each situation has its answer, and what does not tell comes with what to do."""
+    expected, given_states = CASES[name]
+    found = read_support(given_states)
+    assert found.support is expected, found
+    assert bool(found.remedy) == (expected is Support.UNDECIDED)
+
+
+@given(st.floats(-0.5, 1.5), st.sampled_from((HANGING, STANDING)))
+def test_the_load_decides_where_the_legs_are_down(share: float, pose: FloatArray) -> None:
+    """Below a quarter of the weight nothing is carried, above half it stands, between nobody knows."""
+    found = read_support(states(pose, load=share * WEIGHT_N)).support
+    if min(abs(abs(share) - 0.25), abs(share - 0.5)) < 1e-6:
+        return
+    expected = Support.FLOOR if share > 0.5 else Support.HELD if abs(share) < 0.25 else Support.UNDECIDED
+    assert found is expected
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("angle", "support"), [(0.34, Support.HELD), (0.36, Support.UNDECIDED)])
+def test_a_stand_is_level(axis: int, angle: float, support: Support) -> None:
+    """To 0.35 rad, in any direction, as in the run that follows."""
+    assert read_support(states(HANGING, **leaning(angle, axis))).support is support
+
+
+@pytest.mark.parametrize(
+    "changes", [{"window_s": 0.0}, {"loaded": 0.2}, {"held_reach_m": 0.1}, {"level_rad": math.nan}]
+)
+def test_settings_that_mean_nothing_are_refused(changes: dict[str, float]) -> None:
+    """Neither negative, nor in the wrong order."""
+    with pytest.raises(ConfigurationError):
+        SupportConfig(**changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("profile", ["sensor", "realistic"])
+@pytest.mark.parametrize("suspended", [False, True])
+@STARTS
+def test_an_emulated_robot_is_told_with_a_margin(
+    profile: str, suspended: bool, start: Any, sport: str
+) -> None:
+    """Noise, encoder bias and friction move nothing near a line: half the distance to each is left."""
+    device = Go2Device(draw_truth(profile, 3), suspended=suspended, start=start, sport=sport)
+    sent = device.advance_to(800_000_000)
+    frames = [decode_low_state(payload) for topic, payload in sent if topic == topics.LOW_STATE][-150:]
+    tight = SupportConfig(
+        held_reach_m=0.25, lying_reach_m=0.08, unloaded=0.12, loaded=0.75, foot_pressed=30.0, level_rad=0.1,
+        joint_rad_s=0.4, body_rad_s=0.2, force_m_s2=0.3, sensors_rad=0.1,
+    )  # fmt: skip
+    assert read_support(frames, tight).support is (Support.HELD if suspended else Support.FLOOR)
+
+
+# The driver.
+
+
+def rig(kind: type[Go2Robot], device: Go2Device, **settings: Any) -> tuple[Go2Robot, VirtualClock]:
+    """Return a driver in front of an emulated robot, connected."""
+    clock = VirtualClock(10**9)
+    robot = kind(VirtualTopics(device, clock), clock, **settings)
+    robot.connect()
+    return robot, clock
+
+
+@STARTS
+def test_a_stand_is_refused_by_the_floors_robot(start: Any, sport: str) -> None:
+    """Nothing is commanded, sport mode keeps the robot, and being made passive sends nothing either."""
+    device = Go2Device(draw_truth("realistic", 1), suspended=True, start=start, sport=sport)
+    robot, clock = rig(Go2Robot, device)
+    with pytest.raises(SafetyError, match=r"holds the robot in the air.*go2_hung.*--no-support-check"):
+        robot.home(20.0)
+    make_passive(robot, clock)
+    assert (device.log.accepted, device.sport_name) == (0, sport)
+    with pytest.raises(SafetyError, match="home"):
+        robot.arm(1.0)
+
+
+@STARTS
+def test_the_floor_is_refused_by_the_stands_robot(start: Any, sport: str) -> None:
+    """Before its controller lets go: a robot that is released while it stands falls."""
+    device = Go2Device(draw_truth("realistic", 1), start=start, sport=sport)
+    height = device.base_height
+    robot, _ = rig(Go2HungRobot, device)
+    with pytest.raises(SafetyError, match=r"on the floor.*take the robot `go2`"):
+        robot.home(20.0)
+    assert (device.log.accepted, device.sport_name) == (0, sport)
+    assert device.base_height == pytest.approx(height, abs=0.01)
+
+
+@pytest.mark.parametrize(("kind", "suspended"), [(Go2Robot, False), (Go2HungRobot, True)])
+@pytest.mark.parametrize("start", ["lying", "standing"])
+def test_where_robot_and_model_agree_it_is_armed(kind: type[Go2Robot], suspended: bool, start: Any) -> None:
+    """Released from sport mode, lying or hanging."""
+    device = Go2Device(draw_truth("realistic", 2), suspended=suspended, start=start)
+    robot, _ = rig(kind, device)
+    robot.home(20.0)
+    robot.arm(1.0)
+    assert device.sport_name == ""
+
+
+def test_the_check_can_be_left_out() -> None:
+    """For whoever tries a policy in the air, and knows it."""
+    robot, _ = rig(Go2Robot, Go2Device(nominal_truth(), suspended=True, sport=""), support_check=False)
+    robot.home(20.0)
+    robot.arm(1.0)
+
+
+def test_a_robot_that_swings_is_waited_for() -> None:
+    """Until it is still, but not for ever; then the message says what to do."""
+    wire = ScriptedBench(Go2HungRobot, mode="")
+    wire.robot.connect()
+    wire.device.changes = {"angular_velocity": np.array((0.0, 0.7, 0.0))}
+    with pytest.raises(SafetyError, match=r"not sure.*is held in the air: it moves.*wait until it is still"):
+        wire.robot.home(10.0)
+    left, state = iter(range(300)), wire.device.state
+
+    def calming() -> LowState:
+        if next(left, None) is None:
+            wire.device.changes = {}
+        return state()
+
+    wire.device.state = calming  # type: ignore[method-assign]
+    wire.robot.home(10.0)
+    wire.robot.arm(1.0)
+
+
+def test_a_robot_that_is_lifted_while_sport_mode_lets_go_is_refused() -> None:
+    """What is judged before the release is judged again after it."""
+    wire = ScriptedBench()
+    wire.robot.connect()
+    serve = wire.device.serve
+
+    def lift(service: str, request: Any) -> tuple[int, str]:
+        if (service, request.api) == ("motion_switcher", 1003):
+            wire.device.pose = HANGING.copy()
+        return serve(service, request)
+
+    wire.device.serve = lift  # type: ignore[method-assign]
+    with pytest.raises(SafetyError, match="holds the robot in the air"):
+        wire.robot.home(10.0)
+    assert wire.device.mode == "" and wire.device.heard == []

@@ -1,0 +1,66 @@
+"""How clearly the emulated Go2 shows what carries it: the figures behind ``deal_hw.drivers.go2.support``.
+
+    python tools/measure_go2_support.py
+
+prints a table with the range over seeds and profiles of what decides, for each situation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+
+import numpy as np
+
+from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.device import Go2Device
+from deal_hw.drivers.go2.leg_geometry import foot_loads, foot_positions
+from deal_hw.drivers.go2.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.support import read_support
+from deal_hw.drivers.go2.truth import draw_truth
+
+SITUATIONS = {
+    "lying, limp": {"sport": ""},
+    "lying, sport mode": {"sport": "normal"},
+    "standing, sport mode": {"start": "standing"},
+    "hanging, limp": {"suspended": True, "sport": ""},
+    "hanging, sport mode damps": {"suspended": True},
+    "hanging, sport mode stands": {"suspended": True, "start": "standing"},
+}
+WINDOW_MS = 300
+
+
+def window(device: Go2Device, after_ms: int) -> list[LowStateFrame]:
+    """Return the states of 0.3 s, so long after the start."""
+    sent = device.advance_to((after_ms + WINDOW_MS) * 1_000_000)
+    states = [decode_low_state(payload) for topic, payload in sent if topic == topics.LOW_STATE]
+    return states[-WINDOW_MS // 2 :]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    options = parser.parse_args()
+    print("| situation | answers | reach [m] | third foot [m] | load [N] | foot sensors | fastest joint |")
+    print("|---|---|---|---|---|---|---|")
+    for name, settings in SITUATIONS.items():
+        rows, answers = [], set()
+        for profile, seed in itertools.product(("sensor", "realistic"), range(options.seeds)):
+            states = window(Go2Device(draw_truth(profile, seed), **settings), 500)  # type: ignore[arg-type]
+            answers.add(read_support(states).support.value)
+            position = np.median([state.position for state in states], axis=0)
+            effort = np.median([state.effort for state in states], axis=0)
+            reach = -foot_positions(position)[:, 2]
+            speed = np.abs(np.median([state.velocity for state in states], axis=0)).max()
+            feet = np.median([state.foot_force for state in states], axis=0)
+            rows.append(
+                (reach.mean(), np.sort(reach)[1], foot_loads(position, effort)[:, 2].sum(), feet.max(), speed)
+            )
+        low, high = np.min(rows, axis=0), np.max(rows, axis=0)
+        cells = [f"{a:.{n}f} to {b:.{n}f}" for a, b, n in zip(low, high, (3, 3, 1, 0, 2), strict=True)]
+        print(f"| {name} | {', '.join(sorted(answers))} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
