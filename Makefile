@@ -13,6 +13,7 @@ BENCH_ARGS ?= --profile sensor --seeds 0,1 --out runs/bench/loop.json
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
+SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw/control/passive.py,deal_hw/control/supervisor.py,deal_hw/control/vigil.py,deal_hw/control/claim.py
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
@@ -53,14 +54,14 @@ check: $(STAMP) typing coverage-safety ## format, lint, types, import order and 
 	$(BIN)/python -m pytest -q tests/house/test_layers.py
 
 # The repository's own coverage settings measure everything; here every line and branch of a few files counts.
-coverage-safety: $(STAMP) ## each line and branch of the safety module is tested
+coverage-safety: $(STAMP) ## each line and branch of the safety module and of the exit path is tested
 	@mkdir -p build
 	$(BIN)/coverage run $(SAFETY_COVERAGE) --branch \
-	  --include='deal_hw/control/safety*.py,deal_hw/control/leg_checks.py' \
-	  -m pytest -q tests/control/test_control_safety*.py
+	  --include='$(SAFETY_FILES)' \
+	  -m pytest -q tests/control/test_control_safety*.py tests/control/test_control_exit*.py
 	$(BIN)/coverage report $(SAFETY_COVERAGE) --show-missing --fail-under=100
 
-mutation: $(STAMP) ## change the safety module in 900 places; each change must break a test (10 minutes)
+mutation: $(STAMP) ## change safety module and exit path, place by place; each change must break a test (30 minutes)
 	$(BIN)/python tools/mutate_safety.py
 
 bench: $(STAMP) ## a small benchmark; BENCH_ARGS chooses another

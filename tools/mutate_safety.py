@@ -1,6 +1,6 @@
-"""Mutation run over the safety module: `make mutation`.
+"""Mutation run over the safety module and the exit path: `make mutation`.
 
-mutmut changes the module in one place after another and runs the safety tests against each change. A change
+mutmut changes them in one place after another and runs their tests against each change. A change
 that no test notices survives. Survivors must stand in docs/safety-mutation.md with the reason why they may;
 any other fails the run.
 
@@ -10,6 +10,7 @@ rest of deal_hw (drivers) comes from the installed package.
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -20,13 +21,22 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 WORK = ROOT / "build" / "mutation"
 PAGE = ROOT / "docs" / "safety-mutation.md"
-MUTATED = ("deal_hw/control/safety*.py", "deal_hw/control/leg_checks.py")
-TESTS = "tests/control/test_control_safety*.py"
+SETS = {
+    "safety": (
+        ("deal_hw/control/safety*.py", "deal_hw/control/leg_checks.py"),
+        "tests/control/test_control_safety*.py",
+    ),
+    "exit": (
+        tuple(f"deal_hw/control/{name}.py" for name in ("passive", "supervisor", "vigil", "claim")),
+        "tests/control/test_control_exit*.py",
+    ),
+}
+"""What is changed, and the tests that must notice; each set is a run of its own."""
 SURVIVED = ("survived", "no tests", "suspicious", "skipped")
-CONFIGURATION = f"""
+CONFIGURATION = """
 [tool.mutmut]
 source_paths = ["deal_hw/"]
-only_mutate = {list(MUTATED)!r}
+only_mutate = {mutated!r}
 pytest_add_cli_args_test_selection = ["tests"]
 use_git_change_detection = false
 # A busy machine must not make a test look as if it had noticed a change.
@@ -39,14 +49,14 @@ filterwarnings = ["error"]
 """
 
 
-def prepare() -> None:
+def prepare(mutated: tuple[str, ...], tests: str) -> None:
     """Copy what mutmut needs."""
     shutil.rmtree(WORK, ignore_errors=True)
     (WORK / "tests").mkdir(parents=True)
     shutil.copytree(ROOT / "deal_hw", WORK / "deal_hw", ignore=shutil.ignore_patterns("__pycache__"))
-    for test in ROOT.glob(TESTS):
+    for test in ROOT.glob(tests):
         shutil.copy(test, WORK / "tests")
-    (WORK / "pyproject.toml").write_text(CONFIGURATION)
+    (WORK / "pyproject.toml").write_text(CONFIGURATION.format(mutated=list(mutated)))
 
 
 def mutmut(*arguments: str) -> str:
@@ -75,8 +85,16 @@ def change(mutant: str) -> tuple[str, str]:
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("sets", nargs="*", metavar="SET", help=f"of {', '.join(SETS)}; all by default")
+    chosen = parser.parse_args().sets or list(SETS)
     os.nice(10)
-    prepare()
+    return max([run(*SETS[name]) for name in chosen])
+
+
+def run(mutated: tuple[str, ...], tests: str) -> int:
+    """Run one set; return 1 where a survivor is not argued."""
+    prepare(mutated, tests)
     children = str(max((os.cpu_count() or 2) - 1, 1))
     mutmut("run", "--max-children", children)
     found = verdicts()

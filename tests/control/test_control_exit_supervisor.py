@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import socket
 import threading
@@ -278,8 +279,8 @@ class Recorder:
         self.released = 0
 
     def errors(self) -> tuple[str, ...]:
-        """Return what went wrong."""
-        return self._errors
+        """Return what went wrong, once a cycle has come."""
+        return self._errors if select.select([self.far], [], [], 0)[0] else ()
 
     def release(self) -> None:
         """Close our copy."""
