@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.control.clock_check import judge_clock
@@ -39,6 +39,7 @@ def test_drift_has_its_level_and_remedy(drift: float, level: Level) -> None:
     assert found is level and bool(remedy) == (level is not Level.OK)
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.5, 10.0))
 def test_delays_are_no_drift(seed: int, seconds: float) -> None:
     """However late messages come, and however short it was listened."""
