@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,8 +14,9 @@ from typing import Any, Literal
 import tyro
 
 from deal_hw.cli.doctor_machine import examine_machine
+from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_topic_transport
+from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
@@ -32,7 +35,7 @@ class Doctor:
     """The robot to listen to, such as go2."""
 
     port: str = ""
-    """Where it is: a network interface (dds) or an endpoint (zenoh)."""
+    """Where it is: a network interface (dds), an endpoint (zenoh) or a serial port."""
 
     transport: str = ""
     """How it is reached; by default the robot's usual way."""
@@ -79,7 +82,7 @@ def doctor(config: Doctor) -> DoctorReport:
 
     Raises:
         UnknownNameError: There is no such robot.
-        ConfigurationError: The robot has no checks of its own.
+        ConfigurationError: The robot is not reached that way.
     """
     found: list[Finding] = []
     area = ""
@@ -87,9 +90,9 @@ def doctor(config: Doctor) -> DoctorReport:
         if finding.area != area:
             area = finding.area
             print(area)
-        print(f"  {_MARKS[finding.level]}  {finding.message}", flush=True)
+        print(_wrapped(f"  {_MARKS[finding.level]}  ", finding.message), flush=True)
         if finding.remedy:
-            print(f"        -> {finding.remedy}")
+            print(_wrapped("        -> ", finding.remedy))
         found.append(finding)
     report = DoctorReport(findings=tuple(found))
     if config.json is not None:
@@ -100,21 +103,29 @@ def doctor(config: Doctor) -> DoctorReport:
     return report
 
 
+def _wrapped(lead: str, text: str) -> str:
+    """Return a text after its lead, in lines that the terminal holds."""
+    width = shutil.get_terminal_size().columns
+    return textwrap.fill(
+        text, max(width, 60), initial_indent=lead, subsequent_indent=" " * len(lead), break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+
+
 def _examine(config: Doctor) -> Iterator[Finding]:
     yield from examine_machine()
     yield from _interfaces(config.port)
     if not config.robot:
         return
     name = config.transport or default_transport(config.robot)
-    if name not in TOPIC_TRANSPORTS:
-        raise ConfigurationError(
-            f"`doctor` can listen to robots on a network ({', '.join(TOPIC_TRANSPORTS)}), not over {name}; "
-            "`deal-hw deploy --dry-run` checks the link to this one"
-        )
-    from deal_hw.drivers.go2.checkup import Checkup
-
     clock = MonotonicClock()
     try:
+        if name not in TOPIC_TRANSPORTS:
+            robot = make_robot(config.robot, name, config.port, clock, config.wire)
+            yield from examine_robot(config.robot, robot, clock, config.seconds)
+            return
+        from deal_hw.drivers.go2.checkup import Checkup
+
         link = make_topic_transport(name, config.port, clock, config.wire)
         yield from Checkup(link, clock, config.seconds, config.state_check).run()
     except DealHwError as error:
@@ -131,4 +142,12 @@ def _interfaces(port: str) -> Iterator[Finding]:
         elif not interface.multicast and not interface.loopback and interface.up:
             level = Level.WARN
             remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
+        elif (
+            not interface.multicast and interface.loopback and port in (interface.name, *interface.addresses)
+        ):
+            level = Level.NOTE
+            remedy = (
+                "deal-hw's own programs meet here; programs on the vendor's SDK find nothing until "
+                f"`ip link set {interface.name} multicast on`"
+            )
         yield Finding("interfaces", level, str(interface), remedy)

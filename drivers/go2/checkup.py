@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.control.clock_check import judge_clock
 from deal_hw.control.leg_checks import tilt
 from deal_hw.drivers.go2 import topics
 from deal_hw.drivers.go2.low_state import LowStateFrame, decode_low_state
@@ -205,8 +206,8 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
             "states", Level.NOTE,
             f"{missing} states lost and {back} repeated or out of order of {len(heard.ticks)}",
         )  # fmt: skip
-    drift = (sum(steps.tolist()) * 1e-3) / ((heard.stamps[-1] - heard.stamps[0]) * 1e-9) - 1.0
-    yield Finding("states", Level.OK, f"robot's clock against ours: {drift * 100:+.2f} %")
+    device_ms = np.concatenate(((0,), np.cumsum(steps.astype(np.int64))))
+    yield judge_clock(np.array(heard.stamps), 1_000_000 * device_ms)
 
 
 def _judge_refused(refused: Refusals, sound: int) -> Finding:

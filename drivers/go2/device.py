@@ -64,8 +64,7 @@ class Go2Device:
     Args:
         truth: Hidden parameters, profile, seed.
         suspended: Whether the base is held in the air.
-        start: Lying limp on the floor (suspended: limp legs hang down), or standing with sport mode in
-            control.
+        start: Limp, lying or with its legs hanging down, or standing with sport mode in control.
         sport: Name of the sport mode that is active at power-up; "" for none.
         sport_on_wire: Whether sport mode's own commands are seen on ``rt/lowcmd``.
         plan: What goes wrong.
@@ -85,7 +84,7 @@ class Go2Device:
         remote: Sequence[RemoteMoment] | None = (),
         tick_ms: int = 0,
     ) -> None:
-        self._truth, self._suspended = truth, suspended
+        self._truth = truth
         self._profile = profile = find_profile(truth.profile)
         self._plan = plan or FaultPlan()
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0x602]).spawn(4)]
@@ -123,7 +122,7 @@ class Go2Device:
         self._bad_requests = 0
         self._largest_tilt = 0.0
         self.log = CommandLog()
-        self._begin(start)
+        self._begin(start, HANGING if suspended else LYING)
 
     @property
     def device_ns(self) -> int:
@@ -250,10 +249,9 @@ class Go2Device:
 
     # What happens in a tick.
 
-    def _begin(self, start: str) -> None:
+    def _begin(self, start: str, limp: FloatArray) -> None:
         """Settle in the start posture; device time does not move."""
         sim, drives, controller = self._sim, self._drives, self._sport.controller
-        limp = HANGING if self._suspended else LYING
         sim.set_pose(STANDING if start == "standing" else limp, 0.34 if start == "standing" else 0.13)
         if start == "standing":
             controller.take(Posture.STANDING, STANDING, -10_000)

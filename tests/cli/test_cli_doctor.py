@@ -10,13 +10,21 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deal_hw.cli import doctor as verb
 from deal_hw.cli import doctor_machine as machine
 from deal_hw.cli.doctor import Doctor, doctor
+from deal_hw.cli.doctor_serial import examine_robot
+from deal_hw.clock import VirtualClock
+from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Level
+from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 
 
 def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[Level]:
@@ -33,7 +41,8 @@ def test_this_computer_is_examined(capsys: pytest.CaptureFixture[str], tmp_path:
     assert json.loads(out.read_text()) == [f.to_json() for f in report.findings]
     assert all(f.remedy for f in report.findings if f.level in (Level.WARN, Level.FAIL))
     said = capsys.readouterr()
-    assert all(f.message in said.out for f in report.findings)
+    words = " ".join(said.out.split())
+    assert all(" ".join(f.message.split()) in words for f in report.findings)
     assert "all is well" in said.err or "worst:" in said.err
 
 
@@ -71,21 +80,21 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[str]) -> None:
     """A wrong endpoint or interface is told like everything else, and the exit code says so."""
-    for transport, port in (("zenoh", "tcp/127.0.0.1:1"), ("dds", "nope0")):
-        report = doctor(Doctor(robot="go2", transport=transport, port=port))
+    for robot, transport, port in (
+        ("go2", "zenoh", "tcp/127.0.0.1:1"), ("go2", "dds", "nope0"), ("cartpole", "", "/dev/ttyNONE7"),
+    ):  # fmt: skip
+        report = doctor(Doctor(robot=robot, transport=transport, port=port))
         assert report.exit_code == 1
         assert levels(report.findings, "link") == {Level.FAIL}
         assert port in capsys.readouterr().out
 
 
 def test_settings_that_do_not_fit_are_refused() -> None:
-    """A robot needs a port, a serial robot has no checks here, an unknown one is named."""
+    """A robot needs a port, an unknown one is named."""
     with pytest.raises(ConfigurationError, match="or neither"):
         Doctor(robot="go2")
     with pytest.raises(ConfigurationError, match=r"from 0\.5 to 600"):
         Doctor(seconds=0.0)
-    with pytest.raises(ConfigurationError, match="dry-run"):
-        doctor(Doctor(robot="cartpole", port="/dev/null"))
     with pytest.raises(UnknownNameError, match="go2"):
         doctor(Doctor(robot="gotwo", port="lo"))
 
@@ -103,5 +112,45 @@ def test_a_cable_that_is_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interfaces, "list_interfaces", lambda: known)
     found = list(verb._interfaces("192.168.123.99"))
     assert [f.level for f in found] == [Level.FAIL, Level.WARN, Level.OK]
+    (lo,) = [f for f in verb._interfaces("127.0.0.1") if f.message.startswith("lo ")]
+    assert (lo.level, "ip link set lo multicast on" in lo.remedy) == (Level.NOTE, True)
     assert "cable" in found[0].remedy
     assert "multicast on" in found[1].remedy
+
+
+def listened(drop: float = 0.0) -> list[Finding]:
+    """Return what is found on an emulated cart-pole that loses a share of its frames."""
+    clock = VirtualClock()
+    faults = FrameFaults(FaultRates(drop=drop), np.random.default_rng(0))
+    wire = FaultyTransport(
+        VirtualTransport(CartpoleDevice(nominal_truth("ideal")), clock), faults, clock=clock
+    )
+    return list(examine_robot("cartpole", CartpoleRobot(wire, clock), clock, 2.0))
+
+
+def test_a_serial_robot_is_greeted_and_listened_to() -> None:
+    """Who it is, its states, the link's errors and its clock; its motor stays off."""
+    found = listened()
+    assert {f.level for f in found} == {Level.OK}
+    text = "; ".join(f.message for f in found)
+    for words in ("firmware (", "200 states a second of 200", "0 of 40", "+0.00 %"):
+        assert words in text
+
+
+def test_a_bad_serial_cable_is_a_warning() -> None:
+    """A fifth of the frames lost: fewer states, and their share."""
+    found = [f for f in listened(0.2) if f.area == "states"]
+    assert [f.level for f in found] == [Level.WARN, Level.WARN, Level.OK]
+    assert all("cable" in f.remedy for f in found[:2])
+
+
+def test_what_is_printed_fits_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """80 columns, but for words that are longer; the second line of a remedy is below its first."""
+    long = Finding("states", Level.FAIL, "word " * 40, "remedy " * 30)
+    monkeypatch.setattr(verb, "_examine", lambda config: iter([long]))
+    monkeypatch.setenv("COLUMNS", "80")
+    assert doctor(Doctor()).exit_code == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80 and len(lines) == 1 + 3 + 3

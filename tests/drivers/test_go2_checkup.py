@@ -170,6 +170,19 @@ def test_a_clock_that_stands_still_is_said() -> None:
     assert only(examine(tamper=stale), "states", "stands still").level is Level.FAIL
 
 
+def test_a_clock_that_runs_fast_is_a_failure() -> None:
+    """By 9.55 %, as of a simulator that does not keep time."""
+
+    def fast(topic: str, payload: bytes) -> Iterable[bytes]:
+        if topic != topics.LOW_STATE:
+            return (payload,)
+        values = decode_low_state(payload).values()
+        return (encode_low_state(dataclasses.replace(values, tick_ms=round(values.tick_ms * 1.0955))),)
+
+    found = only(examine(tamper=fast), "states", "robot's clock against ours: +9.5")
+    assert found.level is Level.FAIL and "simulator" in found.remedy
+
+
 def test_lost_states_are_counted() -> None:
     """Every fifth state is lost: a warning about the rate, and the count of those missing."""
     count = 0

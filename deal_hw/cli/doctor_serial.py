@@ -1,0 +1,72 @@
+"""What `deal-hw doctor` looks at on a robot that is no Go2: who it is, its states, the link's errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.control.clock_check import judge_clock
+from deal_hw.errors import TransportTimeoutError
+from deal_hw.findings import Finding, Level
+from deal_hw.robot import Robot
+
+_FEW_ERRORS = 0.01
+"""Share of corrupt and missing states that a link may have."""
+_SLOW = 0.9
+_PATIENCE_S = 1.0
+
+
+def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iterator[Finding]:
+    """Yield what a robot tells while nothing is asked of its motors; connecting may switch them off.
+
+    Args:
+        name: The robot's name.
+        robot: Its driver, not connected.
+        clock: The clock of its stamps.
+        seconds: How long to listen [s].
+
+    Raises:
+        DealHwError: It cannot be reached, or is another device.
+    """
+    with robot:
+        yield Finding("link", Level.OK, f"{name} answers{_told(getattr(robot, 'info', None))}")
+        errors = robot.link_errors
+        host_ns: list[int] = []
+        device_ns: list[int] = []
+        end_ns = clock.now_ns() + round(seconds * 1e9)
+        while clock.now_ns() < end_ns:
+            try:
+                state = robot.read_state(min(_PATIENCE_S, seconds))
+            except TransportTimeoutError as error:
+                yield Finding("states", Level.FAIL, str(error), "is the device powered, is the cable good?")
+                return
+            host_ns.append(state.receive_ns)
+            device_ns.append(state.device_ns)
+        errors = robot.link_errors - errors
+    wanted_hz = robot.description.state_rate_hz
+    rate_hz = (len(host_ns) - 1) / max((host_ns[-1] - host_ns[0]) * 1e-9, 1e-9)
+    slow = rate_hz < _SLOW * wanted_hz
+    yield Finding(
+        "states", Level.WARN if slow else Level.OK, f"{rate_hz:.0f} states a second of {wanted_hz:.0f}",
+        "another cable or a less busy computer" if slow else "",
+    )  # fmt: skip
+    share = errors / (errors + len(host_ns))
+    bad = share > _FEW_ERRORS
+    yield Finding(
+        "states", Level.WARN if bad else Level.OK,
+        f"{errors} of {errors + len(host_ns)} states corrupt or lost ({share:.1%})",
+        "check cable, connectors and grounding" if bad else "",
+    )  # fmt: skip
+    yield judge_clock(np.array(host_ns), np.array(device_ns))
+
+
+def _told(info: Any) -> str:
+    """Return what a robot said of itself, where that is a dataclass, in words."""
+    if not dataclasses.is_dataclass(info) or isinstance(info, type):
+        return ""
+    words = (f"{name.replace('_', ' ')} {value}" for name, value in dataclasses.asdict(info).items())
+    return f": {', '.join(words)}"
