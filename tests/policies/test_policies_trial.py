@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -146,7 +147,8 @@ def test_an_endless_network_is_stopped(tmp_path: Path) -> None:
 def test_a_network_that_crashes_its_process_is_refused(file: Callable[..., Path]) -> None:
     """The signal that ended it is named."""
     with TrialPolicy(file()) as policy:
-        os.kill(policy.process_id, 11)
+        os.kill(policy.process_id, signal.SIGSEGV)
+        os.waitid(os.P_PID, policy.process_id, os.WEXITED | os.WNOWAIT)
         with pytest.raises(PolicyError, match=r"crashes the process that runs it \(signal SIGSEGV"):
             policy.act(np.zeros(4, dtype=np.float32))
 
