@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -142,6 +143,26 @@ def test_an_endless_network_is_stopped(tmp_path: Path) -> None:
             policy.act(np.array([1.0, 0.0, 0.0], dtype=np.float32))
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
+
+
+def test_an_endless_network_ends_with_the_process_that_asked(tmp_path: Path) -> None:
+    """Also where that one is killed and can end nobody."""
+    path = tmp_path / "endless.onnx"
+    write_policy(*faulty_policy(DRIVEN, "endless"), path)
+    code = (
+        "import sys; import numpy as np; from pathlib import Path; "
+        "from deal_hw.policies.trial import TrialPolicy; policy = TrialPolicy(Path(sys.argv[1])).__enter__(); "
+        "print(policy.process_id, flush=True); policy.act(np.ones(3, dtype=np.float32))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True) as asker:
+        assert asker.stdout is not None
+        child = os.pidfd_open(int(asker.stdout.readline()))
+        try:
+            asker.kill()
+            # Long before the limit of the processor's time, which would end it, too.
+            assert select.select([child], [], [], 10.0)[0]
+        finally:
+            os.close(child)
 
 
 def test_a_network_that_crashes_its_process_is_refused(file: Callable[..., Path]) -> None:
