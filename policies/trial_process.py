@@ -2,14 +2,15 @@
 
 Started as ``python -m deal_hw.policies.trial_process FD PARENT MEMORY_BYTES SECONDS FILE``: one end of a
 socket as inherited descriptor, the parent's process id, limits, and the policy. Messages are JSON. The first
-says what the file holds; then each list of observations is answered with actions and the time that they took
-[s]. What is wrong is answered as ``{"error": ...}``.
+says what the file holds; then each list of observations is answered with actions and the processor time that
+they took [s]. What is wrong is answered as ``{"error": ...}``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import resource
 import sys
@@ -29,7 +30,7 @@ def main() -> int:
     """Answer until the other end is closed; return the exit code."""
     fd, parent, memory, seconds, file = sys.argv[1:]
     die_with_parent(int(parent))
-    _limit(int(memory), float(seconds))
+    _limit(int(memory), int(seconds))
     with Connection(int(fd)) as connection, contextlib.suppress(EOFError, ConnectionError):
         try:
             policy = OnnxPolicy(Path(file))
@@ -39,9 +40,9 @@ def main() -> int:
             )
             while True:
                 observations = np.array(json.loads(connection.recv_bytes()), dtype=np.float32)
-                begun = time.perf_counter()
+                begun = time.process_time()
                 actions = policy.act_batch(observations)
-                took = time.perf_counter() - begun
+                took = time.process_time() - begun
                 _send(connection, {"actions": actions.tolist(), "seconds": took})
         except PolicyError as err:
             _send(connection, {"error": str(err)})
@@ -54,13 +55,13 @@ def _send(connection: Connection, message: dict[str, Any]) -> None:
     connection.send_bytes(json.dumps(message).encode())
 
 
-def _limit(memory: int, seconds: float) -> None:
+def _limit(memory: int, seconds: int) -> None:
     """Bound what the network may use, beyond what Python and onnxruntime use already."""
     in_use = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     for kind, limit in (
         (resource.RLIMIT_AS, in_use + memory),
-        # An endless network also ends where nobody is left to kill it.
-        (resource.RLIMIT_CPU, round(seconds) + 1),
+        # The kernel ends an endless network with SIGXCPU.
+        (resource.RLIMIT_CPU, math.ceil(time.process_time()) + seconds),
         (resource.RLIMIT_CORE, 0),
     ):
         hard = resource.getrlimit(kind)[1]

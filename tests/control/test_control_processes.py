@@ -21,6 +21,7 @@ import pytest
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
+from deal_hw.cli.link import LegOptions
 from deal_hw.cli.replay import Replay, replay
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import InterruptedRunError, RunReport, run_episodes
@@ -41,6 +42,7 @@ from deal_hw.errors import (
     SafetyError,
     WrongDeviceError,
 )
+from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.types import Status
 
@@ -452,9 +454,14 @@ def test_deploy_balances_with_a_policy_file(emulator: Emulator, tmp_path: Path) 
 
 
 def test_a_policy_that_returns_nan_trips_at_once(emulator: Emulator, tmp_path: Path) -> None:
-    """Nothing of it reaches the robot."""
-    policy = write_policy(tmp_path / "nan.onnx", (math.nan,) * 4)
-    report = deploy(Deploy(robot="cartpole", port=emulator.port, policy=policy, out=tmp_path, quiet=True))
+    """Nothing of it reaches the robot, where the trial of the policy did not meet the fault either."""
+    onnx_export = pytest.importorskip("deal_hw.policies.onnx_export")
+    policy = tmp_path / "nan.onnx"
+    onnx_export.write_policy(*faulty_policy(DESCRIPTION, "nan", rare=True), policy)
+    legs = LegOptions(velocity=f"{RARE_M_S},0,0")
+    report = deploy(
+        Deploy(robot="cartpole", port=emulator.port, policy=policy, legs=legs, out=tmp_path, quiet=True)
+    )
     assert (report.outcome, report.exit_code) == (Outcome.TRIPPED, 3)
     assert report.episodes[0].reason == "the policy asked for a command that is not finite"
     assert report.episodes[0].cycles_sent == 0

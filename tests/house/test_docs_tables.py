@@ -6,6 +6,7 @@ import dataclasses
 import enum
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -13,6 +14,7 @@ from deal_hw.cli.main import JOBS
 from deal_hw.control.safety_machine import SafetyFlags
 from deal_hw.data.record import CycleFlag
 from deal_hw.data.schemas import CHANNELS
+from deal_hw.policy import Quantity
 from deal_hw.types import Status
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,6 +24,14 @@ SOURCES = "\n".join(
     for path in [ROOT / "Makefile", *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))]
 )
 DATA_FORMAT = (ROOT / "docs" / "data-format.md").read_text(encoding="utf-8")
+
+
+def test_every_quantity_of_an_observation_has_its_unit() -> None:
+    """The table of policies from elsewhere names exactly the known quantities."""
+    page = (ROOT / "docs" / "how-to-add.md").read_text(encoding="utf-8").partition("| quantity | of |")[2]
+    rows = [line.split("|") for line in page.partition("\n\n")[0].splitlines()[2:]]
+    assert sorted(re.findall(r"`(\w+)`", " ".join(row[1] for row in rows))) == sorted(get_args(Quantity))
+    assert all(row[3].strip() for row in rows)
 
 
 @pytest.mark.parametrize("topic", CHANNELS)

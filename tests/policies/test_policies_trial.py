@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import select
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -130,23 +132,53 @@ def test_a_faulty_network_is_refused(tmp_path: Path, fault: Fault, words: str) -
 
 
 def test_an_endless_network_is_stopped(tmp_path: Path) -> None:
-    """After the time limit, and its process is gone."""
+    """After its share of processor time, and its process is gone."""
     path = tmp_path / "endless.onnx"
     write_policy(*faulty_policy(DRIVEN, "endless"), path)
-    settings = dataclasses.replace(BRIEF, time_limit_s=3.0)
+    settings = dataclasses.replace(BRIEF, processor_s=1)
     with TrialPolicy(path, settings) as policy:
         child = policy.process_id
         policy.act(np.zeros(3, dtype=np.float32))
-        with pytest.raises(PolicyError, match=r"gave no answer; .* stopped after 3 s, it loops for ever"):
+        with pytest.raises(
+            PolicyError, match=r"gave no answer within 1 s of processor time; it loops for ever"
+        ):
             policy.act(np.array([1.0, 0.0, 0.0], dtype=np.float32))
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
 
 
+def test_a_trial_that_takes_too_long_is_stopped(file: Callable[..., Path]) -> None:
+    """By the clock, whatever the reason: here the process was not even started when its time was over."""
+    settings = dataclasses.replace(BRIEF, time_limit_s=0.0)
+    with pytest.raises(PolicyError, match=r"stopped after 0 s; it is far too slow, or this computer is too"):
+        check_policy(file(), CARTPOLE, settings)
+
+
+def test_an_endless_network_ends_with_the_process_that_asked(tmp_path: Path) -> None:
+    """Also where that one is killed and can end nobody."""
+    path = tmp_path / "endless.onnx"
+    write_policy(*faulty_policy(DRIVEN, "endless"), path)
+    code = (
+        "import sys; import numpy as np; from pathlib import Path; "
+        "from deal_hw.policies.trial import TrialPolicy, TrialSettings; "
+        "policy = TrialPolicy(Path(sys.argv[1]), TrialSettings(processor_s=600)).__enter__(); "
+        "print(policy.process_id, flush=True); policy.act(np.ones(3, dtype=np.float32))"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True) as asker:
+        assert asker.stdout is not None
+        child = os.pidfd_open(int(asker.stdout.readline()))
+        try:
+            asker.kill()
+            assert select.select([child], [], [], 60.0)[0]
+        finally:
+            os.close(child)
+
+
 def test_a_network_that_crashes_its_process_is_refused(file: Callable[..., Path]) -> None:
     """The signal that ended it is named."""
     with TrialPolicy(file()) as policy:
-        os.kill(policy.process_id, 11)
+        os.kill(policy.process_id, signal.SIGSEGV)
+        os.waitid(os.P_PID, policy.process_id, os.WEXITED | os.WNOWAIT)
         with pytest.raises(PolicyError, match=r"crashes the process that runs it \(signal SIGSEGV"):
             policy.act(np.zeros(4, dtype=np.float32))
 
