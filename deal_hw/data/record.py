@@ -175,7 +175,7 @@ def decode(datagram: bytes) -> CycleRecord:
         raise ProtocolError(f"cycle record of {len(datagram)} bytes is corrupt or cut off: wrong CRC-32")
     try:
         return _decode_body(body)
-    except (struct.error, ValueError) as error:
+    except (struct.error, ValueError, RecursionError) as error:
         raise ProtocolError(
             f"cycle record of {len(datagram)} bytes does not hold what its head says: {error}"
         ) from error
