@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import random
 import struct
@@ -97,7 +98,7 @@ def damage_values(rng: random.Random, values: Any) -> Any:
     """Return plain values of which one, anywhere inside, is another; the given ones are changed in place."""
     holder, key = _somewhere(rng, values)
     if holder is None:
-        return rng.choice(_ODD_VALUES)
+        return copy.deepcopy(rng.choice(_ODD_VALUES))
     way = rng.randrange(6)
     if way == 0:
         del holder[key]
@@ -108,9 +109,9 @@ def damage_values(rng: random.Random, values: Any) -> Any:
     elif way == 2:
         holder[key] = _retyped(holder[key])
     elif way == 3:
-        holder[key] = [holder[key]] * rng.choice((1, 2, 1000))
+        holder[key] = [copy.deepcopy(holder[key]) for _ in range(rng.choice((1, 2, 100)))]
     else:
-        holder[key] = rng.choice(_ODD_VALUES)
+        holder[key] = copy.deepcopy(rng.choice(_ODD_VALUES))
     return values
 
 

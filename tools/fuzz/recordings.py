@@ -18,7 +18,7 @@ import zstandard
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
-from deal_hw.data.dataset import INDEX_NAME, Dataset
+from deal_hw.data.dataset import INDEX_NAME, Dataset, digest_of
 from deal_hw.data.episode_info import summarize
 from deal_hw.data.mcap_scan import Found, messages, scan
 from deal_hw.data.reader import read_episode, read_wire
@@ -31,7 +31,7 @@ from deal_hw.errors import DatasetError
 from deal_hw.transport import Message
 from deal_hw.types import BodyState, Event, JointCommand, RobotState, Status
 from fuzz.kind import FileKind, Kind
-from fuzz.mutations import damage_bytes, damage_json, flip, overwrite
+from fuzz.mutations import damage_bytes, damage_json, flip, mended, overwrite
 
 _CYCLE_NS = 20_000_000
 _EPISODE = "000001.mcap"
@@ -189,6 +189,15 @@ def make_indexes(folder: Path) -> list[bytes]:
     return found
 
 
+def _mend_digest(data: bytes) -> bytes:
+    """Return an index whose digest fits its description, where it can be told."""
+    with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        values = json.loads(data)
+        values["digest"] = digest_of(values["description"])
+        return json.dumps(values).encode()
+    return data
+
+
 def read_index(path: Path) -> None:
     """Open a dataset for reading and for collecting, and tell about it as `deal-hw data info` does."""
     from deal_hw.cli.data import Info, data
@@ -243,7 +252,9 @@ KINDS: dict[str, Kind] = {
     "mcap": _files(_EPISODE, make_episodes, read_damaged, damage_bytes),
     "mcap_hostile": _files(_EPISODE, make_episodes, read_hostile, forge),
     "mcap_stray": _files(f"episodes/{_EPISODE}", make_episodes, read_stray, damage_bytes, forge),
-    "dataset_json": _files(INDEX_NAME, make_indexes, read_index, damage_bytes, damage_json, damage_json),
+    "dataset_json": _files(
+        INDEX_NAME, make_indexes, read_index, damage_bytes, damage_json, mended(damage_json, _mend_digest)
+    ),
     "run_json": _files("run.json", make_run, read_run, damage_bytes, damage_json, damage_json),
     "excitation_json": _files("plan.json", make_plans, play_plan, damage_bytes, damage_json, damage_json),
 }
