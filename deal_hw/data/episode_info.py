@@ -14,6 +14,8 @@ from deal_hw.data.reader import Episode, read_episode
 from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError
 from deal_hw.schema import STRICT, short
 
+_MOST_JUMPS = 20
+"""So many jumps of a clock the index names; a recording of nothing else must not fill it."""
 _VERDICT = {"name", "severity", "message"}
 _CLOCK = {"offset_s", "drift_ppm", "offset_uncertainty_s", "drift_uncertainty_ppm"}
 
@@ -33,8 +35,8 @@ class EpisodeInfo:
         cycles: Control cycles.
         verdicts: The telemetry checks, as :meth:`deal_hw.data.checks.Verdict.to_json` writes them.
         excitation: Movement, as :meth:`deal_hw.data.excitation.Excitation.to_json` writes it.
-        clock: Relation of the clocks, as :meth:`deal_hw.data.clock_sync.ClockSync.to_json` writes it; None
-            where it cannot be told.
+        clock: Relation of the clocks, as :meth:`deal_hw.data.clock_sync.ClockSync.to_json` writes it, with 20
+            jumps at most; None where it cannot be told.
         note: What the operator should know, such as a repair.
         facts: What the collector adds: outcome, cadence, task, ...
 
@@ -117,6 +119,7 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
 
 def _clock(episode: Episode) -> Mapping[str, Any] | None:
     try:
-        return synchronize(episode.trajectory).to_json()
+        found = synchronize(episode.trajectory).to_json()
     except InsufficientDataError:
         return None
+    return {**found, "jumps": found["jumps"][:_MOST_JUMPS]}

@@ -1,8 +1,8 @@
 """Reads MCAP files that may be torn, damaged or made to harm, record by record, without trusting any of them.
 
 The readers of the mcap library stop at the first thing that is wrong; this one goes on with the next chunk,
-and says which byte ranges it could not use. Time is linear in the size of the file, and memory is bounded by
-:data:`MAX_CHUNK_BYTES`, whatever the bytes are.
+and says which byte ranges it could not use. Whatever the bytes are, time is linear in the size of the file,
+and so is what all chunks hold together (:data:`MAX_RATIO`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from mcap.writer import MCAP0_MAGIC
 MAX_CHUNK_BYTES = 16 << 20
 """Longest record, and the most that a chunk may hold [B]. The recorder closes a chunk at 1 MiB."""
 MAX_RATIO = 256
-"""A chunk may grow so many times when it is decompressed. A Go2 at rest that sends the same bytes all the
-time reaches 46."""
-_FREE_BYTES = 1 << 16
-"""So much a chunk may hold whatever its ratio [B]."""
+"""Decompressed, the chunks of a file may have so many times its size and one longest chunk besides. A Go2 at
+rest that sends the same bytes all the time reaches 46."""
 _TRIES = 4
 """Bytes of unusable records that are looked into, per byte of the file: a damaged chunk is met twice, in its
 place and in the search for the next one. Only a file of records that overlap each other needs more."""
@@ -125,6 +123,7 @@ class _Scanner:
         self._data = data
         self._view = memoryview(data)
         self._left = _TRIES * len(data) + MAX_CHUNK_BYTES
+        self._room = MAX_RATIO * len(data) + MAX_CHUNK_BYTES
         self._chunk: Found | None = None
         self._searched = 0
 
@@ -183,14 +182,34 @@ class _Scanner:
         if kind is None:
             sound = _is_message_index(body) if opcode == Opcode.MESSAGE_INDEX else opcode in _SUMMARY_ONLY
             return sound or "a record that makes no sense"
-        if kind is Chunk and not _is_chunk(body):
-            return "a chunk of a wrong length"
+        if kind is Chunk and (wrong := self._refuse_chunk(body)):
+            return wrong
         if len(body) > MAX_CHUNK_BYTES:
             return f"a {kind.__name__.lower()} of {len(body)} bytes (at most {MAX_CHUNK_BYTES} are read)"
         result = _read_chunk(body, offset) if kind is Chunk else _read_record(kind, body, offset)
         if isinstance(result, str):
             self._left -= len(body)
         return result
+
+    def _refuse_chunk(self, body: memoryview) -> str:
+        """Return in no time why a chunk is not worth decompressing; "" where it is."""
+        if len(body) < _CHUNK_HEAD.size:
+            return "a chunk of a wrong length"
+        _, _, size, _, name_size, name, packed_size = _CHUNK_HEAD.unpack_from(body)
+        # A length that grew would swallow the chunks behind it.
+        if (name_size, name) != (4, b"zstd") or len(body) != _CHUNK_HEAD.size + packed_size:
+            return "a chunk of a wrong length"
+        if size > min(MAX_CHUNK_BYTES, self._room):
+            return f"a chunk that announces {size} bytes in {packed_size}"
+        try:
+            # The decompressor takes the memory that the frame asks for, not what it is told to.
+            announced = zstandard.get_frame_parameters(body[_CHUNK_HEAD.size :]).content_size
+        except zstandard.ZstdError as error:
+            return _damaged(Chunk, error)
+        if announced not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            return "a chunk whose sizes contradict each other"
+        self._room -= size
+        return ""
 
     def _next_chunk(self, start: int) -> int | None:
         """Return where the next readable chunk starts, at or after ``start``, which never goes back."""
@@ -226,24 +245,10 @@ def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> Found
     return Found(offset, record) if same else _damaged(kind)
 
 
-def _is_chunk(body: memoryview) -> bool:
-    """Say in no time whether a chunk's lengths agree: one that grew would swallow the chunks behind it."""
-    if len(body) < _CHUNK_HEAD.size:
-        return False
-    *_, name_size, name, size = _CHUNK_HEAD.unpack_from(body)
-    return bool(name_size == 4 and name == b"zstd" and len(body) == _CHUNK_HEAD.size + size)
-
-
 def _read_chunk(body: memoryview, offset: int) -> Found | str:
     start_ns, end_ns, size, crc, *_ = _CHUNK_HEAD.unpack_from(body)
     packed = body[_CHUNK_HEAD.size :]
-    if size > min(MAX_CHUNK_BYTES, max(_FREE_BYTES, MAX_RATIO * len(packed))):
-        return f"a chunk that announces {size} bytes in {len(packed)}"
     try:
-        # The decompressor takes the memory that the frame asks for, not what it is told here.
-        announced = zstandard.get_frame_parameters(packed).content_size
-        if announced not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            return "a chunk whose sizes contradict each other"
         plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
         if len(plain) != size:
             return "a chunk whose sizes contradict each other"

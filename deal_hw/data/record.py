@@ -312,7 +312,10 @@ def _encode_event(event: Event) -> bytes:
 def _decode_event(cursor: _Cursor) -> Event:
     stamp_ns, kind, message, data = cursor.unpack(_EVENT)
     texts = cursor.text(kind), cursor.text(message)
-    return Event(stamp_ns, *texts, json.loads(cursor.take(data)) if data else {})
+    values = json.loads(cursor.take(data)) if data else {}
+    if not isinstance(values, dict):
+        raise ValueError(f"an event's data are a JSON {type(values).__name__}, no object")
+    return Event(stamp_ns, *texts, values)
 
 
 def _encode_message(message: Message) -> bytes:

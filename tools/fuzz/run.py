@@ -25,6 +25,10 @@ _HARD_BYTES = 6 << 30
 """Address space that a child may add before an allocation fails [B]."""
 
 
+_PATIENCE = 12
+"""An input may take so many times its processor time by the clock: other programs run, too."""
+
+
 class _HangError(BaseException):
     """The time of one input is up; no reader catches it."""
 
@@ -82,13 +86,14 @@ def _child(
             _STEP.pack_into(shared, 0, number, read, refused)
             data = make_input(kind, seeds, seed, number)
             # A hang inside C code never gets to the signal's handler: then the process ends.
-            faulthandler.dump_traceback_later(4 * limit_s, exit=True)
+            faulthandler.dump_traceback_later(2 * _PATIENCE * limit_s, exit=True)
             outcome = _outcome(kind, data, Path(folder) / "read", limit_s)
-            read, refused = read + (outcome == "read"), refused + (outcome == "refused")
-            grown = _peak() - base
-            if outcome not in ("read", "refused") or grown > limit_bytes:
-                failure = outcome if grown <= limit_bytes else f"{grown >> 20} MiB of memory ({outcome})"
+            if (grown := _peak() - base) > limit_bytes:
+                outcome = f"{grown >> 20} MiB of memory ({outcome})"
+            if outcome not in ("read", "refused"):
+                failure = outcome
                 break
+            read, refused = read + (outcome == "read"), refused + (outcome == "refused")
         _STEP.pack_into(shared, 0, number, read, refused)
     except BaseException:
         failure = f"the fuzzer itself failed\n{traceback.format_exc()}"
@@ -101,6 +106,7 @@ def _guard() -> None:
         raise _HangError
 
     signal.signal(signal.SIGALRM, ring)
+    signal.signal(signal.SIGPROF, ring)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (used + _HARD_BYTES, hard))
@@ -119,10 +125,12 @@ def _outcome(kind: Kind, data: bytes, folder: Path, limit_s: float) -> str:
         source.parent.mkdir(parents=True, exist_ok=True)
         source.write_bytes(data)
     try:
-        signal.setitimer(signal.ITIMER_REAL, limit_s)
+        signal.setitimer(signal.ITIMER_PROF, limit_s)
+        signal.setitimer(signal.ITIMER_REAL, _PATIENCE * limit_s)
         try:
             kind.read(source)  # type: ignore[arg-type]
         finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.setitimer(signal.ITIMER_REAL, 0)
     except _HangError:
         return f"more than {limit_s:g} s\n{traceback.format_exc()}"
