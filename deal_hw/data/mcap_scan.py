@@ -156,7 +156,8 @@ class _Scanner:
                 in_data_section = in_data_section and not isinstance(result.record, DataEnd)
                 if isinstance(result.record, Footer):
                     if self._view[end:] != MCAP0_MAGIC:
-                        yield Lost(end, len(data) - end, "the file does not end after its footer", torn=True)
+                        left = len(data) - end
+                        yield Lost(end, left, "bytes behind the footer", torn=left < len(MCAP0_MAGIC))
                     return
             offset = end
 

@@ -259,6 +259,7 @@ def test_bytes_behind_the_end_cost_nothing(write_episode: WriteEpisode, junk: by
     path = write_episode("appended.mcap", cycles=25)
     whole = path.read_bytes()
     path.write_bytes(whole + bytes(zeros) + junk)
+    assert verify(path).sound == (zeros + len(junk) == 0) and not verify(path).torn
     assert repair(path).messages == verify(path).messages
     assert contents(path.read_bytes()) == contents(whole)
     for file in path.parent.glob("appended.mcap*"):
