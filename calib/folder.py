@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.report.inputs import ReportInputs
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import write_json
 from deal_hw.errors import DatasetError
 from deal_hw.sim.calibrated_mjcf import write_calibrated_mjcf
 from deal_hw.sim.model import RobotModel
 
-RESULT = "result.json"
 DISTRIBUTION = "distribution.json"
 MODEL = "calibrated.xml"
 TRACE = "trace.npz"
@@ -40,10 +38,10 @@ def write_result(
         DatasetError: The folder cannot be written.
         ConfigurationError: A calibrated value cannot be written into the model; all other files are there.
     """
-    files = {name: folder / name for name in (RESULT, DISTRIBUTION, TRACE)}
+    files = {name: folder / name for name in (RESULT_FILE, DISTRIBUTION, TRACE)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(files[RESULT], result.to_json())
+        write_json(files[RESULT_FILE], result.to_json())
         write_json(files[DISTRIBUTION], result.distribution().to_json())
         keys = sorted({key for row in result.trace for key in row})
         columns: dict[str, Any] = {
@@ -67,18 +65,3 @@ def write_result(
     except OSError as err:
         raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
     return files
-
-
-def read_result(path: Path) -> CalibrationResult:
-    """Read a result from its file or its folder.
-
-    Raises:
-        DatasetError: There is none.
-    """
-    file = path / RESULT if path.is_dir() else path
-    try:
-        return CalibrationResult.from_json(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError) as err:
-        raise DatasetError(
-            f"{file} is not a calibration result ({err}); `deal-hw calibrate` writes one"
-        ) from err

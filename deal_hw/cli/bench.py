@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import platform
 import sys
@@ -19,7 +18,8 @@ from deal_hw.cli.bench_go2_transport import TransportBench
 from deal_hw.cli.calibrate_model import Recordings
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
-from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
+from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError, shown
+from deal_hw.reading import object_of, read_json, reading
 
 FORMAT = "deal_hw.bench/1"
 
@@ -273,16 +273,13 @@ def _line(row: Mapping[str, Any]) -> str:
 def _load(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+    with reading(path, "rows of a bench", "name another file"):
+        values = object_of(read_json(path))
         if values["format"] != FORMAT:
             raise DatasetError(
-                f"{path} has format {values['format']!r}, expected {FORMAT!r}; name another file"
+                f"{path} has format {shown(values['format'])}, not {FORMAT!r}; name another file"
             )
-        rows: list[dict[str, Any]] = values["rows"]
-    except (ValueError, KeyError, TypeError) as err:
-        raise DatasetError(f"{path} exists and is not a bench file ({err!r}); name another file") from err
-    return rows
+        return [dict(object_of(row, "a row")) for row in values["rows"]]
 
 
 def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

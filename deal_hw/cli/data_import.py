@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import tyro
 
 from deal_hw.cli.calibrate_checks import examine_recording
 from deal_hw.errors import ConfigurationError
+from deal_hw.reading import number, object_of, read_json, reading, texts
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
@@ -164,15 +164,15 @@ def _joint_facts(model: Path | None) -> JointFacts | None:
 
 
 def _description(path: Path) -> dict[str, Any]:
-    try:
-        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    with reading(
+        path, "a robot's description", "see `description` in a dataset.json", error=ConfigurationError
+    ):
+        values = object_of(read_json(path))
         missing = [key for key in ("name", "joint_names", "actuated", "state_rate_hz") if key not in values]
-    except OSError as error:
-        raise ConfigurationError(f"description {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ConfigurationError(f"description {path} is not JSON: {error}") from error
-    if missing:
-        raise ConfigurationError(
-            f"description {path} lacks {', '.join(missing)}; see `description` in a dataset.json"
-        )
-    return values
+        if missing:
+            raise ConfigurationError(f"it lacks {', '.join(missing)}; see `description` in a dataset.json")
+        texts([values["name"]], "name")
+        for key in ("joint_names", "actuated"):
+            texts(values[key], key)
+        number(values["state_rate_hz"], "state_rate_hz", 1e-3, 1e6)
+        return dict(values)

@@ -146,7 +146,7 @@ def _truth(config: Emulate) -> Truth:
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return Truth.from_json(read_truth(config.truth_from))
+        return read_truth(config.truth_from, Truth.from_json)
     return draw_truth(config.profile, config.seed, xi=CARTPOLE_XI if config.xi is None else config.xi)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import signal
 import tempfile
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.data.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import recorded_description
@@ -22,8 +21,6 @@ from deal_hw.sim.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
 from deal_hw.viz.episode_log import write_episode
 from deal_hw.viz.screenshot import save_screenshot
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
-
-RESULT_FILE = "result.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,23 +113,6 @@ def inspect(config: Inspect) -> InspectReport:
     if not config.quiet:
         _print(overlay, note, files)
     return InspectReport(overlay=overlay, note=note, files=files)
-
-
-def read_result(path: Path) -> CalibrationResult:
-    """Return a calibration result from its folder or file.
-
-    Raises:
-        ConfigurationError: It is not there or does not hold one.
-    """
-    file = path / RESULT_FILE if path.is_dir() else path
-    try:
-        return CalibrationResult.from_json(json.loads(file.read_text(encoding="utf-8")))
-    except OSError as err:
-        raise ConfigurationError(
-            f"{file} cannot be read: {err.strerror}; `deal-hw calibrate` writes it"
-        ) from err
-    except (KeyError, TypeError, ValueError) as err:
-        raise ConfigurationError(f"{file} does not hold a calibration result: {err!r}") from err
 
 
 def _overlay(

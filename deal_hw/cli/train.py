@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.reading import object_of, read_json, reading
 
 if TYPE_CHECKING:
     from deal_hw.description import SensorModel
@@ -156,14 +156,11 @@ def read_distribution(path: Path) -> ParameterDistribution:
     Raises:
         ConfigurationError: There is no such file, or it holds no distribution.
     """
-    try:
-        return ParameterDistribution.from_json(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as err:
-        raise ConfigurationError(
-            f"no such file: {path}; `deal-hw calibrate` writes calibration/distribution.json"
-        ) from err
-    except (ValueError, KeyError, TypeError, AttributeError) as err:
-        raise ConfigurationError(f"{path} holds no parameter distribution: {err}") from err
+    with reading(
+        path, "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json",
+        error=ConfigurationError,
+    ):  # fmt: skip
+        return ParameterDistribution.from_json(object_of(read_json(path)))
 
 
 def _space(robot: str) -> ParameterSpace:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.calib.folder import read_result
+from deal_hw.calibration import read_result
 from deal_hw.cli.calibrate import Calibrate, calibrate, make_space
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
