@@ -15,6 +15,10 @@ from deal_hw.parameters import LONGEST_LATENCY_S, ParameterDistribution, Paramet
 from deal_hw.reading import number, numbers, object_of, read_json, reading, texts
 from deal_hw.types import FloatArray
 
+LATENCY_RANGE_S = (0.0, 0.04)
+"""Total latencies that are searched, and that the simulator of a calibration can have [s]."""
+SHORTEST_S = 1.0
+"""Shortest recording that is calibrated from [s]."""
 RESULT_FILE = "result.json"
 RESULT_FORMAT = "deal_hw.calibration_result/1"
 Verdict = Literal["identifiable", "weak", "not identifiable"]

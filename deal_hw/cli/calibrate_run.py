@@ -16,6 +16,7 @@ import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.calibrate_live import open_checkpoint
+from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
@@ -245,8 +246,7 @@ def _positive(word: str) -> float:
         value = float(word)
     except ValueError as err:
         raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err
-    if not (np.isfinite(value) and value > 0):
-        raise ConfigurationError(f"--residual-std must be above 0, got {word}")
+    Range(1e-9, 1e3, "rad or m").check("--residual-std", value)
     return value
 
 

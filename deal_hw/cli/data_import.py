@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from deal_hw.cli.calibrate_checks import examine_recording
+from deal_hw.cli.options import Checked, Range, given, refuse
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, object_of, read_json, reading, texts
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Import:
+class Import(Checked):
     """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/import.md."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
@@ -34,7 +35,7 @@ class Import:
     """A robot description (JSON, as in dataset.json) to use instead of a minimal one."""
     name: str = ""
     """The robot's name; by default that of the model's or the first recording's file."""
-    device_periods: int = 1
+    device_periods: Annotated[int, Range(1, 100_000)] = 1
     """Device periods between two samples: the robot's own control rate over the recording's."""
     force: bool = False
     """Take recordings in although a check failed; what failed stays with them."""
@@ -71,12 +72,13 @@ def import_recordings(config: Import) -> int:
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
 
-    if config.device_periods < 1:
-        raise ConfigurationError(f"--device-periods is {config.device_periods}; it is 1 or more")
+    if config.description is not None:
+        default = Import(paths=config.paths, out=config.out)
+        refuse(given(config, default, ("name", "device_periods")), "--description says it")
     columns = None if config.columns is None else read_column_map(config.columns)
     facts = _joint_facts(config.model)
-    given = None if config.description is None else _description(config.description)
-    joints = given["joint_names"] if given is not None else None if facts is None else facts.names
+    described = None if config.description is None else _description(config.description)
+    joints = described["joint_names"] if described is not None else None if facts is None else facts.names
     tables = [table for path in config.paths for table in load_tables(path, columns, joints, _say)]
     problems = {
         table.name: [
@@ -98,7 +100,7 @@ def import_recordings(config: Import) -> int:
         )
     if config.dry_run:
         return 0
-    values = given or minimal_description(
+    values = described or minimal_description(
         recordings,
         config.name or (config.model or config.paths[0]).stem,
         tables[0].units,

@@ -7,6 +7,8 @@ once and `collect` never loads what only `train` needs.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -186,6 +188,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
     Raises:
         UnknownNameError: There is no such verb.
+        DealHwError: A setting refuses its value.
         SystemExit: The arguments do not parse, or asked for help.
     """
     verb = find(name)
@@ -194,12 +197,27 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     import tyro
 
     module = importlib.import_module(verb.module)
-    settings = tyro.cli(
-        getattr(module, verb.config),
-        prog=f"deal-hw {name}",
-        args=list(arguments),
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+
+    def read(speak: bool) -> Any:
+        return tyro.cli(
+            getattr(module, verb.config),
+            prog=f"deal-hw {name}",
+            args=list(arguments),
+            config=(tyro.conf.FlagCreatePairsOff,),
+            console_outputs=speak,
+        )
+
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            settings = read(speak=False)
+    except SystemExit as stop:
+        # tyro draws a box around what a setting itself refuses; that gets its one line like other errors.
+        cause: BaseException | None = stop
+        while cause is not None and not isinstance(cause, DealHwError):
+            cause = cause.__context__
+        if cause is not None:
+            raise cause from None
+        settings = read(speak=True)
     return settings, getattr(module, verb.function)
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation import Segment, segment_command
+from deal_hw.control.excitation import LONGEST_S, Segment, segment_command
 from deal_hw.control.excitation_limits import centre, fit_to_limits, room
 from deal_hw.control.waveforms import (
     Arrangement,
@@ -37,8 +37,6 @@ from deal_hw.types import FloatArray, JointCommand, RobotState
 FORMAT = "deal_hw.excitation/1"
 Family = Literal["multisine", "chirp", "steps"]
 FAMILIES = get_args(Family)
-LONGEST_S = 3600.0
-"""Longest run [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
