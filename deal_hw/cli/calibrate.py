@@ -208,18 +208,17 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     }
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)
-    report = finish(
+    return finish(
         work,
         result,
         folder,
         settings,
+        checkpoint,
         page=config.report,
         advise=config.advise,
         threads=config.threads,
         quiet=config.quiet,
     )
-    checkpoint.unlink(missing_ok=True)
-    return report
 
 
 def _usual_method(config: Calibrate, robot: RobotModel) -> str:

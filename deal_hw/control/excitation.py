@@ -84,8 +84,8 @@ class RichConfig:
         ):  # fmt: skip
             raise ConfigurationError(
                 f"not a usable collection profile: duration {self.duration_s:g} s, balance "
-                f"{self.balance_s:g} s, amplitude {self.amplitude:g}, hold {low:g} to {high:g} s; numbers above 0, at most "
-                f"{LONGEST_S:g} s"
+                f"{self.balance_s:g} s, amplitude {self.amplitude:g}, hold {low:g} to "
+                f"{high:g} s; numbers above 0, at most {LONGEST_S:g} s"
             )
 
 

@@ -108,8 +108,7 @@ def change_mjcf(
     Raises:
         ConfigurationError: As :func:`write_calibrated_mjcf`.
     """
-    if target.exists() and target.samefile(path):
-        raise ConfigurationError(f"{target} is the model itself; write the calibrated one to another file")
+    require_other(target, path)
     top = read_files(path)
     spec = mujoco.MjSpec.from_file(str(top.path))
     have = spec.compile()
@@ -134,6 +133,16 @@ def change_mjcf(
             file.unlink(missing_ok=True)
         raise
     return tuple(sorted(written, key=lambda file: file.name != target.name))
+
+
+def require_other(target: Path, path: Path) -> None:
+    """Check that a file to write is not the model itself.
+
+    Raises:
+        ConfigurationError: It is.
+    """
+    if target.exists() and target.samefile(path):
+        raise ConfigurationError(f"{target} is the model itself; write the calibrated one to another file")
 
 
 def _compile(path: Path) -> Any:

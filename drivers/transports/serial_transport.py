@@ -177,7 +177,8 @@ class SerialTransport(Transport):
         if "configure port" in text or code == errno.ENOTTY:
             # What the kernel says, "inappropriate ioctl for device", tells nobody that it is no port at all.
             return PortNotFoundError(
-                f"{self.port} is a file or a device, but not a serial port; ports at hand: {_ports()}"
+                f"{self.port} cannot be opened as a serial port: it is a file or another device; ports at "
+                f"hand: {_ports()}"
             )
         return PortNotFoundError(f"{self.port} cannot be opened as a serial port: {text}")
 
