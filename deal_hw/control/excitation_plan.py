@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation import LONGEST_S, Segment, segment_command
+from deal_hw.control.excitation import Segment, segment_command
 from deal_hw.control.excitation_limits import centre, fit_to_limits, room
 from deal_hw.control.waveforms import (
     Arrangement,
@@ -30,8 +30,7 @@ from deal_hw.control.waveforms import (
     wave_to_json,
 )
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, UnknownNameError, shown
-from deal_hw.reading import number, object_of, read_json, reading, texts
+from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
 FORMAT = "deal_hw.excitation/1"
@@ -161,23 +160,23 @@ class ExcitationPlan:
             ConfigurationError: The values are not those of a plan.
         """
         if values.get("format") != FORMAT:
-            raise ConfigurationError(
-                f"not an excitation: format is {shown(values.get('format'))}, not {FORMAT!r}"
+            raise ConfigurationError(f"not an excitation: format is {values.get('format')!r}, not {FORMAT!r}")
+        try:
+            return cls(
+                robot=str(values["robot"]),
+                digest=str(values["digest"]),
+                seconds=float(values["seconds"]),
+                balance_s=float(values["balance_s"]),
+                ease_s=float(values["ease_s"]),
+                wave=wave_from_json(values["wave"]),
+                segments=tuple(Segment(**part) for part in values["segments"]),
+                words=str(values["words"]),
+                predicted={str(k): float(v) for k, v in values["predicted"].items()},
             )
-        return cls(
-            robot=texts([values["robot"]], "robot")[0],
-            digest=texts([values["digest"]], "digest")[0],
-            seconds=number(values["seconds"], "seconds", 1e-3, LONGEST_S),
-            balance_s=number(values["balance_s"], "balance_s", 0.0, LONGEST_S),
-            ease_s=number(values["ease_s"], "ease_s", 0.0, LONGEST_S),
-            wave=wave_from_json(object_of(values["wave"], "wave")),
-            segments=tuple(
-                Segment(**{key: number(value, f"segment: {key}") for key, value in object_of(part).items()})
-                for part in values["segments"]
-            ),
-            words=texts([values["words"]], "words")[0],
-            predicted={k: number(v, k) for k, v in object_of(values["predicted"], "predicted").items()},
-        )
+        except (KeyError, TypeError, ValueError, AttributeError) as err:
+            if isinstance(err, ConfigurationError):
+                raise
+            raise ConfigurationError(f"not an excitation: {type(err).__name__} {err}") from err
 
     def write(self, path: Path) -> None:
         """Write the plan as JSON."""
@@ -191,9 +190,16 @@ def read_plan(path: Path) -> ExcitationPlan:
     Raises:
         ConfigurationError: It cannot be read, or holds no plan.
     """
-    advice = f"give one of {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` wrote"
-    with reading(path, "an excitation", advice, error=ConfigurationError):
-        return ExcitationPlan.from_json(object_of(read_json(path)))
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as err:
+        raise ConfigurationError(
+            f"--excite {path}: {err}; give one of {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` "
+            "wrote"
+        ) from err
+    if not isinstance(values, dict):
+        raise ConfigurationError(f"--excite {path}: not an excitation, but a JSON {type(values).__name__}")
+    return ExcitationPlan.from_json(values)
 
 
 def make_plan(description: RobotDescription, design: ExcitationDesign) -> ExcitationPlan:

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
 
 Law = Literal["linear", "log"]
@@ -191,7 +191,7 @@ def _tuples(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return tuple(_tuples(part) for part in value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigurationError(f"a signal's table holds {shown(value)}; wanted: finite numbers")
+        raise ConfigurationError(f"a signal's table holds {value!r}; wanted: finite numbers")
     return float(value)
 
 

