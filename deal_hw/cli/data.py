@@ -148,8 +148,10 @@ def _info(config: Info) -> int:
 
 def _dataset_table(dataset: Dataset) -> Table:
     from rich.table import Table
+    from rich.text import Text
 
-    title = f"{dataset.folder}: {dataset.description['name']}, description {dataset.digest}"
+    # Words from a file are no markup, hence Text.
+    title = Text(f"{dataset.folder}: {dataset.description['name']}, description {dataset.digest}")
     table = Table(title=title, title_justify="left")
     for name in ("episode", "purpose", "recorded (UTC)"):
         table.add_column(name)
@@ -159,7 +161,8 @@ def _dataset_table(dataset: Dataset) -> Table:
     for episode in dataset.episodes:
         offset, drift = _clock_texts(episode)
         table.add_row(
-            episode.file, episode.purpose, episode.wall_utc[:19], f"{episode.duration_s:.2f}",
+            Text(episode.file), Text(episode.purpose), Text(episode.wall_utc[:19]),
+            f"{episode.duration_s:.2f}",
             str(episode.states), str(episode.commands), offset, drift, _worst(episode),
         )  # fmt: skip
     return table
@@ -167,7 +170,7 @@ def _dataset_table(dataset: Dataset) -> Table:
 
 def _clock_texts(episode: EpisodeInfo) -> tuple[str, str]:
     clock: dict[str, Any] = dict(episode.clock or {})
-    if not clock:
+    if clock.get("offset_s") is None or clock.get("drift_ppm") is None:
         return "-", "-"
     offset, drift = f"{clock['offset_s'] * 1e3:+.3f} ms", f"{clock['drift_ppm']:+.0f} ppm"
     if clock["offset_uncertainty_s"] is not None:
@@ -198,7 +201,8 @@ def _print_episode(console: Console, episode: EpisodeInfo) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=f"{episode.file}: {episode.purpose} {episode.wall_utc[:19]}", title_justify="left")
+    title = Text(f"{episode.file}: {episode.purpose} {episode.wall_utc[:19]}")
+    table = Table(title=title, title_justify="left")
     table.add_column("check")
     table.add_column("verdict")
     table.add_column("what")
@@ -214,4 +218,4 @@ def _print_episode(console: Console, episode: EpisodeInfo) -> None:
 
 def _plain(value: Any) -> str:
     values = value if isinstance(value, (tuple, list)) else [value]
-    return ", ".join(f"{number:.4g}" for number in values)
+    return ", ".join("-" if number is None else f"{number:.4g}" for number in values)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
 from deal_hw.control.behaviours import Behaviour, position_command
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
+from deal_hw.schema import STRICT
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
 LONGEST_S = 3600.0
@@ -20,6 +22,8 @@ LONGEST_S = 3600.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segment:
     """A part of the run in which other gains and limits are sent, as factors of the description's."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     start: float
     """Start, as a fraction of the run."""
@@ -36,9 +40,9 @@ class Segment:
                 f"segment {self.start!r}..{self.stop!r}: fractions of the run, 0 <= start < stop <= 1"
             )
         for name in ("stiffness", "damping", "effort_limit", "speed_limit"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ConfigurationError(
-                    f"segment factor {name} is {getattr(self, name)!r}; it must be above 0"
+                    f"segment factor {name} is {getattr(self, name)!r}; it must be a finite number above 0"
                 )
 
 

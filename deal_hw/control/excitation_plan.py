@@ -11,10 +11,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
+from deal_hw import schema
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation import Segment, segment_command
 from deal_hw.control.excitation_limits import centre, fit_to_limits, room
@@ -29,11 +30,17 @@ from deal_hw.control.waveforms import (
     wave_from_json,
     wave_to_json,
 )
+from deal_hw.data.files import read_json
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
+from deal_hw.schema import STRICT, short
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
 FORMAT = "deal_hw.excitation/1"
+MAX_SECONDS = 86_400.0
+"""Longest run that a plan may describe [s]."""
+_CHECKED = 1000
+"""Moments of a run at which a signal is looked at before it is played."""
 Family = Literal["multisine", "chirp", "steps"]
 FAMILIES = get_args(Family)
 
@@ -107,7 +114,12 @@ class ExcitationPlan:
         segments: Parts of the run in which other gains and limits are sent.
         words: One line that says what it is.
         predicted: Predicted standard deviation of each parameter in its own scale, where it was computed.
+
+    Raises:
+        ConfigurationError: The times make no sense.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     robot: str
     digest: str
@@ -119,16 +131,30 @@ class ExcitationPlan:
     words: str = ""
     predicted: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not (0 <= self.balance_s < self.seconds <= MAX_SECONDS and 0 <= self.ease_s <= self.seconds):
+            raise ConfigurationError(
+                f"an excitation of {self.seconds:g} s, {self.balance_s:g} s of it balancing, eased over "
+                f"{self.ease_s:g} s; wanted: up to {MAX_SECONDS:g} s, and balancing and easing within them"
+            )
+
     def check_fits(self, description: RobotDescription) -> None:
         """Check that the plan was made for this robot.
 
         Raises:
-            ConfigurationError: It was not.
+            ConfigurationError: It was not, or its signal is not one finite number for each actuated joint.
         """
         if self.robot != description.name or self.digest != description.digest():
             raise ConfigurationError(
-                f"the excitation was made for robot {self.robot!r} (description {self.digest}), this is "
-                f"{description.name!r} ({description.digest()}); make another with `deal-hw excite`"
+                f"the excitation was made for robot {short(self.robot)} (description {short(self.digest)}), "
+                f"this is {description.name!r} ({description.digest()}); make another with `deal-hw excite`"
+            )
+        with np.errstate(all="ignore"):
+            offsets = self.offsets(np.linspace(0.0, self.seconds, _CHECKED))
+        if offsets.shape[1] != len(description.actuated) or not np.isfinite(offsets).all():
+            raise ConfigurationError(
+                f"the excitation moves {offsets.shape[1]} joints, some by no finite number; wanted: finite "
+                f"offsets of the {len(description.actuated)} actuated joints of {description.name!r}"
             )
 
     def offsets(self, time_s: FloatArray) -> FloatArray:
@@ -159,24 +185,18 @@ class ExcitationPlan:
         Raises:
             ConfigurationError: The values are not those of a plan.
         """
-        if values.get("format") != FORMAT:
-            raise ConfigurationError(f"not an excitation: format is {values.get('format')!r}, not {FORMAT!r}")
-        try:
-            return cls(
-                robot=str(values["robot"]),
-                digest=str(values["digest"]),
-                seconds=float(values["seconds"]),
-                balance_s=float(values["balance_s"]),
-                ease_s=float(values["ease_s"]),
-                wave=wave_from_json(values["wave"]),
-                segments=tuple(Segment(**part) for part in values["segments"]),
-                words=str(values["words"]),
-                predicted={str(k): float(v) for k, v in values["predicted"].items()},
+        given = dict(values)
+        if (found := given.pop("format", None)) != FORMAT:
+            raise ConfigurationError(f"not an excitation: format is {short(found)}, not {FORMAT!r}")
+        if not isinstance(wave := given.get("wave"), Mapping):
+            raise ConfigurationError(
+                f"not an excitation: field wave is {short(wave)}; wanted: a signal's table"
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as err:
-            if isinstance(err, ConfigurationError):
-                raise
-            raise ConfigurationError(f"not an excitation: {type(err).__name__} {err}") from err
+        given["wave"] = dataclasses.asdict(wave_from_json(wave))
+        try:
+            return schema.read_json(cls, json.dumps(given))
+        except (TypeError, ValueError) as err:
+            raise ConfigurationError(f"not an excitation: {err}") from err
 
     def write(self, path: Path) -> None:
         """Write the plan as JSON."""
@@ -191,14 +211,11 @@ def read_plan(path: Path) -> ExcitationPlan:
         ConfigurationError: It cannot be read, or holds no plan.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as err:
+        values = read_json(path, dict[str, Any])
+    except DatasetError as err:
         raise ConfigurationError(
-            f"--excite {path}: {err}; give one of {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` "
-            "wrote"
+            f"--excite {err}; give one of {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` wrote"
         ) from err
-    if not isinstance(values, dict):
-        raise ConfigurationError(f"--excite {path}: not an excitation, but a JSON {type(values).__name__}")
     return ExcitationPlan.from_json(values)
 
 

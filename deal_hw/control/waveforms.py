@@ -7,14 +7,17 @@ only: what a table holds may be chosen by an optimiser, but the control process 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
 
+from deal_hw import schema
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.schema import STRICT, short
 from deal_hw.types import FloatArray
 
 Law = Literal["linear", "log"]
@@ -30,6 +33,8 @@ class Tones:
         amplitude: (A, F) [m or rad].
         phase: At time 0, (A, F) [rad].
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     frequency_hz: tuple[tuple[float, ...], ...]
     amplitude: tuple[tuple[float, ...], ...]
@@ -72,6 +77,8 @@ class Sweep:
         law: Whether the frequency grows by equal differences or by equal ratios.
         arrangement: How several joints share the time.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     amplitude: tuple[float, ...]
     duration_s: float
@@ -139,6 +146,8 @@ class Steps:
         value: (S, A) [m or rad].
     """
 
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+
     begin_s: tuple[float, ...]
     value: tuple[tuple[float, ...], ...]
 
@@ -146,6 +155,8 @@ class Steps:
         rising = all(a < b for a, b in zip(self.begin_s, self.begin_s[1:], strict=False))
         if not self.begin_s or len(self.begin_s) != len(self.value) or self.begin_s[0] != 0 or not rising:
             raise ConfigurationError("steps need one value for each time, and rising times from 0 on")
+        if len({len(row) for row in self.value}) != 1:
+            raise ConfigurationError("steps need as many values at each time")
 
     def at(self, time_s: FloatArray) -> FloatArray:
         """Return the offsets at times, (T, A)."""
@@ -159,7 +170,7 @@ class Steps:
 
 
 Wave = Tones | Sweep | Steps
-WAVES = {"tones": Tones, "sweep": Sweep, "steps": Steps}
+WAVES: Final[Mapping[str, type[Wave]]] = {"tones": Tones, "sweep": Sweep, "steps": Steps}
 
 
 def wave_to_json(wave: Wave) -> dict[str, Any]:
@@ -176,23 +187,13 @@ def wave_from_json(values: Mapping[str, Any]) -> Wave:
     """
     given = dict(values)
     name = given.pop("wave", "")
-    if name not in WAVES:
-        raise UnknownNameError("wave", str(name), WAVES)
+    if not isinstance(name, str) or name not in WAVES:
+        raise UnknownNameError("wave", short(name), WAVES)
     try:
-        found: Wave = WAVES[name](**{key: _tuples(value) for key, value in given.items()})
-    except TypeError as err:
+        found: Wave = schema.read_json(WAVES[name], json.dumps(given, allow_nan=False))
+    except (TypeError, ValueError) as err:
         raise ConfigurationError(f"not the table of {name!r}: {err}") from err
     return found
-
-
-def _tuples(value: Any) -> Any:
-    if isinstance(value, str):
-        return value
-    if isinstance(value, list | tuple):
-        return tuple(_tuples(part) for part in value)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigurationError(f"a signal's table holds {value!r}; wanted: finite numbers")
-    return float(value)
 
 
 def ease(time_s: FloatArray, duration_s: float, ease_s: float) -> FloatArray:

@@ -8,17 +8,18 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from deal_hw.data.episode_info import EpisodeInfo, summarize
-from deal_hw.data.files import write_json
-from deal_hw.data.reader import Episode, read_episode
+from deal_hw.data.files import read_json, write_json
+from deal_hw.data.reader import Episode, check_description, read_episode
 from deal_hw.data.repair import repair
 from deal_hw.description import RobotDescription
-from deal_hw.errors import DatasetError, EmptyRecordingError
+from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
+from deal_hw.schema import STRICT
 
 SCHEMA_VERSION = 1
 INDEX_NAME = "dataset.json"
@@ -30,6 +31,31 @@ def digest_of(description: Mapping[str, Any]) -> str:
     """Return the digest of a description given as JSON; equals ``RobotDescription.digest()``."""
     facts = {key: value for key, value in description.items() if key != "sources"}
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class _Version:
+    """What every index has, whichever version of deal-hw wrote it."""
+
+    schema_version: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Index:
+    """``dataset.json``."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+
+    schema_version: int
+    robot: str
+    digest: str
+    description: Mapping[str, Any]
+    episodes: tuple[EpisodeInfo, ...]
+
+    def __post_init__(self) -> None:
+        check_description(self.description)
+        if self.digest != digest_of(self.description):
+            raise ConfigurationError("the index was edited: its digest is not that of its description")
 
 
 class Dataset:
@@ -132,27 +158,14 @@ class Dataset:
     @classmethod
     def _load(cls, folder: Path, lock: int, notify: Notify) -> Self:
         path = folder / INDEX_NAME
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            if values["schema_version"] != SCHEMA_VERSION:
-                raise DatasetError(
-                    f"{path} has schema version {values['schema_version']}, expected {SCHEMA_VERSION}; "
-                    "it was written by another version of deal-hw"
-                )
-            episodes = tuple(
-                EpisodeInfo(**{**episode, "verdicts": tuple(episode["verdicts"])})
-                for episode in values["episodes"]
+        version = read_json(path, _Version).schema_version
+        if version != SCHEMA_VERSION:
+            raise DatasetError(
+                f"{path} has schema version {version}, expected {SCHEMA_VERSION}; "
+                "it was written by another version of deal-hw"
             )
-            description = values["description"]
-            if values["digest"] != digest_of(description):
-                raise DatasetError(
-                    f"{path} was edited: its digest {values['digest']} is not that of its description"
-                )
-        except OSError as error:
-            raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise DatasetError(f"{path} is not the index of a dataset: {error!r}") from error
-        return cls(folder, description, episodes, lock, notify)
+        index = read_json(path, _Index)
+        return cls(folder, index.description, index.episodes, lock, notify)
 
     def path(self, index: int) -> Path:
         """Return the file of an episode; negative numbers count from the end.

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from deal_hw.data.checks import Severity, Verdict, check
 from deal_hw.data.clock_sync import synchronize
 from deal_hw.data.excitation import excitation
 from deal_hw.data.reader import Episode, read_episode
-from deal_hw.errors import DatasetError, EmptyRecordingError, InsufficientDataError
+from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError
+from deal_hw.schema import STRICT, short
+
+_MOST_JUMPS = 20
+"""So many jumps of a clock the index names; a recording of nothing else must not fill it."""
+_VERDICT = {"name", "severity", "message"}
+_CLOCK = {"offset_s", "drift_ppm", "offset_uncertainty_s", "drift_uncertainty_ppm"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,11 +35,16 @@ class EpisodeInfo:
         cycles: Control cycles.
         verdicts: The telemetry checks, as :meth:`deal_hw.data.checks.Verdict.to_json` writes them.
         excitation: Movement, as :meth:`deal_hw.data.excitation.Excitation.to_json` writes it.
-        clock: Relation of the clocks, as :meth:`deal_hw.data.clock_sync.ClockSync.to_json` writes it; None
-            where it cannot be told.
+        clock: Relation of the clocks, as :meth:`deal_hw.data.clock_sync.ClockSync.to_json` writes it, with 20
+            jumps at most; None where it cannot be told.
         note: What the operator should know, such as a repair.
         facts: What the collector adds: outcome, cadence, task, ...
+
+    Raises:
+        ConfigurationError: The file is elsewhere, a verdict is none, or the clock's numbers are missing.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
 
     file: str
     purpose: str
@@ -51,8 +62,24 @@ class EpisodeInfo:
 
     def __post_init__(self) -> None:
         # The file field decides which file is read, and dataset.json may come from elsewhere.
-        if Path(self.file).parts[:1] != ("episodes",) or ".." in Path(self.file).parts:
-            raise DatasetError(f"episode file {self.file!r} is not inside the dataset's episodes/ folder")
+        parts = Path(self.file).parts
+        if len(parts) != 2 or parts[0] != "episodes" or ".." in parts or "\0" in self.file:
+            raise ConfigurationError(
+                f"episode file {short(self.file)} is not inside the dataset's episodes/ folder"
+            )
+        for verdict in self.verdicts:
+            if _VERDICT - verdict.keys() or verdict["severity"] not in tuple(Severity):
+                raise ConfigurationError(f"field verdicts holds {short(dict(verdict))}, which is no verdict")
+        clock, excitation = self.clock or {}, self.excitation or {}
+        if self.clock is not None and not all(name in clock and _is_number(clock[name]) for name in _CLOCK):
+            raise ConfigurationError(f"field clock is {short(dict(clock))}; wanted: numbers or null")
+        for value in excitation.values():
+            if not all(_is_number(part) for part in (value if isinstance(value, list | tuple) else [value])):
+                raise ConfigurationError(f"field excitation holds {short(value)}; wanted: numbers")
+
+
+def _is_number(value: object) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | None = None) -> EpisodeInfo:
@@ -92,6 +119,7 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
 
 def _clock(episode: Episode) -> Mapping[str, Any] | None:
     try:
-        return synchronize(episode.trajectory).to_json()
+        found = synchronize(episode.trajectory).to_json()
     except InsufficientDataError:
         return None
+    return {**found, "jumps": found["jumps"][:_MOST_JUMPS]}

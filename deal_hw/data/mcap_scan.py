@@ -1,11 +1,13 @@
-"""Reads MCAP files that may be torn or damaged, record by record, without trusting any of them.
+"""Reads MCAP files that may be torn, damaged or made to harm, record by record, without trusting any of them.
 
 The readers of the mcap library stop at the first thing that is wrong; this one goes on with the next chunk,
-and says which byte ranges it could not use.
+and says which byte ranges it could not use. Whatever the bytes are, time is linear in the size of the file,
+and so is what all chunks hold together (:data:`MAX_RATIO`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import struct
 from collections.abc import Iterator
@@ -19,7 +21,18 @@ from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Me
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
+MAX_CHUNK_BYTES = 16 << 20
+"""Longest record, and the most that a chunk may hold [B]. The recorder closes a chunk at 1 MiB."""
+MAX_RATIO = 256
+"""Decompressed, the chunks of a file may have so many times its size and one longest chunk besides. A Go2 at
+rest that sends the same bytes all the time reaches 46."""
+_TRIES = 4
+"""Bytes of unusable records that are looked into, per byte of the file: a damaged chunk is met twice, in its
+place and in the search for the next one. Only a file of records that overlap each other needs more."""
+
 _PREFIX = struct.Struct("<BQ")
+_CHUNK_HEAD = struct.Struct("<QQQII4sQ")
+"""Of a zstd chunk, behind its prefix: first and last stamp, size, CRC, the compression's name, length."""
 _CHUNK_MARK = struct.pack("<I", 4) + b"zstd"
 _CHUNK_MARK_OFFSET = _PREFIX.size + 8 + 8 + 8 + 4
 """From a chunk record's first byte to its compression name: prefix, start, end, uncompressed size, CRC."""
@@ -35,8 +48,7 @@ _SUMMARY_ONLY = {
     Opcode.SUMMARY_OFFSET,
     Opcode.FOOTER,
 }
-_CHUNK_FIELDS = 8 + 8 + 8 + 4 + 4 + 8
-"""Bytes of a chunk beside its compression's name and its records."""
+_ZEROS = "zeros where a record should be"
 
 _TYPES: dict[int, type[McapRecord]] = {
     Opcode.HEADER: Header,
@@ -71,7 +83,7 @@ class Lost:
     Attributes:
         offset: Where they start.
         size: How many.
-        reason: Why.
+        reason: Why the first of them could not.
         torn: They are the unfinished end of a file, not damage.
     """
 
@@ -82,91 +94,181 @@ class Lost:
 
 
 def scan(data: bytes) -> Iterator[Found | Lost]:
-    """Yield the records of a file in order, and what lies between them unreadable.
+    """Yield the records of a file in order, and what lies between them unreadable: one :class:`Lost` a place.
 
-    Ends after the footer; a file without one ends with a :class:`Lost` (of size 0 if it was cut between
+    Ends after the footer; a file without one ends with a torn :class:`Lost` (of size 0 if it was cut between
     records). Records of other kinds (message indexes, summary) are passed over: a writer makes them anew.
     """
-    offset = len(MCAP0_MAGIC)
-    in_data_section = True
-    while True:
-        if offset + _PREFIX.size > len(data):
-            yield Lost(offset, len(data) - offset, "the file ends without a footer", torn=True)
-            return
-        opcode, size = _PREFIX.unpack_from(data, offset)
-        end = offset + _PREFIX.size + size
-        result = _parse(opcode, data[offset + _PREFIX.size : end], offset) if end <= len(data) else None
-        if not in_data_section and result is None:
-            yield Lost(offset, len(data) - offset, "the index is cut off", torn=True)
-            return
-        if opcode in _SUMMARY_ONLY and in_data_section:
-            result = "a record out of place"
-        if isinstance(result, str) or result is None:
-            lost = _skip(data, offset, None if result is None else end, result)
-            yield lost
-            if lost.torn:
+    lost: Lost | None = None
+    for item in _Scanner(data).items():
+        if isinstance(item, Found):
+            if lost is not None:
+                yield lost
+            lost = None
+            yield item
+        elif lost is None or item.torn or lost.offset + lost.size != item.offset:
+            if lost is not None:
+                yield lost
+            lost = item
+        else:
+            lost = dataclasses.replace(lost, size=lost.size + item.size)
+    if lost is not None:
+        yield lost
+
+
+class _Scanner:
+    """Goes through a file once, and knows where the next readable chunk is."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._view = memoryview(data)
+        self._left = _TRIES * len(data) + MAX_CHUNK_BYTES
+        self._room = MAX_RATIO * len(data) + MAX_CHUNK_BYTES
+        self._chunk: Found | None = None
+        self._searched = 0
+
+    def items(self) -> Iterator[Found | Lost]:
+        """Yield what is found and lost; what is lost may come in pieces."""
+        data, offset, in_data_section = self._data, len(MCAP0_MAGIC), True
+        while True:
+            if offset + _PREFIX.size > len(data):
+                yield Lost(offset, len(data) - offset, "the file ends without a footer", torn=True)
                 return
-            offset += lost.size
-            continue
-        if isinstance(result, Found):
-            yield result
-            in_data_section = in_data_section and not isinstance(result.record, DataEnd)
-            if isinstance(result.record, Footer):
-                if data[end:] != MCAP0_MAGIC:
-                    yield Lost(end, len(data) - end, "the file does not end after its footer", torn=True)
+            opcode, size = _PREFIX.unpack_from(data, offset)
+            end = offset + _PREFIX.size + size
+            # A record of zeros is none: its length says nothing, and there may be millions of them.
+            result = self._parse(offset, end) if opcode and end <= len(data) else None
+            if not in_data_section and result is None:
+                yield Lost(offset, len(data) - offset, "the index is cut off", torn=True)
                 return
-        offset = end
+            if opcode in _SUMMARY_ONLY and in_data_section:
+                result = "a record out of place"
+            if isinstance(result, str) or result is None:
+                reason = result or ("a record that is cut off" if opcode else _ZEROS)
+                lost = self._skip(offset, None if result is None else end, reason)
+                yield lost
+                if lost.torn:
+                    return
+                offset += lost.size
+                continue
+            if isinstance(result, Found):
+                yield result
+                in_data_section = in_data_section and not isinstance(result.record, DataEnd)
+                if isinstance(result.record, Footer):
+                    if self._view[end:] != MCAP0_MAGIC:
+                        yield Lost(end, len(data) - end, "the file does not end after its footer", torn=True)
+                    return
+            offset = end
+
+    def _skip(self, offset: int, end: int | None, reason: str) -> Lost:
+        """Return what to pass over from an unusable record on; its end is None where it cannot be known.
+
+        The length may be what is wrong: the next readable chunk decides where to go on if it comes earlier.
+        """
+        chunk = self._next_chunk(offset + 1)
+        if self._left <= 0:
+            # Nobody writes such a file; going on would take quadratic time.
+            return Lost(offset, len(self._data) - offset, "broken records that overlap", torn=True)
+        stops = [stop for stop in (chunk, end) if stop is not None]
+        stop = min(stops, default=len(self._data))
+        return Lost(offset, stop - offset, reason, torn=not stops)
+
+    def _parse(self, offset: int, end: int) -> Found | str | bool:
+        """Return the record, why it is unusable, or True for a kind that is passed over."""
+        if self._chunk is not None and self._chunk.offset == offset:
+            return self._chunk
+        opcode, body = self._data[offset], self._view[offset + _PREFIX.size : end]
+        kind = _TYPES.get(opcode)
+        if kind is None:
+            sound = _is_message_index(body) if opcode == Opcode.MESSAGE_INDEX else opcode in _SUMMARY_ONLY
+            return sound or "a record that makes no sense"
+        if kind is Chunk and (wrong := self._refuse_chunk(body)):
+            return wrong
+        if len(body) > MAX_CHUNK_BYTES:
+            return f"a {kind.__name__.lower()} of {len(body)} bytes (at most {MAX_CHUNK_BYTES} are read)"
+        result = _read_chunk(body, offset) if kind is Chunk else _read_record(kind, body, offset)
+        if isinstance(result, str):
+            self._left -= len(body)
+        return result
+
+    def _refuse_chunk(self, body: memoryview) -> str:
+        """Return in no time why a chunk is not worth decompressing; "" where it is."""
+        if len(body) < _CHUNK_HEAD.size:
+            return "a chunk of a wrong length"
+        _, _, size, _, name_size, name, packed_size = _CHUNK_HEAD.unpack_from(body)
+        # A length that grew would swallow the chunks behind it.
+        if (name_size, name) != (4, b"zstd") or len(body) != _CHUNK_HEAD.size + packed_size:
+            return "a chunk of a wrong length"
+        if size > min(MAX_CHUNK_BYTES, self._room):
+            return f"a chunk that announces {size} bytes in {packed_size}"
+        try:
+            # The decompressor takes the memory that the frame asks for, not what it is told to.
+            announced = zstandard.get_frame_parameters(body[_CHUNK_HEAD.size :]).content_size
+        except zstandard.ZstdError as error:
+            return _damaged(Chunk, error)
+        if announced not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            return "a chunk whose sizes contradict each other"
+        self._room -= size
+        return ""
+
+    def _next_chunk(self, start: int) -> int | None:
+        """Return where the next readable chunk starts, at or after ``start``, which never goes back."""
+        if self._chunk is not None and self._chunk.offset >= start:
+            return self._chunk.offset
+        start = max(start, self._searched)
+        self._chunk = None
+        mark = self._data.find(_CHUNK_MARK, start + _CHUNK_MARK_OFFSET)
+        while mark >= 0 and self._left > 0:
+            offset = mark - _CHUNK_MARK_OFFSET
+            self._searched = offset + 1
+            opcode, size = _PREFIX.unpack_from(self._data, offset)
+            end = offset + _PREFIX.size + size
+            if opcode == Opcode.CHUNK and end <= len(self._data):
+                found = self._parse(offset, end)
+                if isinstance(found, Found):
+                    self._chunk = found
+                    return offset
+            mark = self._data.find(_CHUNK_MARK, mark + 1)
+        self._searched = len(self._data)
+        return None
 
 
-def _skip(data: bytes, offset: int, end: int | None, reason: str | None) -> Lost:
-    """Return what to pass over from an unusable record on; its end is None where that lies outside the file.
-
-    The length may be what is wrong: the next readable chunk decides where to go on if it comes earlier.
-    """
-    chunk = _next_chunk(data, offset + 1)
-    stops = [stop for stop in (chunk, end) if stop is not None]
-    stop = min(stops, default=len(data))
-    return Lost(offset, stop - offset, reason or "a record that is cut off", torn=not stops)
-
-
-def _parse(opcode: int, body: bytes, offset: int) -> Found | str | bool:
-    """Return the record, why it is unusable, or True for a kind that is passed over."""
-    kind = _TYPES.get(opcode)
-    if kind is None:
-        sound = _is_message_index(body) if opcode == Opcode.MESSAGE_INDEX else opcode in _SUMMARY_ONLY
-        return sound or "a record that makes no sense"
+def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> Found | str:
     try:
         record: McapRecord = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
-        if isinstance(record, Chunk):
-            # A length that grew would swallow the chunks behind it, and the library reads only what it needs.
-            if len(body) != _CHUNK_FIELDS + len(record.compression.encode()) + len(record.data):
-                return "a chunk of a wrong length"
-            return Found(offset, record, tuple(breakup_chunk(record, validate_crc=True)))
         builder = RecordBuilder()
         record.write(builder)
         # The library reads past the end of a record without complaint; only the way back shows it.
         same = builder.end()[_PREFIX.size :] == body  # type: ignore[no-untyped-call]
     except _PARSE_ERRORS as error:
-        return f"a damaged {kind.__name__.lower()} ({str(error) or type(error).__name__})"
-    return Found(offset, record) if same else f"a damaged {kind.__name__.lower()}"
+        return _damaged(kind, error)
+    return Found(offset, record) if same else _damaged(kind)
 
 
-def _is_message_index(body: bytes) -> bool:
+def _read_chunk(body: memoryview, offset: int) -> Found | str:
+    start_ns, end_ns, size, crc, *_ = _CHUNK_HEAD.unpack_from(body)
+    packed = body[_CHUNK_HEAD.size :]
+    try:
+        plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        if len(plain) != size:
+            return "a chunk whose sizes contradict each other"
+        record = Chunk(
+            compression="zstd", data=bytes(packed), message_start_time=start_ns, message_end_time=end_ns,
+            uncompressed_crc=crc, uncompressed_size=size,
+        )  # fmt: skip
+        unpacked = dataclasses.replace(record, compression="", data=plain)
+        return Found(offset, record, tuple(breakup_chunk(unpacked, validate_crc=True)))
+    except _PARSE_ERRORS as error:
+        return _damaged(Chunk, error)
+
+
+def _damaged(kind: type[McapRecord], error: Exception | None = None) -> str:
+    why = f" ({(str(error) or type(error).__name__)[:60]})" if error is not None else ""
+    return f"a damaged {kind.__name__.lower()}{why}"
+
+
+def _is_message_index(body: memoryview) -> bool:
     return len(body) >= 6 and len(body) == 6 + int.from_bytes(body[2:6], "little")
-
-
-def _next_chunk(data: bytes, start: int) -> int | None:
-    """Return where the next readable chunk starts, at or after ``start``."""
-    mark = data.find(_CHUNK_MARK, start + _CHUNK_MARK_OFFSET)
-    while mark >= 0:
-        offset = mark - _CHUNK_MARK_OFFSET
-        opcode, size = _PREFIX.unpack_from(data, offset)
-        end = offset + _PREFIX.size + size
-        if opcode == Opcode.CHUNK and end <= len(data):
-            if isinstance(_parse(opcode, data[offset + _PREFIX.size : end], offset), Found):
-                return offset
-        mark = data.find(_CHUNK_MARK, mark + 1)
-    return None
 
 
 def messages(found: Found) -> Iterator[Message]:

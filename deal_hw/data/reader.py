@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +11,19 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
-from mcap.writer import MCAP0_MAGIC
 
+from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.mcap_scan import Found, Lost, messages, scan
 from deal_hw.data.recorder import METADATA_NAME
 from deal_hw.data.schemas import CHANNELS, message_type
-from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
+from deal_hw.errors import (
+    ConfigurationError,
+    DatasetError,
+    EmptyRecordingError,
+    ProtocolError,
+    TornRecordingError,
+)
+from deal_hw.schema import read_json, short
 from deal_hw.transport import Message
 from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
 
@@ -94,35 +100,54 @@ def read_episode(path: Path) -> Episode:
         TornRecordingError: It has no footer or is damaged.
         DatasetError: It cannot be read or is not an episode of deal-hw.
     """
-    preamble, rows = _collect(Path(path))
-    if not rows["/state"]:
-        raise EmptyRecordingError(f"{path} holds no state sample; was the robot silent? Record again")
     try:
+        preamble, rows = _collect(Path(path))
+        if not rows["/state"]:
+            raise EmptyRecordingError(f"{path} holds no state sample; was the robot silent? Record again")
         return _episode(Path(path), preamble, rows)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{path} is not an episode that this version reads: {error!r}") from error
+    except (KeyError, ValueError, ProtocolError) as error:
+        raise _unreadable(path, error) from error
 
 
 def read_wire(path: Path) -> Iterator[Message]:
-    """Yield the raw messages of an episode in order; channels as the robot named them."""
-    for channel, (stamp_ns, payload) in _wire_rows(Path(path)):
-        yield Message(channel, payload, stamp_ns)
+    """Yield the raw messages of an episode in order; channels as the robot named them.
 
-
-def _load(path: Path) -> bytes:
+    Raises:
+        TornRecordingError: It has no footer or is damaged.
+        DatasetError: It cannot be read or is not an episode of deal-hw.
+    """
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    if not data:
-        raise EmptyRecordingError(f"{path} is empty (0 bytes); nothing was recorded")
-    if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC[: len(data)]:
-        raise DatasetError(f"{path} is not an MCAP file; episodes are files such as DIR/episodes/000000.mcap")
-    return data
+        for channel, (stamp_ns, payload) in _wire_rows(Path(path)):
+            yield Message(channel, payload, stamp_ns)
+    except ProtocolError as error:
+        raise _unreadable(path, error) from error
+
+
+def check_description(values: Mapping[str, Any]) -> None:
+    """Check that a description given as JSON names a robot and its joints.
+
+    Raises:
+        ConfigurationError: It does not.
+    """
+    names = [*_names(values, "joint_names"), *_names(values, "actuated")]
+    if not names or not isinstance(values.get("name"), str):
+        raise ConfigurationError(f"the description {short(dict(values))} names no robot with joints")
+
+
+def _names(description: Mapping[str, Any], field: str) -> list[str]:
+    names = description.get(field)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigurationError(f"the description's {field} are {short(names)}; wanted: a list of names")
+    return names
+
+
+def _unreadable(path: Path, error: Exception) -> DatasetError:
+    what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+    return DatasetError(f"{path} is not an episode that this version reads: {what}")
 
 
 def _records(path: Path) -> Iterator[Found]:
-    for item in scan(_load(path)):
+    for item in scan(read_episode_bytes(path)):
         if isinstance(item, Lost):
             state = "is torn" if item.torn else "is damaged"
             raise TornRecordingError(
@@ -150,7 +175,7 @@ def _wire_rows(path: Path) -> Iterator[tuple[str, tuple[Any, ...]]]:
 def _channel(channels: Mapping[int, Channel], message: McapMessage) -> Channel:
     channel = channels.get(message.channel_id)
     if channel is None:
-        raise DatasetError(f"a message on channel {message.channel_id}, which the file does not name")
+        raise ProtocolError(f"a message is on channel {message.channel_id}, which the file does not name")
     return channel
 
 
@@ -174,15 +199,17 @@ def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]
 
 
 def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tuple[Any, ...]]]) -> Episode:
-    description = json.loads(preamble["description"])
-    metadata = json.loads(preamble["metadata"])
+    description = read_json(dict[str, Any], preamble["description"])
+    check_description(description)
+    metadata = read_json(dict[str, Any], preamble["metadata"])
+    J, A = len(description["joint_names"]), len(description["actuated"])
     receive_ns, device_ns, sequence, command_sequence, command_age_ns, status, *kinematics = zip(
         *rows["/state"], strict=True
     )
     start_ns, device_start_ns = receive_ns[0], device_ns[0]
     numbers = np.array(sequence, dtype=np.int64)
-    cycles = _cycles(rows, start_ns, len(description["actuated"]))
-    position, velocity, effort = (np.stack(values) for values in kinematics)
+    cycles = _cycles(rows, start_ns, A)
+    position, velocity, effort = (_table(values, J) for values in kinematics)
     facts = {
         "description": description,
         "lost_frames": lost_frames(numbers),
@@ -201,11 +228,12 @@ def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tu
         command_sequence=np.array(command_sequence, dtype=np.int64),
         command_age_s=_seconds_or_nan(command_age_ns),
         events=tuple(
-            Event(stamp, kind, text, json.loads(data)) for stamp, kind, text, data in rows["/events"]
+            Event(stamp, kind, text, read_json(dict[str, Any], data))
+            for stamp, kind, text, data in rows["/events"]
         ),
         metadata={**metadata, **facts},
         body=_body(rows["/body"], receive_ns, numbers),
-        **_commands(rows, start_ns, len(description["actuated"])),
+        **_commands(rows, start_ns, A),
     )
     return Episode(
         path=path, description=description, metadata=metadata, wall_utc=preamble["wall_utc"],
@@ -292,4 +320,8 @@ def _seconds_or_nan(ages_ns: Sequence[int]) -> FloatArray:
 
 
 def _table(rows: Sequence[FloatArray], width: int) -> FloatArray:
+    if any(row.size != width for row in rows):
+        raise ValueError(
+            f"a row has {next(r.size for r in rows if r.size != width)} numbers, expected {width}"
+        )
     return np.stack(rows) if rows else np.empty((0, width))

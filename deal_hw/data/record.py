@@ -175,7 +175,7 @@ def decode(datagram: bytes) -> CycleRecord:
         raise ProtocolError(f"cycle record of {len(datagram)} bytes is corrupt or cut off: wrong CRC-32")
     try:
         return _decode_body(body)
-    except (struct.error, ValueError) as error:
+    except (struct.error, ValueError, RecursionError) as error:
         raise ProtocolError(
             f"cycle record of {len(datagram)} bytes does not hold what its head says: {error}"
         ) from error
@@ -312,7 +312,10 @@ def _encode_event(event: Event) -> bytes:
 def _decode_event(cursor: _Cursor) -> Event:
     stamp_ns, kind, message, data = cursor.unpack(_EVENT)
     texts = cursor.text(kind), cursor.text(message)
-    return Event(stamp_ns, *texts, json.loads(cursor.take(data)) if data else {})
+    values = json.loads(cursor.take(data)) if data else {}
+    if not isinstance(values, dict):
+        raise ValueError(f"an event's data are a JSON {type(values).__name__}, no object")
+    return Event(stamp_ns, *texts, values)
 
 
 def _encode_message(message: Message) -> bytes:

@@ -1,22 +1,32 @@
-"""Mends an episode that was torn by a kill or damaged on disk, and checks whole ones."""
+"""Mends an episode that was torn by a kill or damaged on disk, and checks whole ones.
+
+Both take time in proportion to the file, and memory for the file and one chunk of it.
+"""
 
 from __future__ import annotations
 
 import os
+import struct
 import zlib
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
 from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import CompressionType, Writer
 
+from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.mcap_scan import Found, Lost, messages, scan
 from deal_hw.data.recorder import LIBRARY
 from deal_hw.data.schemas import CHANNELS
-from deal_hw.errors import DatasetError, EmptyRecordingError
+from deal_hw.errors import DatasetError
 
 REPAIR_NAME = "deal-hw.repair"
+_SHOWN = 3
+"""Damaged places that a sentence names; it counts the others."""
+_KEPT = 100
+"""Damaged places and holes that a report lists; it counts the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +39,13 @@ class RepairReport:
         torn: It had no footer.
         messages: Readable messages.
         chunks: Readable chunks.
-        damaged: Damaged places, in words.
+        damaged: Damaged places, in words; of more than 100 the first.
+        places: How many there are.
         lost_bytes: Bytes that could not be used.
-        lost_spans_s: Stretches of the recording in which messages are missing, host time since the first [s].
+        lost_spans_s: Stretches of the recording in which messages are missing, host time since the first [s];
+            of more than 100 the first.
+        holes: How many there are.
+        missing_s: How long they are together [s].
         original: Where the original was kept; None where it was not.
     """
 
@@ -41,8 +55,11 @@ class RepairReport:
     messages: int
     chunks: int
     damaged: tuple[str, ...] = ()
+    places: int = 0
     lost_bytes: int = 0
     lost_spans_s: tuple[tuple[float, float], ...] = ()
+    holes: int = 0
+    missing_s: float = 0.0
     original: Path | None = None
 
     @property
@@ -51,19 +68,24 @@ class RepairReport:
         return not self.torn and not self.damaged
 
     def describe(self) -> str:
-        """Return one paragraph for the operator."""
+        """Return one line for the operator, however much is damaged."""
         if self.sound:
             return f"{self.path}: sound, {self.messages} messages in {self.chunks} chunks"
-        wrong = (["no footer (the recorder was killed or the disk was full)"] if self.torn else []) + [
-            *self.damaged
-        ]
+        wrong = [*self.damaged[:_SHOWN]]
+        if self.torn:
+            wrong.insert(0, "no footer (the recorder was killed, the power failed or the disk was full)")
+        if self.places > _SHOWN:
+            wrong.append(f"{self.places - _SHOWN} more damaged places")
         text = (
             f"{self.path}: {'; '.join(wrong)}. {self.messages} messages in {self.chunks} chunks are readable"
         )
         if self.lost_bytes:
             text += f", {self.lost_bytes} bytes are lost"
-        for start_s, end_s in self.lost_spans_s:
-            text += f", a hole of {end_s - start_s:.3f} s begins {start_s:.3f} s into the recording"
+        if self.holes:
+            what = "a hole" if self.holes == 1 else f"{self.holes} holes, together"
+            begins = "it begins" if self.holes == 1 else "the first begins"
+            text += f", {what} of {self.missing_s:.3f} s, {begins} {self.lost_spans_s[0][0]:.3f} s into the "
+            text += "recording"
         if self.repaired:
             text += ". Rewritten"
             text += f"; the damaged original is {self.original}" if self.original else ""
@@ -75,9 +97,9 @@ def verify(path: Path) -> RepairReport:
 
     Raises:
         EmptyRecordingError: It has 0 bytes.
-        DatasetError: It cannot be read or is not an MCAP file of deal-hw.
+        DatasetError: It cannot be read, is too large, or is not an MCAP file of deal-hw.
     """
-    return _inspect(Path(path), _load(Path(path))).report
+    return _inspect(Path(path), read_episode_bytes(Path(path))).report
 
 
 def repair(path: Path) -> RepairReport:
@@ -91,7 +113,7 @@ def repair(path: Path) -> RepairReport:
         DatasetError: It cannot be read or written, is not an MCAP file of deal-hw, or has nothing readable.
     """
     path = Path(path)
-    data = _load(path)
+    data = read_episode_bytes(path)
     found = _inspect(path, data)
     report = found.report
     if report.sound:
@@ -108,17 +130,12 @@ def repair(path: Path) -> RepairReport:
         os.replace(fresh, path)
         if not report.damaged:
             kept.unlink()
-    except OSError as error:
-        raise DatasetError(
-            f"{path} cannot be repaired: {error.strerror}; the original is untouched"
-        ) from error
+    except (OSError, struct.error) as error:
+        why = error.strerror if isinstance(error, OSError) else f"its numbers fit no MCAP file ({error})"
+        raise DatasetError(f"{path} cannot be repaired: {why}; the original is untouched") from error
     finally:
         fresh.unlink(missing_ok=True)
-    return RepairReport(
-        path=path, repaired=True, torn=report.torn, messages=report.messages, chunks=report.chunks,
-        damaged=report.damaged, lost_bytes=report.lost_bytes, lost_spans_s=report.lost_spans_s,
-        original=kept if report.damaged else None,
-    )  # fmt: skip
+    return replace(report, repaired=True, original=kept if report.damaged else None)
 
 
 def _unused(path: Path) -> Path:
@@ -138,25 +155,14 @@ class _Findings:
     channels: dict[int, Channel]
 
 
-def _load(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    if not data:
-        raise EmptyRecordingError(f"{path} is empty (0 bytes); there is nothing to repair")
-    if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
-        raise DatasetError(f"{path} is not an MCAP file; it starts with {data[:8]!r}")
-    return data
-
-
 def _inspect(path: Path, data: bytes) -> _Findings:
     schemas, channels = _known()
     header = Header(profile="ros2", library=LIBRARY)
     losses: list[Lost] = []
     spans: list[tuple[float, float]] = []
     first_ns = last_ns = None
-    chunks = count = 0
+    counts: Counter[int] = Counter()
+    chunks = 0
     hole = False
     mismatches: list[str] = []
     for item in scan(data):
@@ -167,7 +173,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
         if isinstance(item.record, Header):
             header = item.record
         elif isinstance(item.record, DataEnd):
-            if item.record.data_section_crc not in (0, zlib.crc32(data[: item.offset])):
+            if item.record.data_section_crc not in (0, zlib.crc32(memoryview(data)[: item.offset])):
                 mismatches.append("the checksum over the whole recording does not match")
         elif isinstance(item.record, Footer) and _is_index_damaged(data, item.offset, item.record):
             mismatches.append("the checksum of the index does not match")
@@ -180,7 +186,8 @@ def _inspect(path: Path, data: bytes) -> _Findings:
         channels.update({record.id: record for record in item.contents if isinstance(record, Channel)})
         stamps = [message.log_time for message in messages(item)]
         if stamps:
-            chunks, count = chunks + 1, count + len(stamps)
+            chunks += 1
+            counts.update(message.channel_id for message in messages(item))
             first_ns = min(stamps) if first_ns is None else first_ns
             if hole and last_ns is not None:
                 spans.append(((last_ns - first_ns) * 1e-9, (min(stamps) - first_ns) * 1e-9))
@@ -189,18 +196,21 @@ def _inspect(path: Path, data: bytes) -> _Findings:
         raise DatasetError(
             f"{path} was written by {header.library!r}; only recordings of deal-hw can be mended"
         )
-    damaged = [f"{loss.reason} at byte {loss.offset}" for loss in losses if not loss.torn]
-    damaged = damaged or mismatches
+    damaged = [f"{loss.reason} at byte {loss.offset}" for loss in losses if not loss.torn] or mismatches
+    if nameless := sum(count for channel, count in counts.items() if channel not in channels):
+        damaged.append(f"{nameless} messages are on channels that the file does not name")
     report = RepairReport(
-        path=path, repaired=False, torn=any(loss.torn for loss in losses), messages=count, chunks=chunks,
-        damaged=tuple(damaged), lost_bytes=sum(loss.size for loss in losses), lost_spans_s=tuple(spans),
+        path=path, repaired=False, torn=any(loss.torn for loss in losses),
+        messages=counts.total() - nameless, chunks=chunks, damaged=tuple(damaged[:_KEPT]),
+        places=len(damaged), lost_bytes=sum(loss.size for loss in losses), lost_spans_s=tuple(spans[:_KEPT]),
+        holes=len(spans), missing_s=sum(stop - start for start, stop in spans),
     )  # fmt: skip
     return _Findings(report, header, schemas, channels)
 
 
 def _is_index_damaged(data: bytes, offset: int, footer: Footer) -> bool:
     # The checksum covers the summary and the footer up to the checksum itself: prefix and two offsets.
-    covered = data[footer.summary_start or offset : offset + 9 + 16]
+    covered = memoryview(data)[footer.summary_start or offset : offset + 9 + 16]
     return footer.summary_crc not in (0, zlib.crc32(covered))
 
 
@@ -230,7 +240,7 @@ def _rewrite(data: bytes, findings: _Findings, file: IO[bytes]) -> None:
     }
     channels = {
         number: writer.register_channel(
-            channel.topic, channel.message_encoding, schemas[channel.schema_id], channel.metadata
+            channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
         )
         for number, channel in sorted(findings.channels.items())
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import os
 import platform
 import subprocess
@@ -14,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from deal_hw.data.files import write_json
+from deal_hw.data.files import read_json, write_json
 from deal_hw.errors import DatasetError
 
 _PACKAGES = (
@@ -113,12 +112,9 @@ class RunFolder:
             DatasetError: The folder is not a run.
         """
         try:
-            values: dict[str, Any] = json.loads((self.path / "run.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise DatasetError(
-                f"{self.path} is not a run folder: run.json cannot be read ({error})"
-            ) from error
-        return values
+            return read_json(self.path / "run.json", dict[str, Any])
+        except DatasetError as error:
+            raise DatasetError(f"{self.path} is not a run folder: {error}") from error
 
     def write(self, name: str, values: Any) -> Path:
         """Write plain JSON values to a file inside the folder, atomically; return its path."""

@@ -70,10 +70,10 @@ class Response:
         """
         try:
             values = json.loads(self.data) if self.data else {}
-        except ValueError as error:
-            raise FrameError(f"response to {self.api}: {self.data!r} is not JSON: {error}") from error
+        except (ValueError, RecursionError) as error:
+            raise FrameError(f"response to {self.api}: {self.data[:60]!r} is not JSON: {error}") from error
         if not isinstance(values, dict):
-            raise FrameError(f"response to {self.api}: {self.data!r} is not a JSON object")
+            raise FrameError(f"response to {self.api}: {self.data[:60]!r} is not a JSON object")
         return values
 
 

@@ -124,7 +124,7 @@ class Services:
             return NO_SUCH_API, ""
         try:
             code, data = function(json.loads(request.parameter or "{}"), position, now_ms)
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             return BAD_PARAMETER, ""
         return code, "" if data is None else json.dumps(data)
 

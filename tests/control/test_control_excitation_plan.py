@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from deal_hw.control.excitation_plan import (
     read_plan,
 )
 from deal_hw.control.safety_filter import SafetyFilter
+from deal_hw.control.waveforms import Tones
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.so101.description import DESCRIPTION as ARM
@@ -164,16 +166,39 @@ def test_unknown_family_and_broken_files_are_refused(tmp_path: Path) -> None:
         read_plan(file)
     good = make_plan(DESCRIPTION, ExcitationDesign()).to_json()
     for broken, words in (
-        ("[1]", "a JSON list"),
+        ("[1]", "Input should be an object"),
         ("{", "a file that `deal-hw excite`"),
         (json.dumps({**good, "format": "x"}), "format is 'x'"),
-        (json.dumps({k: v for k, v in good.items() if k != "wave"}), "KeyError 'wave'"),
+        (json.dumps({k: v for k, v in good.items() if k != "wave"}), "field wave is None"),
         (json.dumps({**good, "segments": [{"start": 1.0, "stop": 0.0}]}), "segment"),
+        (
+            json.dumps({**good, "segments": [{"start": 0.0, "stop": 1.0, "damping": math.inf}]}),
+            "finite number",
+        ),
+        (json.dumps({**good, "robot": ["cartpole"]}), "field robot is"),
+        (json.dumps({**good, "seconds": math.nan}), "nan s"),
+        (json.dumps({**good, "wave": {**good["wave"], "amplitude": [[[1.0]]]}}), "field amplitude"),
+        (
+            json.dumps({**good, "wave": {"wave": "steps", "begin_s": [0, 1], "value": [[1], []]}}),
+            "as many values",
+        ),
+        ("[" * 100_000, "recursion limit"),
     ):
         file.write_text(broken)
         with pytest.raises(ConfigurationError, match=words.replace("[", r"\[")):
             read_plan(file)
     assert ExcitationPlan.from_json(good).words.startswith("4 s of a multisine")
+
+
+@pytest.mark.parametrize(("joints", "size"), [(1, 1e308), (2, 1.0)])
+def test_a_signal_that_cannot_be_played_is_refused(joints: int, size: float) -> None:
+    """One that overflows, and one for more joints than the robot has, never start."""
+    good = make_plan(DESCRIPTION, ExcitationDesign())
+    wave = Tones(
+        frequency_hz=((1.0, 1.1),) * joints, amplitude=((size, size),) * joints, phase=((1.5, 1.5),) * joints
+    )
+    with pytest.raises(ConfigurationError, match=f"moves {joints} joints"):
+        dataclasses.replace(good, wave=wave).check_fits(DESCRIPTION)
 
 
 def test_a_robot_without_room_is_refused() -> None:

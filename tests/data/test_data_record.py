@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -114,6 +115,18 @@ def test_noise_is_refused(noise: bytes) -> None:
     """Bytes that nobody encoded raise ProtocolError, not something else."""
     with pytest.raises(ProtocolError):
         decode(noise)
+
+
+@pytest.mark.parametrize("data", [b"[" * 100_000, b"[1]", b"{", b"\xff", b"1" * 5000])
+def test_event_data_are_a_json_object(make_cycle: Callable[[int], CycleRecord], data: bytes) -> None:
+    """Anything else in an event, with a right checksum, is corrupt."""
+    good = encode(replace(make_cycle(0), events=(Event(0, "kind", "text", {"a": 1}),), wire=()))
+    head, text = good[:-4].split(b'{"a": 1}')[0], b'{"a": 1}'
+    assert good[:-4] == head + text
+    sized = head[:-12] + head[-12:].replace(len(text).to_bytes(4, "little"), len(data).to_bytes(4, "little"))
+    body = sized + data
+    with pytest.raises(ProtocolError, match="does not hold what its head says"):
+        decode(body + zlib.crc32(body).to_bytes(4, "little"))
 
 
 def test_another_version_is_named(make_cycle: Callable[[int], CycleRecord]) -> None:

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 SERVICES = ("control", "data", "sim", "testing", "viz")
-VOCABULARY = ("errors", "types", "clock", "findings", "reading")
+VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema")
 CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")
 LAYER = {
     **dict.fromkeys(("deal_hw", *VOCABULARY), 0),
@@ -47,6 +47,7 @@ CONFINED = {
     "dynamixel_sdk": {"drivers"},
     "zenoh": {"drivers"},
     "tyro": {"cli"},
+    "pydantic": {"schema"},
 }
 """Which parts may load a package; packages that are not named here are free."""
 

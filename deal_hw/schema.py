@@ -1,0 +1,123 @@
+"""Reads JSON into dataclasses and says which field is wrong.
+
+Types, missing and unknown fields come from the dataclass's annotations, by pydantic; ranges and what fields
+have to do with each other from the checks in its ``__post_init__``, which hold in Python, too. pydantic is
+imported on use: `import deal_hw` stays light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cache
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from deal_hw.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter, ValidationError
+
+T = TypeVar("T")
+
+STRICT: Final[Mapping[str, Any]] = MappingProxyType({"strict": True, "extra": "forbid"})
+"""Value of ``__pydantic_config__`` in a dataclass: nothing is converted, unknown fields are refused."""
+SHOWN: Final = 3
+"""How many wrong fields a message explains; it counts or names the others."""
+_MAX_CHARACTERS: Final = 60
+_MAX_NAMES: Final = 16
+
+
+def read_json(kind: type[T], text: str) -> T:
+    """Return the dataclass that a JSON text describes.
+
+    Raises:
+        ConfigurationError: The text is no JSON, or a field is wrong; the message names the fields.
+    """
+    from pydantic import ValidationError
+
+    try:
+        made: T = _adapter(kind).validate_json(text)  # type: ignore[arg-type]  # Classes are hashable.
+    except ValidationError as err:
+        raise ConfigurationError(_explain(err)) from err
+    return made
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+def _explain(err: ValidationError) -> str:
+    """Return in one line each wrong field, what was found and what is allowed."""
+    errors = err.errors(include_url=False)
+    found = []
+    for error in errors[:SHOWN]:
+        parts = [
+            f"[{part}]" if isinstance(part, int) else f".{short(part, quote=False)}" for part in error["loc"]
+        ]
+        place = "".join(parts).lstrip(".")
+        if error["type"] == "value_error":
+            # A check of a dataclass, which does not know its own place.
+            found.append(": ".join(filter(None, (place, str(error["ctx"]["error"])))))
+        elif not place or error["type"] == "missing":
+            found.append(f"field {place} is missing" if place else error["msg"])
+        else:
+            found.append(f"field {place} is {short(error['input'])}; {error['msg']}")
+    more = f"; and {len(errors) - SHOWN} more" if len(errors) > SHOWN else ""
+    return "; ".join(found) + more
+
+
+def refusal(name: str, found: object, allowed: str, *, quote: bool = True) -> ConfigurationError:
+    """Return the error that names a field, what was found and what is allowed."""
+    return ConfigurationError(f"field {name} is {short(found, quote=quote)}; allowed: {allowed}")
+
+
+def short(value: object, *, quote: bool = True) -> str:
+    """Return a value as a message shows it: whole where it is short, else its beginning and its size."""
+    text = repr(value)
+    text = text if quote or not isinstance(value, str) else text[1:-1]
+    size = f" ({len(value)} entries)" if isinstance(value, Sequence) and not isinstance(value, str) else ""
+    return text if len(text) <= _MAX_CHARACTERS else f"{text[: _MAX_CHARACTERS - 12]}...{size}"
+
+
+def either(allowed: Sequence[str]) -> str:
+    """Return names as a message lists them; of many the first."""
+    text = ", ".join(short(name) for name in allowed[:_MAX_NAMES])
+    return text if len(allowed) <= _MAX_NAMES else f"{text}, ... ({len(allowed)} in all)"
+
+
+def check_members(name: str, values: Sequence[str], known: Sequence[str]) -> None:
+    """Check that each value is one of the known ones.
+
+    Raises:
+        ConfigurationError: One is not.
+    """
+    for i, value in enumerate(values):
+        if value not in known:
+            raise refusal(f"{name}[{i}]", value, either(known))
+
+
+def check_numbers(
+    name: str, values: Sequence[float], length: int, *, lowest: float = -math.inf, endless: bool = False
+) -> None:
+    """Check that there are so many numbers, each finite and not too small.
+
+    Args:
+        name: Name of the field.
+        values: Its values.
+        length: How many there must be.
+        lowest: The smallest that is allowed.
+        endless: Whether infinity is allowed, too.
+
+    Raises:
+        ConfigurationError: They are not so.
+    """
+    if len(values) != length:
+        raise refusal(name, f"of length {len(values)}", f"{length}", quote=False)
+    for i, value in enumerate(values):
+        if not ((math.isfinite(value) and value >= lowest) or (endless and value == math.inf)):
+            at_least = "" if lowest == -math.inf else f" of at least {lowest:g}"
+            raise refusal(f"{name}[{i}]", value, f"a finite number{at_least}")

@@ -1,0 +1,86 @@
+"""The fuzzer notices what it is there for, and every kind of input survives a few."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TOOL = ROOT / "tools" / "fuzz_files.py"
+
+
+def listed() -> list[str]:
+    """Return the names of all kinds."""
+    said = subprocess.run([sys.executable, TOOL, "--list"], capture_output=True, text=True, check=True)
+    return said.stdout.split()
+
+
+def test_every_kind_survives_a_few_inputs() -> None:
+    """No traceback, hang, long message or gigabyte in thirty inputs of each kind."""
+    done = subprocess.run(
+        [sys.executable, TOOL, "--count", "30", "--seed", "7"], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == listed()
+
+
+def fail(data: bytes) -> None:
+    raise KeyError("a")
+
+
+def hang(data: bytes) -> None:
+    while True:
+        time.sleep(0.01)
+
+
+def swallow_and_hang(data: bytes) -> None:
+    try:
+        hang(data)
+    except Exception:
+        return
+
+
+def grow(data: bytes) -> None:
+    bytearray(b"x" * (200 << 20))
+
+
+def die(data: bytes) -> None:
+    os.abort()
+
+
+def talk(data: bytes) -> None:
+    from deal_hw.errors import DatasetError
+
+    raise DatasetError("one line\nand another")
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (fail, "KeyError at test_fuzz.py"),
+        (hang, "more than 0.2 s"),
+        (swallow_and_hang, "more than 0.2 s"),
+        (grow, "MiB of memory"),
+        (die, "the process died: status -6"),
+        (talk, "a message of several lines"),
+    ],
+)
+def test_failures_are_counted(
+    read: Callable[[bytes], None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each failure costs one input, has its name, and the run goes on behind it."""
+    monkeypatch.syspath_prepend(str(TOOL.parent))
+    from fuzz.kind import WireKind
+    from fuzz.mutations import damage_bytes
+    from fuzz.run import run
+
+    kind = WireKind(make=lambda: [b"good"], read=read, mutations=(damage_bytes,))
+    found = run(kind, 2, 0, limit_s=0.2, limit_bytes=100 << 20)
+    (failure,) = [what for what in found if what.startswith("FAILED")]
+    assert words in failure and found[failure] == 2 and found["read"] == found["refused"] == 0

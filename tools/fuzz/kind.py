@@ -1,0 +1,52 @@
+"""What the fuzzer needs to know of one kind of input."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from deal_hw.errors import DealHwError
+
+Mutation = Callable[[random.Random, bytes, Sequence[bytes]], bytes]
+"""Returns a damaged copy of some bytes; the other good inputs are there to splice from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileKind:
+    """A file that a user may give us.
+
+    Attributes:
+        make: Returns good files as bytes, given an empty folder to work in.
+        read: Reads the file at a path as the product does.
+        name: What the file is called while it is read; may hold folders ("episodes/000000.mcap").
+        mutations: How it is damaged; one is drawn for each input.
+        refusals: What a reader may raise: an error of ours, in one line.
+    """
+
+    make: Callable[[Path], Sequence[bytes]]
+    read: Callable[[Path], object]
+    name: str
+    mutations: Sequence[Mutation]
+    refusals: tuple[type[Exception], ...] = (DealHwError,)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireKind:
+    """Bytes that arrive from a device or another process.
+
+    Attributes:
+        make: Returns good messages.
+        read: Decodes the bytes as the product does.
+        mutations: How they are damaged; one is drawn for each input.
+        refusals: What a decoder may raise.
+    """
+
+    make: Callable[[], Sequence[bytes]]
+    read: Callable[[bytes], object]
+    mutations: Sequence[Mutation]
+    refusals: tuple[type[Exception], ...] = (DealHwError,)
+
+
+Kind = FileKind | WireKind
