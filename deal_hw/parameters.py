@@ -341,7 +341,7 @@ class ParameterDistribution:
             ConfigurationError: A field cannot give draws that are finite; the message names it.
         """
         if values.get("format") != "deal_hw.parameter_distribution/1":
-            raise ConfigurationError(f"not a parameter distribution: format is {values.get('format')!r}")
+            raise ConfigurationError(f"not a parameter distribution: format is {shown(values.get('format'))}")
         space = ParameterSpace.from_json(values["space"])
         K = len(space)
         covariance = values["covariance"]
@@ -358,7 +358,8 @@ class ParameterDistribution:
             space=space,
             mean=mean,
             covariance=None if covariance is None else _covariance(covariance, K),
-            latency_s=(float(low_s), float(high_s)),
+            # Minus zero, which is no less than zero, would be so for the generator.
+            latency_s=(float(low_s) + 0.0, float(high_s) + 0.0),
         )
 
     def digest(self) -> str:

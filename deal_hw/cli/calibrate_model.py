@@ -93,10 +93,10 @@ def write_parameters(config: Recordings) -> int:
         raise ConfigurationError("--write-parameters needs --model robot.xml")
     if path.exists():
         raise ConfigurationError(f"{path} exists; name another file, or remove it")
-    from deal_hw.sim.describe import compile_model
+    from deal_hw.sim.compiling import compile_mjcf
     from deal_hw.sim.parameters.template import template
 
-    text = template(compile_model(config.model), config.model.name)
+    text = template(compile_mjcf(config.model), config.model.name)
     path.write_text(text, encoding="utf-8")
     again = f"deal-hw calibrate --model {config.model} --parameters {path} --data ..."
     print(f"written: {path}; edit it, then: {again}")
@@ -129,7 +129,8 @@ def prepare_model(
     """
     try:
         from deal_hw.data.importing.columns import read_column_map
-        from deal_hw.sim.describe import compile_model, describe
+        from deal_hw.sim.compiling import compile_mjcf
+        from deal_hw.sim.describe import describe
         from deal_hw.sim.joint_facts import joint_facts
         from deal_hw.sim.model import load_model
     except ModuleNotFoundError as err:
@@ -147,9 +148,9 @@ def prepare_model(
         if not quiet:
             print(text, file=sys.stderr)
 
-    model = compile_model(config.model)
+    model = compile_mjcf(config.model)
     space = _space(config, narrowing, model)
-    facts = joint_facts(config.model)
+    facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
     fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)

@@ -1,4 +1,4 @@
-"""Reads files that may hold anything, up to a size; writes so that a crash leaves no half of a file or a set."""
+"""Reads files that may hold anything, up to a size; writes so that a crash leaves no half of them."""
 
 from __future__ import annotations
 

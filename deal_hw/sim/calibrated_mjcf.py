@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim import mjcf_tables as tables
 from deal_hw.sim.mjcf_changes import MjcfChanges, differences, numbers
@@ -149,9 +149,10 @@ def _compile(path: Path) -> Any:
     try:
         # Where MuJoCo finds what included files refer to depends on whether this path is absolute.
         return mujoco.MjModel.from_xml_path(os.path.abspath(path))
-    except ValueError as err:
+    except (ValueError, mujoco.FatalError) as err:
         raise ConfigurationError(
-            f"the calibrated model {path} does not compile: {err}; the values are in result.json beside it"
+            f"the calibrated model {path} does not compile: {short(str(err))}; the values are in "
+            "result.json beside it"
         ) from err
 
 
