@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.errors import ConfigurationError, DatasetError, short, shown
+from deal_hw.reading import RECORDING_BYTES, object_of, read_arrays, read_bytes, reading
 
 State = Mapping[str, Any]
 """Nested mappings and lists of plain JSON values and NumPy arrays."""
@@ -75,17 +76,14 @@ def unpack(data: bytes) -> dict[str, Any]:
     Raises:
         DatasetError: These are not the bytes of a checkpoint.
     """
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-        header = json.loads(arrays.pop(_HEADER).tobytes())
+    with reading("the state", FORMAT):
+        arrays, left_out = read_arrays(data, lambda dtype, shape: dtype.kind in "biufc")
+        if left_out:
+            raise ValueError(f"{short(next(iter(left_out)), 60)} is no array of numbers")
+        header = object_of(json.loads(arrays.pop(_HEADER).tobytes()))
         if header["format"] != FORMAT:
-            raise ValueError(f"format {header['format']!r}")
-        state: dict[str, Any] = _restored(header["state"], arrays)
-    # Damaged bytes make the ZIP, NPY and JSON readers raise nearly anything; nothing of ours is called here.
-    except Exception as err:
-        raise DatasetError(f"this is no checkpoint of {FORMAT}: {err or type(err).__name__}") from err
-    return state
+            raise ValueError(f"format {shown(header['format'])}")
+        return dict(object_of(_restored(header["state"], arrays)))
 
 
 def _restored(value: Any, arrays: Mapping[str, Any]) -> Any:
@@ -136,23 +134,17 @@ class Checkpoint:
         """
         if self._fresh:
             return None
-        try:
-            data = self.path.read_bytes()
-        except FileNotFoundError:
+        if not self.path.exists():
             return None
-        except OSError as err:
-            raise DatasetError(f"{self.path} cannot be read: {err.strerror}") from err
-        try:
-            saved = unpack(data)
-        except DatasetError as err:
-            raise DatasetError(f"{self.path}: {err}; remove it and begin again") from err
+        with reading(self.path, "a calibration's state", "remove it and begin again"):
+            saved = unpack(read_bytes(self.path, RECORDING_BYTES))
         if saved.get("identity") != self.identity:
             raise ConfigurationError(
                 f"{self.path} is of a run with other data, settings or versions and cannot be resumed; "
                 "remove it, or repeat the settings of that run"
             )
-        state: dict[str, Any] = saved["run"]
-        return state
+        with reading(self.path, "a calibration's state", "remove it and begin again"):
+            return dict(object_of(saved["run"]))
 
     def remove(self) -> None:
         """Remove the file: the run is over."""

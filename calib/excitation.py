@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.calib.problem import Problem
+from deal_hw.calibration import SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.batch import COMMAND_DELAY
 
-SHORTEST_S = 1.0
 LEAST_NOISE_RATIO = 20.0
 LEAST_CHOSEN_RATIO = 5.0
 """The same where the noise was chosen: allowing for what the model lacks, it is far above the sensor's."""

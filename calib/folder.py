@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.report.inputs import ReportInputs
-from deal_hw.calibration import CalibrationResult
-from deal_hw.data.files import write_json
-from deal_hw.errors import DatasetError
-from deal_hw.sim.calibrated_mjcf import write_calibrated_mjcf
+from deal_hw.calibration import RESULT_FILE, CalibrationResult
+from deal_hw.data.files import published_together, write_json
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.sim.calibrated_mjcf import require_other, write_calibrated_mjcf
 from deal_hw.sim.model import RobotModel
 
-RESULT = "result.json"
 DISTRIBUTION = "distribution.json"
 MODEL = "calibrated.xml"
 TRACE = "trace.npz"
@@ -25,7 +23,7 @@ REPORT = "report.html"
 def write_result(
     folder: Path, robot: RobotModel, result: CalibrationResult, report: ReportInputs | None = None
 ) -> dict[str, Path]:
-    """Write everything a calibration found; each file appears whole or not at all.
+    """Write everything a calibration found; all of it appears, or none.
 
     Args:
         folder: Where to write; made if need be.
@@ -39,46 +37,41 @@ def write_result(
     Raises:
         DatasetError: The folder cannot be written.
         ConfigurationError: A calibrated value cannot be written into the model; all other files are there.
+        KeyboardInterrupt: Ctrl-C; nothing was changed, or all files are there.
     """
-    files = {name: folder / name for name in (RESULT, DISTRIBUTION, TRACE)}
+    unwritable: ConfigurationError | None = None
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(files[RESULT], result.to_json())
-        write_json(files[DISTRIBUTION], result.distribution().to_json())
-        keys = sorted({key for row in result.trace for key in row})
-        columns: dict[str, Any] = {
-            key: np.array([row.get(key, np.nan) for row in result.trace]) for key in keys
-        }
-        if result.population is not None:
-            columns["population"] = result.population
-        np.savez(files[TRACE], **columns)
-        if report is not None:
-            # Only here: matplotlib takes half a second to load.
-            from deal_hw.calib.report.page import write_report
+        with published_together(folder) as waiting:
+            names = [RESULT_FILE, DISTRIBUTION, TRACE]
+            write_json(waiting / RESULT_FILE, result.to_json())
+            write_json(waiting / DISTRIBUTION, result.distribution().to_json())
+            np.savez(waiting / TRACE, **_trace(result))
+            if report is not None:
+                # Only here: matplotlib takes half a second to load.
+                from deal_hw.calib.report.page import write_report
 
-            files[REPORT] = folder / REPORT
-            write_report(files[REPORT], report)
-        # Last: a model that cannot be written must not cost the numbers.
-        source = f"method {result.method}, distribution {result.distribution().digest()}"
-        written = write_calibrated_mjcf(
-            robot, result.space, result.estimate, folder / MODEL, result.latency_s, source
-        )
-        files.update({file.name: file for file in written})
+                write_report(waiting / REPORT, report)
+                names.append(REPORT)
+            source = f"method {result.method}, distribution {result.distribution().digest()}"
+            try:
+                require_other(folder / MODEL, robot.description.mjcf)
+                written = write_calibrated_mjcf(
+                    robot, result.space, result.estimate, waiting / MODEL, result.latency_s, source
+                )
+                names += [file.name for file in written]
+            except ConfigurationError as err:
+                # A model that cannot be written must not cost the numbers.
+                unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
     except OSError as err:
         raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
-    return files
+    if unwritable is not None:
+        raise unwritable
+    return {name: folder / name for name in names}
 
 
-def read_result(path: Path) -> CalibrationResult:
-    """Read a result from its file or its folder.
-
-    Raises:
-        DatasetError: There is none.
-    """
-    file = path / RESULT if path.is_dir() else path
-    try:
-        return CalibrationResult.from_json(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError) as err:
-        raise DatasetError(
-            f"{file} is not a calibration result ({err}); `deal-hw calibrate` writes one"
-        ) from err
+def _trace(result: CalibrationResult) -> dict[str, Any]:
+    keys = sorted({key for row in result.trace for key in row})
+    columns: dict[str, Any] = {key: np.array([row.get(key, np.nan) for row in result.trace]) for key in keys}
+    if result.population is not None:
+        columns["population"] = result.population
+    return columns

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from deal_hw.calib.noise import NoiseModel, noise_model, white_noise_std
 from deal_hw.calib.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
+from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.batch import BatchPool, ServoBatch
@@ -33,8 +34,6 @@ __all__ = [
 
 WIRE_RESOLUTION = 1e-6
 """Positions travel as whole micrometres and microradians."""
-
-LATENCY_RANGE_S = (0.0, 0.04)
 
 VELOCITY_PRIOR_STD = {"m": 3.0, "rad": 30.0}
 """Weak prior on start velocities, in m/s and rad/s: keeps windows of few samples solvable."""
@@ -128,6 +127,11 @@ class Problem:
     def __post_init__(self) -> None:
         robot, space, threads = self.robot, self.space, self.threads
         self._batches = BatchPool(lambda count: ServoBatch(robot, space, count, threads))
+        low, high = (1e3 * v for v in self.latency_range_s)
+        if self.fixed_latency_s is not None and not low <= 1e3 * self.fixed_latency_s <= high:
+            raise ConfigurationError(
+                f"a latency of {1e3 * self.fixed_latency_s:g} ms: the simulator has {low:g} to {high:g} ms"
+            )
         if not self.episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
         self.episodes = [fill_gaps(e) for e in self.episodes]

@@ -5,13 +5,22 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 
-from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterDistribution, ParameterSpace
+from deal_hw.reading import number, numbers, object_of, read_json, reading, texts
 from deal_hw.types import FloatArray
 
+LATENCY_RANGE_S = (0.0, 0.04)
+"""Total latencies that are searched, and that the simulator of a calibration can have [s]."""
+SHORTEST_S = 1.0
+"""Shortest recording that is calibrated from [s]."""
+RESULT_FILE = "result.json"
+RESULT_FORMAT = "deal_hw.calibration_result/1"
 Verdict = Literal["identifiable", "weak", "not identifiable"]
 ProblemT = TypeVar("ProblemT", contravariant=True)
 
@@ -128,7 +137,7 @@ class CalibrationResult:
                 "verdict": self.verdicts[k] if self.verdicts else None,
             }
         return {
-            "format": "deal_hw.calibration_result/1",
+            "format": RESULT_FORMAT,
             "method": self.method,
             "space": self.space.to_json(),
             "parameters": parameters,
@@ -148,28 +157,58 @@ class CalibrationResult:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> CalibrationResult:
-        """Return the result that :meth:`to_json` wrote."""
+        """Return the result that :meth:`to_json` wrote.
+
+        Raises:
+            ConfigurationError: A field is of another kind or shape; the message names it.
+        """
+        if values.get("format") != RESULT_FORMAT:
+            raise ConfigurationError(f"not a calibration result: format is {shown(values.get('format'))}")
         space = ParameterSpace.from_json(values["space"])
-        rows = [values["parameters"][name] for name in space.names]
+        K = len(space)
+        rows = [object_of(values["parameters"][name], f"parameter {shown(name)}") for name in space.names]
         covariance = values["covariance"]
+        verdicts = tuple(row["verdict"] for row in rows) if rows and rows[0]["verdict"] else ()
+        if unknown := [v for v in verdicts if v not in get_args(Verdict)]:
+            raise UnknownNameError("verdict", shown(unknown[0]), get_args(Verdict))
+        low_s, high_s = numbers(values["latency_interval_s"], "latency_interval_s", (2,), finite=False)
         return cls(
-            method=values["method"],
+            method=texts([values["method"]], "method")[0],
             space=space,
-            estimate=np.array([row["estimate"] for row in rows]),
-            interval=np.array([[row["low"], row["high"]] for row in rows]),
-            covariance=None if covariance is None else np.array(covariance),
-            verdicts=tuple(row["verdict"] for row in rows) if rows and rows[0]["verdict"] else (),
-            null_directions=tuple(values["null_directions"]),
-            latency_s=values["latency_s"],
-            latency_interval_s=(values["latency_interval_s"][0], values["latency_interval_s"][1]),
-            chi2=values["chi2"],
-            alarms=tuple(values["alarms"]),
-            advice=tuple(values.get("advice", ())),
-            heldout_nrmse=values["heldout_nrmse"],
-            steps=values["steps"],
-            seconds=values["seconds"],
-            provenance=values["provenance"],
+            estimate=numbers([row["estimate"] for row in rows], "estimate", (K,)),
+            interval=numbers([[row["low"], row["high"]] for row in rows], "interval", (K, 2), finite=False)
+            if rows
+            else np.empty((0, 2)),
+            covariance=None
+            if covariance is None
+            else numbers(covariance, "covariance", (K, K), finite=False),
+            verdicts=verdicts,
+            null_directions=texts(values["null_directions"], "null_directions"),
+            latency_s=number(values["latency_s"], "latency_s", 0.0, LONGEST_LATENCY_S),
+            latency_interval_s=(float(low_s), float(high_s)),
+            chi2=float(numbers(values["chi2"], "chi2", (), finite=False)),
+            alarms=texts(values["alarms"], "alarms"),
+            advice=tuple(object_of(row, "advice") for row in values.get("advice", ())),
+            heldout_nrmse={
+                name: float(numbers(value, "heldout_nrmse", (), finite=False))
+                for name, value in object_of(values["heldout_nrmse"], "heldout_nrmse").items()
+            },
+            steps=int(number(values["steps"], "steps", 0.0)),
+            seconds=number(values["seconds"], "seconds", 0.0),
+            provenance=object_of(values["provenance"], "provenance"),
         )
+
+
+def read_result(path: Path) -> CalibrationResult:
+    """Read a result from its file or its folder.
+
+    Raises:
+        DatasetError: There is none.
+        ConfigurationError: The file holds no result; the message names the field.
+    """
+    file = path / RESULT_FILE if path.is_dir() else path
+    with reading(file, "a calibration result", "`deal-hw calibrate` writes one"):
+        return CalibrationResult.from_json(object_of(read_json(file)))
 
 
 class StateStore(Protocol):

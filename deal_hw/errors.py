@@ -27,7 +27,39 @@ The tree (built-in parents in parentheses)::
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import reprlib
+from collections.abc import Iterable, Mapping
+
+QUOTED = 200
+"""Most characters of a file's content that a message repeats."""
+LISTED = 1000
+"""Most characters of the names that a message lists."""
+
+
+def short(value: object, most: int = QUOTED) -> str:
+    """Return text, or the `repr` of another value, in one printable line of a bounded length.
+
+    Args:
+        value: What a message is to show; it may come from a hostile file.
+        most: Longest text to return.
+    """
+    if not isinstance(value, str):
+        # A plain repr of nested lists that share their parts may be a million times as long as the file.
+        value = _REPR.repr(value) if isinstance(value, _CONTAINERS) else str(value)
+    text = " ".join(value[: 4 * most].split())
+    # Control characters of a file would speak to the terminal.
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def shown(value: object) -> str:
+    """Return a value of a file as a message shows it: :func:`short`, text in quotes."""
+    return repr(short(value)) if isinstance(value, str) else short(value)
+
+
+_CONTAINERS = (Mapping, list, tuple, set, frozenset)
+_REPR = reprlib.Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, 60, 60
 
 
 class DealHwError(Exception):
@@ -50,7 +82,8 @@ class UnknownNameError(ConfigurationError):
     def __init__(self, what: str, given: str, allowed: Iterable[str]) -> None:
         self.given = given
         self.allowed = tuple(allowed)
-        super().__init__(f"unknown {what} {given!r}; known: {', '.join(self.allowed) or '(none)'}")
+        known = short(", ".join(self.allowed) or "(none)", LISTED)
+        super().__init__(f"unknown {what} {short(given)!r}; known: {known}")
 
 
 class MissingExtraError(DealHwError, ImportError):

@@ -12,14 +12,19 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.reading import number, numbers, texts
 from deal_hw.types import FloatArray
 
 Scale = Literal["log", "linear"]
+LONGEST_LATENCY_S = 1.0
+"""No robot is later [s]."""
+_LARGEST_VARIANCE = 1e100
+"""Beyond that sums of squares are no numbers any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +69,9 @@ class Parameter:
         )  # fmt: skip
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
+        if self.scale not in get_args(Scale):
+            raise UnknownNameError(f"scale of parameter {self.name!r}", self.scale, get_args(Scale))
+        if not (np.isfinite(self.high - self.low) and self.low < self.high):
             raise ConfigurationError(
                 f"parameter {self.name!r}: range [{self.low:g}, {self.high:g}] {self.unit} must have "
                 "low < high"
@@ -106,6 +113,24 @@ class Parameter:
             # Policies carry a digest of these values: those made before priors existed must keep theirs.
             del values["prior_mean"], values["prior_std"]
         return values
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Parameter:
+        """Return the parameter that :meth:`to_json` wrote.
+
+        Raises:
+            ConfigurationError: A value is of another kind than the field.
+        """
+        name = shown(values["name"])
+        if not all(isinstance(values[key], str) for key in ("name", "kind", "unit", "scale")):
+            raise ConfigurationError(f"parameter {name}: name, kind, unit and scale must be texts")
+        if not isinstance(values["known"], bool):
+            raise ConfigurationError(f"parameter {name}: known must be true or false")
+        keys = ["nominal", "low", "high"]
+        keys += [key for key in ("prior_mean", "prior_std") if values.get(key) is not None]
+        found = {key: number(values[key], f"parameter {name}: {key}") for key in keys}
+        elements = texts(values["elements"], f"parameter {name}: elements")
+        return cls(**{**values, **found, "elements": elements})
 
 
 class ParameterSpace:
@@ -248,7 +273,7 @@ class ParameterSpace:
     @classmethod
     def from_json(cls, values: Iterable[Mapping[str, Any]]) -> ParameterSpace:
         """Return the space that :meth:`to_json` wrote."""
-        return cls(Parameter(**{**v, "elements": tuple(v["elements"])}) for v in values)
+        return cls(Parameter.from_json(v) for v in values)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -290,7 +315,9 @@ class ParameterDistribution:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         draws = self.space.to_scale(self.mean) + rng.standard_normal((count, len(self.space))) @ root.T
-        return np.clip(self.space.from_scale(draws), self.space.low, self.space.high)
+        # A draw beyond all numbers on a log scale is cut off at the range as well.
+        with np.errstate(over="ignore"):
+            return np.clip(self.space.from_scale(draws), self.space.low, self.space.high)
 
     def sample_latency(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Draw total latencies, (count,) [s]."""
@@ -308,18 +335,42 @@ class ParameterDistribution:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> ParameterDistribution:
-        """Return the distribution that :meth:`to_json` wrote."""
+        """Return the distribution that :meth:`to_json` wrote.
+
+        Raises:
+            ConfigurationError: A field cannot give draws that are finite; the message names it.
+        """
         if values.get("format") != "deal_hw.parameter_distribution/1":
-            raise ConfigurationError(f"not a parameter distribution: format is {values.get('format')!r}")
+            raise ConfigurationError(f"not a parameter distribution: format is {shown(values.get('format'))}")
         space = ParameterSpace.from_json(values["space"])
+        K = len(space)
         covariance = values["covariance"]
+        low_s, high_s = numbers(values["latency_s"], "latency_s", (2,))
+        if not 0 <= low_s <= high_s <= LONGEST_LATENCY_S:
+            raise ConfigurationError(
+                f"latency_s is {low_s:g} to {high_s:g} s; it lies between 0 and {LONGEST_LATENCY_S:g} s"
+            )
+        mean = numbers([values["mean"][name] for name in space.names], "mean", (K,))
+        for p, value in zip(space, mean, strict=True):
+            if p.scale == "log" and value <= 0:
+                raise ConfigurationError(f"mean of {p.name!r} is {value:g}; on a log scale it is above 0")
         return cls(
             space=space,
-            mean=np.array([values["mean"][name] for name in space.names]),
-            covariance=None if covariance is None else np.array(covariance, dtype=float),
-            latency_s=(float(values["latency_s"][0]), float(values["latency_s"][1])),
+            mean=mean,
+            covariance=None if covariance is None else _covariance(covariance, K),
+            # Minus zero, which is no less than zero, would be so for the generator.
+            latency_s=(float(low_s) + 0.0, float(high_s) + 0.0),
         )
 
     def digest(self) -> str:
         """Return a digest of the distribution; a policy carries the one it was trained under."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _covariance(values: Any, size: int) -> FloatArray:
+    found = numbers(values, "covariance", (size, size))
+    if np.abs(found).max(initial=0.0) > _LARGEST_VARIANCE:
+        raise ConfigurationError(f"covariance holds a value above {_LARGEST_VARIANCE:g}")
+    if not np.allclose(found, found.T, rtol=1e-6, atol=1e-12) or (np.diag(found) < 0).any():
+        raise ConfigurationError("covariance is not symmetric, or a variance in it is below 0")
+    return found

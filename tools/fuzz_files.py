@@ -23,7 +23,7 @@ from pathlib import Path
 from fuzz.kind import FileKind, Kind
 from fuzz.run import make_input, run
 
-GROUPS = ("recordings", "wire")
+GROUPS = ("recordings", "wire", "calibration")
 
 
 def kinds() -> dict[str, Kind]:

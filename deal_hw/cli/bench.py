@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 
 from deal_hw.calibration import Budget
 from deal_hw.cli.bench_go2_transport import TransportBench
 from deal_hw.cli.calibrate_model import Recordings
+from deal_hw.cli.options import Range, Ratio, Threads, check_ranges, given, refuse
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
-from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
+from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError, shown
+from deal_hw.reading import object_of, read_json, reading
 
 FORMAT = "deal_hw.bench/1"
+MOST_SEEDS = 10_000
+Seeds = Range(0, 2**32 - 1 - MOST_SEEDS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +45,7 @@ class Bench:
     holdout: tuple[Path, ...] = ()
     """real: recordings that only judge; by default the last part of each."""
 
-    heldout_window: float = 5.0
+    heldout_window: Annotated[float, Range(1e-3, 600, "s")] = 5.0
     """real: held-out predictions restart this often [s]."""
 
     residual_std: tuple[str, ...] = ()
@@ -75,10 +78,10 @@ class Bench:
     demonstration: Literal["excite", "policy"] = "excite"
     """How ant and Go2 are demonstrated: by motions that excite, or by their shipped policies."""
 
-    population: int = 100
+    population: Annotated[int, Range(2, 100_000)] = 100
     """Members of a search."""
 
-    generations: int = 50
+    generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of a search."""
 
     train: bool = True
@@ -87,11 +90,22 @@ class Bench:
     out: Path | None = None
     """File of the rows, by default BENCH.json; the CSV and the figure lie beside it."""
 
-    threads: int | None = None
+    threads: Threads = None
     """Simulation threads; by default all CPUs."""
 
     quiet: bool = False
     """Print nothing but errors."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        parse_seeds(self.seeds)
+        parse_ratios(self.xi)
+        if self.bench != "real":
+            options = given(self.recordings, Recordings())
+            options += given(self, Bench(bench="real"), ("holdout", "heldout_window", "residual_std"))
+            refuse(options, "only `bench real` takes that")
+        if self.bench != "go2-transport":
+            refuse(given(self.link, TransportBench()), "only `bench go2-transport` takes that")
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -104,7 +118,12 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     try:
         for part in text.split(","):
             first, dash, last = part.strip().partition("-")
-            seeds += range(int(first), int(last) + 1) if dash else [int(first)]
+            ends = int(first), int(last if dash else first)
+            Seeds.check("--seeds", ends)
+            Range(ends[0], ends[0] + MOST_SEEDS).check("--seeds", ends[1])
+            seeds += range(ends[0], ends[1] + 1)
+    except ConfigurationError:
+        raise
     except ValueError as err:
         raise ConfigurationError(
             f"--seeds {text!r}: give numbers and ranges, such as 0,1 or 1000-1009"
@@ -124,8 +143,7 @@ def parse_ratios(text: str) -> tuple[float, ...]:
         ratios = tuple(float(part) for part in text.split(","))
     except ValueError as err:
         raise ConfigurationError(f"--xi {text!r}: give numbers above 1, such as 5 or 3,5,10,20") from err
-    if not all(xi > 1 for xi in ratios):
-        raise ConfigurationError(f"--xi {text!r}: a ratio must be above 1")
+    Ratio.check("--xi", ratios)
     return ratios
 
 
@@ -273,16 +291,13 @@ def _line(row: Mapping[str, Any]) -> str:
 def _load(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+    with reading(path, "rows of a bench", "name another file"):
+        values = object_of(read_json(path))
         if values["format"] != FORMAT:
             raise DatasetError(
-                f"{path} has format {values['format']!r}, expected {FORMAT!r}; name another file"
+                f"{path} has format {shown(values['format'])}, not {FORMAT!r}; name another file"
             )
-        rows: list[dict[str, Any]] = values["rows"]
-    except (ValueError, KeyError, TypeError) as err:
-        raise DatasetError(f"{path} exists and is not a bench file ({err!r}); name another file") from err
-    return rows
+        return [dict(object_of(row, "a row")) for row in values["rows"]]
 
 
 def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -7,13 +7,14 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import tyro
 
 from deal_hw.cli.bench_go2_process import SideProcess
 from deal_hw.cli.bench_go2_sides import LATE_NS
 from deal_hw.cli.emulate_go2 import free_port
+from deal_hw.cli.options import Range, check_ranges
 from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.cli.witness import Account, witnesses
 from deal_hw.errors import ConfigurationError
@@ -38,27 +39,24 @@ class TransportBench:
     port: str = ""
     """go2-transport: network interface (dds) or end point (zenoh); by default on this machine's loopback."""
 
-    seconds: float = 20.0
+    seconds: Annotated[float, Range(0.1, 86_400, "s")] = 20.0
     """go2-transport: how long to measure [s]."""
 
-    rate: float = 500.0
+    rate: Annotated[float, Range(1, 10_000, "Hz")] = 500.0
     """go2-transport: commands and states a second [1/s]."""
 
-    freeze_at: float | None = None
+    freeze_at: Annotated[float | None, Range(1e-3, 86_400, "s")] = None
     """go2-transport: stop the robot's process (SIGSTOP) this long after the start [s]."""
 
-    freeze_s: float = 1.0
+    freeze_s: Annotated[float, Range(1e-3, 3600, "s")] = 1.0
     """go2-transport: for how long [s]."""
 
     wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
     """go2-transport: more about the network."""
 
     def __post_init__(self) -> None:
-        if not (0 < self.rate <= 10_000 and self.seconds > 0):
-            raise ConfigurationError(f"--rate {self.rate:g} --seconds {self.seconds:g}: both are above 0")
-        if self.freeze_at is not None and not (
-            self.freeze_at > 0 and self.freeze_s > 0 and self.freeze_at + self.freeze_s < self.seconds
-        ):
+        check_ranges(self)
+        if self.freeze_at is not None and not self.freeze_at + self.freeze_s < self.seconds:
             raise ConfigurationError(
                 f"--freeze-at {self.freeze_at:g} --freeze-s {self.freeze_s:g}: begin and end lie inside the "
                 f"{self.seconds:g} s of the run"

@@ -6,12 +6,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
-from deal_hw.calibration import Budget
+from deal_hw.calibration import LATENCY_RANGE_S, Budget
 from deal_hw.cli.calibrate_live import CHECKPOINT, check_resume, saying_how_to_resume, watching
 from deal_hw.cli.calibrate_model import Recordings, prepare_model, write_parameters
 from deal_hw.cli.calibrate_run import (
@@ -24,6 +24,7 @@ from deal_hw.cli.calibrate_run import (
     residual_std,
 )
 from deal_hw.cli.excite import balancer
+from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -47,7 +48,7 @@ SAMPLES_A_PERIOD = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate:
+class Calibrate(Checked):
     """Find the simulator parameters that explain a recording.
 
     Of a robot that deal-hw drives:  deal-hw calibrate runs/first/dataset
@@ -65,14 +66,14 @@ class Calibrate:
     """Run folder; results go to OUT/calibration. By default the folder that holds the dataset, or
     runs/MODEL."""
 
-    episodes: tuple[int, ...] = ()
+    episodes: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
     """Episodes of the dataset to fit; by default all but the held-out ones."""
 
-    holdout: tuple[int | Path, ...] = ()
+    holdout: Annotated[tuple[int | Path, ...], Range(0, 1_000_000)] = ()
     """What only judges the result: episodes of the dataset (by default those collected with --profile chirp),
     or with --model recordings (by default the last part of each, --holdout-part)."""
 
-    heldout_window: float = HELDOUT_WINDOW_S
+    heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
     """Held-out predictions restart from the measured state this often [s]."""
 
     method: str = DEFAULT
@@ -86,17 +87,17 @@ class Calibrate:
     free: tuple[str, ...] = ()
     """Search exactly these parameters instead; the others keep their nominal values."""
 
-    known: tuple[tuple[str, float], ...] = ()
+    known: Annotated[tuple[tuple[str, float], ...], Range(-1e12, 1e12)] = ()
     """Parameters measured by other means, as NAME VALUE pairs (SI)."""
 
-    range: tuple[tuple[str, float, float], ...] = ()
+    range: Annotated[tuple[tuple[str, float, float], ...], Range(-1e12, 1e12)] = ()
     """Other search ranges, as NAME LOW HIGH (SI)."""
 
-    xi: float | None = None
+    xi: Annotated[float | None, Ratio] = None
     """Search each parameter within a factor XI to either side of its nominal value; 5 by default, with
     --parameters the ranges of that file."""
 
-    latency: float | None = None
+    latency: Annotated[float | None, Range(*LATENCY_RANGE_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
 
     residual_std: tuple[str, ...] = ()
@@ -104,23 +105,23 @@ class Calibrate:
     pairs of joints; by default the sensor noise, estimated. On real robots some milliradians often serve
     better."""
 
-    sample_hz: float | None = None
+    sample_hz: Annotated[float | None, Range(1, 1e5, "Hz")] = None
     """Fit to about so many states a second of a dataset; by default to four a control period. What was held
     out is judged at the same rate."""
 
-    population: int = 100
+    population: Annotated[int, Range(2, 100_000)] = 100
     """Members of the search."""
 
-    generations: int = 50
+    generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of the search."""
 
     polish: bool = True
     """Follow the search by multiple shooting on prediction error."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Fixes everything random."""
 
-    threads: int | None = None
+    threads: Threads = None
     """Simulation threads; by default all CPUs."""
 
     resume: bool = False
@@ -165,6 +166,11 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
             "(deal-hw calibrate --model robot.xml --data rec.csv), not both"
         )
+    if source.model is None:
+        refuse(
+            given(source, Recordings()),
+            "a dataset says it; that goes with --model and --data",
+        )
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
@@ -202,18 +208,17 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     }
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)
-    report = finish(
+    return finish(
         work,
         result,
         folder,
         settings,
+        checkpoint,
         page=config.report,
         advise=config.advise,
         threads=config.threads,
         quiet=config.quiet,
     )
-    checkpoint.unlink(missing_ok=True)
-    return report
 
 
 def _usual_method(config: Calibrate, robot: RobotModel) -> str:
@@ -245,10 +250,10 @@ def _narrowing(config: Calibrate, xi: float | None) -> Narrowing:
 
 
 def _prepare_model(config: Calibrate) -> Work:
-    if config.episodes or config.space:
-        raise ConfigurationError(
-            "--episodes and --space are for datasets; with --model use --data, --parameters"
-        )
+    refuse(
+        given(config, Calibrate(), ("episodes", "space", "sample_hz")),
+        "only datasets take that; with --model use --data and --parameters",
+    )
     holdout = [Path(str(path)) for path in config.holdout]
     xi = XI if config.xi is None and config.recordings.parameters is None else config.xi
     return prepare_model(

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from deal_hw.cli.calibrate_checks import (
     examine_recording,
@@ -26,6 +26,7 @@ from deal_hw.cli.calibrate_recordings import (
     without,
 )
 from deal_hw.cli.calibrate_run import Narrowing, Work
+from deal_hw.cli.options import Checked, Range
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
@@ -37,7 +38,7 @@ HELDOUT_PART = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recordings:
+class Recordings(Checked):
     """Any robot: its MuJoCo model and its recordings. Step by step in docs/any-robot.md."""
 
     model: Path | None = None
@@ -60,21 +61,21 @@ class Recordings:
     """Of a floating robot: its feet's sphere geoms. Base height and velocity are estimated from those that
     stand; recordings must hold the base's orientation and gyro."""
 
-    holdout_part: float | None = None
+    holdout_part: Annotated[float | None, Range(0, 0.95)] = None
     """Without --holdout this last share of each recording only judges the result; 0.25 by default, 0 for
     none."""
 
-    leave_out: tuple[tuple[str, float, float], ...] = ()
+    leave_out: Annotated[tuple[tuple[str, float, float], ...], Range(0, 1e6, "s")] = ()
     """Stretches that the model has no part for, such as a contact: FILE FROM TO [s from its start]."""
 
-    fit_seconds: float = 60.0
+    fit_seconds: Annotated[float, Range(0.1, 1e5, "s")] = 60.0
     """Fit stretches that lie evenly over the recordings and add up to so many seconds; more is slower."""
 
-    window: float = 0.4
+    window: Annotated[float, Range(1e-3, 60, "s")] = 0.4
     """Length of the search's longest windows of prediction [s]; the first ones are a quarter of it. Longer
     ones see slow things (weight, friction that holds) and cost memory with the square of their samples."""
 
-    physics_step: float | None = None
+    physics_step: Annotated[float | None, Range(1e-6, 0.1, "s")] = None
     """Wanted physics step [s]; by default the MJCF's timestep. A whole number fits into a sampling period."""
 
     force: bool = False
@@ -92,10 +93,10 @@ def write_parameters(config: Recordings) -> int:
         raise ConfigurationError("--write-parameters needs --model robot.xml")
     if path.exists():
         raise ConfigurationError(f"{path} exists; name another file, or remove it")
-    from deal_hw.sim.describe import compile_model
+    from deal_hw.sim.compiling import compile_mjcf
     from deal_hw.sim.parameters.template import template
 
-    text = template(compile_model(config.model), config.model.name)
+    text = template(compile_mjcf(config.model), config.model.name)
     path.write_text(text, encoding="utf-8")
     again = f"deal-hw calibrate --model {config.model} --parameters {path} --data ..."
     print(f"written: {path}; edit it, then: {again}")
@@ -128,7 +129,8 @@ def prepare_model(
     """
     try:
         from deal_hw.data.importing.columns import read_column_map
-        from deal_hw.sim.describe import compile_model, describe
+        from deal_hw.sim.compiling import compile_mjcf
+        from deal_hw.sim.describe import describe
         from deal_hw.sim.joint_facts import joint_facts
         from deal_hw.sim.model import load_model
     except ModuleNotFoundError as err:
@@ -146,9 +148,9 @@ def prepare_model(
         if not quiet:
             print(text, file=sys.stderr)
 
-    model = compile_model(config.model)
+    model = compile_mjcf(config.model)
     space = _space(config, narrowing, model)
-    facts = joint_facts(config.model)
+    facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
     fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
@@ -201,10 +203,6 @@ def _holdout_share(config: Recordings, holdout: Sequence[Path]) -> float:
     if holdout:
         return 0.0
     share = HELDOUT_PART if config.holdout_part is None else config.holdout_part
-    if not 0 <= share < 1:
-        raise ConfigurationError(f"--holdout-part must be at least 0 and below 1, got {share:g}")
-    if not config.fit_seconds > 0:
-        raise ConfigurationError(f"--fit-seconds must be above 0, got {config.fit_seconds:g}")
     return share
 
 

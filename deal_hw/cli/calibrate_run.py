@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
-from deal_hw.cli.calibrate_live import open_checkpoint
+from deal_hw.cli.calibrate_live import open_checkpoint, saying_how_to_resume
+from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.calib.report.inputs import ReportInputs
     from deal_hw.control.behaviours import Behaviour
     from deal_hw.sim.episode import Episode
     from deal_hw.sim.model import RobotModel
@@ -245,8 +247,7 @@ def _positive(word: str) -> float:
         value = float(word)
     except ValueError as err:
         raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err
-    if not (np.isfinite(value) and value > 0):
-        raise ConfigurationError(f"--residual-std must be above 0, got {word}")
+    Range(1e-9, 1e3, "rad or m").check("--residual-std", value)
     return value
 
 
@@ -255,6 +256,7 @@ def finish(
     result: CalibrationResult,
     folder: Path,
     settings: Mapping[str, Any],
+    checkpoint: Path,
     *,
     page: bool = True,
     advise: bool = True,
@@ -268,13 +270,44 @@ def finish(
         result: What was found.
         folder: Where to write.
         settings: What else the provenance says: plain JSON values.
+        checkpoint: File of the state to resume from; removed once the results are there.
         page: Write report.html.
         advise: Compute what to record next for parameters that stayed open.
         threads: Simulation threads.
         quiet: Print nothing.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C. It is said whether there are results; where there are, they are whole.
     """
     from deal_hw.calib.folder import write_result
+    from deal_hw.data.files import interrupts_deferred
 
+    with saying_how_to_resume(checkpoint):
+        result, report = _judged(work, result, settings, page=page, advise=advise, threads=threads)
+    try:
+        # An impatient Ctrl-C must neither cost an hour's work nor leave half of it.
+        with interrupts_deferred():
+            files = write_result(folder, work.robot, result, report)
+            checkpoint.unlink(missing_ok=True)
+        if not quiet:
+            print_result(result, work.advice)
+            print("written: " + ", ".join(str(f) for f in files.values()))
+    except KeyboardInterrupt:
+        print(f"\ninterrupted after the end: the results in {folder} are whole", file=sys.stderr)
+        raise
+    return CalibrateReport(result=result, files=files)
+
+
+def _judged(
+    work: Work,
+    result: CalibrationResult,
+    settings: Mapping[str, Any],
+    *,
+    page: bool,
+    advise: bool,
+    threads: int | None,
+) -> tuple[CalibrationResult, ReportInputs | None]:
+    """Return the result with advice and provenance, and what its report shows."""
     if advise:
         from deal_hw.calib.next_recording import next_recordings
 
@@ -291,18 +324,14 @@ def finish(
             "processors": len(os.sched_getaffinity(0)),
         },
     )
-    report = None
-    if page:
-        from deal_hw.calib.report.gather import gather
+    if not page:
+        return result, None
+    from deal_hw.calib.report.gather import gather
 
-        report = gather(
-            work.robot, result, work.episodes, work.holdout, telemetry=work.telemetry, threads=threads
-        )
-    files = write_result(folder, work.robot, result, report)
-    if not quiet:
-        print_result(result, work.advice)
-        print("written: " + ", ".join(str(f) for f in files.values()))
-    return CalibrateReport(result=result, files=files)
+    inputs = gather(
+        work.robot, result, work.episodes, work.holdout, telemetry=work.telemetry, threads=threads
+    )
+    return result, inputs
 
 
 @contextmanager

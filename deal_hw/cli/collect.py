@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from deal_hw.calibration import SHORTEST_S
 from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
+from deal_hw.cli.options import Checked, Range, RunSeconds, Seed, given, refuse
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
-from deal_hw.control.vigor import ATTEMPTS
+from deal_hw.control.vigor import ATTEMPTS, GENTLEST, LIVELIEST
 
 EXCITATION_FILE = "excitation.json"
 """Where the excitation of `--excite optimal` is kept, in the run folder."""
+SHORT_S = 1.5 * SHORTEST_S
+"""Recordings below this are told to be short: not every sample is usable [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Collect:
+class Collect(Checked):
     """Record the robot while it moves in a way that tells much."""
 
     robot: tyro.conf.Positional[str]
@@ -53,21 +58,21 @@ class Collect:
     policy: Path | None = None
     """Policy that balances (.onnx); by default the one shipped for the robot."""
 
-    seconds: float = 4.0
+    seconds: RunSeconds = 4.0
     """Length of an episode [s]."""
 
-    episodes: int = 1
+    episodes: Annotated[int, Range(1, 10_000)] = 1
     """How many episodes."""
 
-    vigor: float = 0.0
+    vigor: Annotated[float, Range(GENTLEST, LIVELIEST)] = 0.0
     """Start profile rich livelier (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
     the safety limits."""
 
-    attempts: int = ATTEMPTS
+    attempts: Annotated[int, Range(1, 100)] = ATTEMPTS
     """How often an episode of profile rich is recorded at most: one that hardly moves is repeated livelier.
     After a trip nothing is repeated; look at the robot first."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Fixes the random set-points; episode k uses SEED + k."""
 
     rich: tyro.conf.Suppress[RichConfig] = field(default_factory=RichConfig)
@@ -83,10 +88,18 @@ def collect(config: Collect) -> RunReport:
     Raises:
         DealHwError: What made it fail; the robot is passive and what was recorded is whole.
     """
+    _refuse_ignored(config)
     policy = config.policy or shipped_policy(config.robot)
     excite, seconds = _excitation(config)
+    if seconds * config.episodes < SHORT_S and not config.quiet:
+        print(
+            f"warning: {seconds * config.episodes:g} s in all is too short for `deal-hw calibrate`, which "
+            f"needs {SHORTEST_S:g} s of usable samples; 4 s are enough (--seconds 4)",
+            file=sys.stderr,
+        )
+    walks = config.profile == "balance" and not excite
     plan = RunPlan(
-        **plan_options(config.robot, config.link, config.legs),
+        **plan_options(config.robot, config.link, config.legs, walks=walks),
         profile="excite" if excite else config.profile,
         policy=str(policy or ""),
         seconds=seconds,
@@ -106,13 +119,31 @@ def collect(config: Collect) -> RunReport:
     )
 
 
+def _refuse_ignored(config: Collect) -> None:
+    """Refuse options that the motion would ignore.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    default = Collect(robot=config.robot, port=config.port)
+    if config.excite:
+        refuse(given(config, default, ["profile"]), "--excite plays its own motion; leave one of the two out")
+    if config.excite or config.profile != "rich":
+        refuse(given(config, default, ["vigor", "attempts"]), "only --profile rich can be livelier")
+    if not config.excite and config.profile in ("chirp", "hold"):
+        refuse(given(config, default, ["policy"]), f"--profile {config.profile} runs no policy")
+
+
 def _excitation(config: Collect) -> tuple[str, float]:
     """Return what the control process is told to play, and for how long [s]; compute what is optimal."""
     if not config.excite or config.excite in FAMILIES:
         return config.excite, config.seconds
     if config.excite != "optimal":
         path = Path(config.excite)
-        return str(path), read_plan(path).seconds
+        plan = read_plan(path)
+        if config.seconds not in (plan.seconds, Collect.seconds):
+            refuse(["--seconds"], f"{path} says that it is {plan.seconds:g} s long; leave it out")
+        return str(path), plan.seconds
     # Only here: the rest of this verb runs on computers without the extras.
     from deal_hw.cli.excite import Excite, excite
 

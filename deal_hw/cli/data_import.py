@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from deal_hw.cli.calibrate_checks import examine_recording
+from deal_hw.cli.options import Checked, Range, given, refuse
 from deal_hw.errors import ConfigurationError
+from deal_hw.reading import number, object_of, read_json, reading, texts
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Import:
+class Import(Checked):
     """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/import.md."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
@@ -34,7 +35,7 @@ class Import:
     """A robot description (JSON, as in dataset.json) to use instead of a minimal one."""
     name: str = ""
     """The robot's name; by default that of the model's or the first recording's file."""
-    device_periods: int = 1
+    device_periods: Annotated[int, Range(1, 100_000)] = 1
     """Device periods between two samples: the robot's own control rate over the recording's."""
     force: bool = False
     """Take recordings in although a check failed; what failed stays with them."""
@@ -71,12 +72,13 @@ def import_recordings(config: Import) -> int:
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
 
-    if config.device_periods < 1:
-        raise ConfigurationError(f"--device-periods is {config.device_periods}; it is 1 or more")
+    if config.description is not None:
+        default = Import(paths=config.paths, out=config.out)
+        refuse(given(config, default, ("name", "device_periods")), "--description says it")
     columns = None if config.columns is None else read_column_map(config.columns)
     facts = _joint_facts(config.model)
-    given = None if config.description is None else _description(config.description)
-    joints = given["joint_names"] if given is not None else None if facts is None else facts.names
+    described = None if config.description is None else _description(config.description)
+    joints = described["joint_names"] if described is not None else None if facts is None else facts.names
     tables = [table for path in config.paths for table in load_tables(path, columns, joints, _say)]
     problems = {
         table.name: [
@@ -98,7 +100,7 @@ def import_recordings(config: Import) -> int:
         )
     if config.dry_run:
         return 0
-    values = given or minimal_description(
+    values = described or minimal_description(
         recordings,
         config.name or (config.model or config.paths[0]).stem,
         tables[0].units,
@@ -164,15 +166,15 @@ def _joint_facts(model: Path | None) -> JointFacts | None:
 
 
 def _description(path: Path) -> dict[str, Any]:
-    try:
-        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    with reading(
+        path, "a robot's description", "see `description` in a dataset.json", error=ConfigurationError
+    ):
+        values = object_of(read_json(path))
         missing = [key for key in ("name", "joint_names", "actuated", "state_rate_hz") if key not in values]
-    except OSError as error:
-        raise ConfigurationError(f"description {path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ConfigurationError(f"description {path} is not JSON: {error}") from error
-    if missing:
-        raise ConfigurationError(
-            f"description {path} lacks {', '.join(missing)}; see `description` in a dataset.json"
-        )
-    return values
+        if missing:
+            raise ConfigurationError(f"it lacks {', '.join(missing)}; see `description` in a dataset.json")
+        texts([values["name"]], "name")
+        for key in ("joint_names", "actuated"):
+            texts(values[key], key)
+        number(values["state_rate_hz"], "state_rate_hz", 1e-3, 1e6)
+        return dict(values)

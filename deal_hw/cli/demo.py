@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.supervised import RunReport
 from deal_hw.control.cadence import CadenceReport
@@ -27,7 +28,7 @@ from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo:
+class Demo(Checked):
     """Record, calibrate, retrain, deploy and compare on an emulated cart-pole over its serial port."""
 
     out: Path = Path("runs/demo")
@@ -36,13 +37,13 @@ class Demo:
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """What stands between the emulated mechanics and the wire."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Draws the hidden truth, the demonstration, the search and the training."""
 
-    episodes: int = 3
+    episodes: Annotated[int, Range(1, 1000)] = 3
     """Deployments of each policy, 10 s each."""
 
-    steps: int | None = None
+    steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps; by default those of the shipped UDR policy."""
 
 

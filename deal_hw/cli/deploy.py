@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
+from deal_hw.cli.options import Checked, Range, RunSeconds, Seed
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deploy:
+class Deploy(Checked):
     """Run a policy on the robot behind the safety filter, and record it."""
 
     robot: tyro.conf.Positional[str]
@@ -38,13 +40,13 @@ class Deploy:
     dataset: Path | None = None
     """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
 
-    seconds: float = 10.0
+    seconds: RunSeconds = 10.0
     """Length of an episode [s]."""
 
-    episodes: int = 1
+    episodes: Annotated[int, Range(1, 10_000)] = 1
     """How many episodes."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Noted in the recording; the policy itself is not random."""
 
     task: str = ""

@@ -9,12 +9,13 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
+from deal_hw.cli.options import Range, check_ranges
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
 from deal_hw.errors import ConfigurationError, DealHwError
@@ -43,7 +44,7 @@ class Doctor:
     state_check: Literal["strict", "length"] = "strict"
     """What the states of a Go2 must pass: strict, or length to leave head and checksum out."""
 
-    seconds: float = 3.0
+    seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
     """How long to listen to the robot [s]."""
 
     wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
@@ -53,8 +54,7 @@ class Doctor:
     """Write the findings to this file."""
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.seconds <= 600:
-            raise ConfigurationError(f"--seconds {self.seconds:g}: from 0.5 to 600")
+        check_ranges(self)
         if bool(self.robot) != bool(self.port):
             raise ConfigurationError(
                 "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
 from deal_hw.cli.emulate_go2 import DEFAULT_PORTS, Go2Options, emulate_go2
+from deal_hw.cli.options import Range, Ratio, Seed, Share, check_ranges
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -40,10 +41,10 @@ class Emulate:
     """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
     Stribeck friction and dropped frames, backlash (cart-pole), encoder bias and torque-speed limit (Go2)."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Decides the hidden parameters, the noise and the start angles."""
 
-    xi: float | None = None
+    xi: Annotated[float | None, Ratio] = None
     """Hidden parameters lie within this ratio of the nominal ones; 5 for the cart-pole, 2 for the Go2."""
 
     nominal: bool = False
@@ -61,31 +62,32 @@ class Emulate:
     reveal_to: Path | None = None
     """Write the same to this JSON file at the end."""
 
-    duration_s: float | None = None
+    duration_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """Stop after this time [s]; without it, at Ctrl-C."""
 
-    corrupt: float = 0.0
+    corrupt: Share = 0.0
     """Share of frames from the device in which a byte is changed."""
 
-    drop: float = 0.0
+    drop: Share = 0.0
     """Share of frames from the device that are lost."""
 
-    duplicate: float = 0.0
+    duplicate: Share = 0.0
     """Share of frames from the device that come twice."""
 
-    freeze_after_s: float | None = None
+    freeze_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """The firmware hangs this long after the motor was first armed, or commanded [s]."""
 
-    vanish_after_s: float | None = None
+    vanish_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """The port vanishes this long after the motor was first armed [s]."""
 
-    parent: int | None = None
+    parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
 
     go2: tyro.conf.OmitArgPrefixes[Go2Options] = field(default_factory=Go2Options)
     """Options of the Go2 alone."""
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         if self.robot not in TRANSPORTS:
             raise UnknownNameError("robot to emulate", self.robot, TRANSPORTS)
         if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:
@@ -94,10 +96,6 @@ class Emulate:
             raise ConfigurationError(f"emulate {self.robot} has no {', '.join(foreign)}")
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
-        for name in ("duration_s", "freeze_after_s", "vanish_after_s"):
-            value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise ConfigurationError(f"{name} must be 0 or more seconds, got {value}")
 
     def _foreign(self) -> list[str]:
         """Return the flags given that belong to another robot."""
@@ -146,7 +144,7 @@ def _truth(config: Emulate) -> Truth:
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return Truth.from_json(read_truth(config.truth_from))
+        return read_truth(config.truth_from, Truth.from_json)
     return draw_truth(config.profile, config.seed, xi=CARTPOLE_XI if config.xi is None else config.xi)
 
 

@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
+from deal_hw.reading import object_of, read_json, reading
 
+T = TypeVar("T")
 _PARENT_CHECK_STEPS = 100
 _FIFO_PRIORITY = 40
 """Below that of a control process: the host must not wait for the emulator."""
@@ -49,19 +51,18 @@ def run_until(
             return
 
 
-def read_truth(path: Path) -> Mapping[str, Any]:
+def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
     """Return what ``reveal`` wrote.
 
+    Args:
+        path: The file.
+        parse: Makes the truth of its values.
+
     Raises:
-        ConfigurationError: The file is no JSON object.
+        ConfigurationError: The file is not there, or holds no truth.
     """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ConfigurationError(f"{path} is not JSON: {error}; --reveal-to writes one") from error
-    if not isinstance(values, dict):
-        raise ConfigurationError(f"{path} holds no truth; --reveal-to writes one")
-    return values
+    with reading(path, "an emulator's truth", "--reveal-to writes one", error=ConfigurationError):
+        return parse(object_of(read_json(path)))
 
 
 def reveal(values: Mapping[str, Any], *, on_stdout: bool, path: Path | None) -> None:

@@ -8,11 +8,12 @@ import socket
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
+from deal_hw.cli.options import Range, check_ranges
 from deal_hw.drivers.go2.faults import FaultPlan, Go2Faults
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.transport import TopicTransport, WireOptions
@@ -49,10 +50,10 @@ class Go2Options:
     no_remote: bool = False
     """No remote is heard: its 40 bytes are zeros."""
 
-    tick_start_ms: int = 0
+    tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
     """The robot's clock at the start [ms]; it wraps at 2**32."""
 
-    domain: int = 0
+    domain: Annotated[int, Range(0, 232)] = 0
     """DDS domain."""
 
     mode: Literal["peer", "client"] = "peer"
@@ -74,8 +75,7 @@ class Go2Options:
     """Faults of the Go2, which begin so long after the first stiff command."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.tick_start_ms < 2**32:
-            raise ConfigurationError(f"tick_start_ms is a number of 32 bits, got {self.tick_start_ms}")
+        check_ranges(self)
 
     def wire(self, transport: str) -> WireOptions:
         """Return how the emulator joins the wire."""
@@ -188,7 +188,7 @@ def _truth(config: Emulate) -> Truth:
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return Truth.from_json(read_truth(config.truth_from))
+        return read_truth(config.truth_from, Truth.from_json)
     return draw_truth(config.profile, config.seed, xi=DEFAULT_XI if config.xi is None else config.xi)
 
 

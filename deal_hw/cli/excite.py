@@ -6,11 +6,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
 
+from deal_hw.cli.options import Range, Ratio, Seed, Threads, check_ranges, given, refuse
 from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from deal_hw.calib.excitation_search import Optimum
 
 BALANCE_S = 0.6
+GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
+SEARCH = ("calibration", "space", "xi", "criterion", "draws", "confirm", "candidates", "rounds")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,25 +48,25 @@ class Excite:
     """optimal: the most telling of many of the others, by simulation; multisine: a sum of sines with a low
     peak; chirp: a sweep; steps: random set-points; sway: the body moves over standing feet (go2)."""
 
-    seconds: float = 4.0
+    seconds: Annotated[float, Range(0.5, 600, "s")] = 4.0
     """Length of the recording [s]."""
 
-    amplitude: float = 1.0
+    amplitude: Annotated[float, Range(1e-3, 1)] = 1.0
     """Not for optimal: share of the largest amplitude that the safety limits allow."""
 
-    low_hz: float = 0.3
+    low_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 0.3
     """Not for optimal: least frequency of multisine, chirp and sway."""
 
-    high_hz: float = 5.0
+    high_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 5.0
     """Not for optimal: greatest frequency of multisine, chirp and sway."""
 
-    effort: float = 1.0
+    effort: Annotated[float, Range(1e-3, 1000)] = 1.0
     """Not for optimal: factor on the effort limit that is sent from SPLIT on."""
 
-    speed: float = 1.0
+    speed: Annotated[float, Range(1e-3, 1000)] = 1.0
     """Not for optimal: factor on the speed limit that is sent from SPLIT on."""
 
-    split: float = 0.5
+    split: Annotated[float, Range(0, 1)] = 0.5
     """Not for optimal: fraction of the run from which on the two factors hold; 0 for all of it."""
 
     policy: Path | None = None
@@ -75,32 +78,37 @@ class Excite:
     space: str = ""
     """Parameters to tell, such as k9; by default the robot's first set."""
 
-    xi: float = 5.0
+    xi: Annotated[float, Ratio] = 5.0
     """Ranges reach a factor XI to either side of nominal."""
 
     criterion: Literal["determinant", "mean"] = "determinant"
     """determinant: most information in all; mean: least mean standard deviation."""
 
-    draws: int = 24
+    draws: Annotated[int, Range(1, 10_000)] = 24
     """Robots that each candidate is tried on."""
 
-    confirm: int = 24
+    confirm: Annotated[int, Range(1, 10_000)] = 24
     """Other robots on which the best candidates are judged in the end."""
 
-    candidates: int = 40
+    candidates: Annotated[int, Range(1, 100_000)] = 40
     """Random candidates."""
 
-    rounds: int = 24
+    rounds: Annotated[int, Range(0, 100_000)] = 24
     """Changes that are tried on the best of them."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Fixes everything random."""
 
-    threads: int | None = None
+    threads: Threads = None
     """Simulation threads; by default all CPUs."""
 
     quiet: bool = False
     """Print nothing but errors."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if not self.low_hz < self.high_hz:
+            raise ConfigurationError(f"--low-hz {self.low_hz:g} must be below --high-hz {self.high_hz:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +132,19 @@ def excite(config: Excite) -> ExciteReport:
     Raises:
         DealHwError: A setting is unusable, or no candidate keeps the limits.
     """
+    default = Excite(robot=config.robot, out=config.out)
+    if config.family == "optimal":
+        refuse(
+            given(config, default, GIVEN_DESIGN),
+            "--family optimal searches it; name another",
+        )
+        if config.calibration is not None:
+            refuse(given(config, default, ("space", "xi")), "--calibration says what is known")
+    else:
+        refuse(
+            given(config, default, SEARCH),
+            f"--family {config.family} is not searched; use --family optimal",
+        )
     description = recorded_description(config.robot)
     balance = balancer(description, config.policy)
     optimum = None

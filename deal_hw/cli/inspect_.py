@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import math
 import signal
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import CalibrationResult, read_result
+from deal_hw.cli.options import Range, check_ranges, refuse
 from deal_hw.data.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.sim.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
 from deal_hw.viz.episode_log import write_episode
 from deal_hw.viz.screenshot import save_screenshot
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
-
-RESULT_FILE = "result.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,27 +46,27 @@ class Inspect:
     web: bool = False
     """Serve it to a browser on this machine until Ctrl-C."""
 
-    web_port: int = DEFAULT_WEB_PORT
+    web_port: Annotated[int, Range(0, 65535)] = DEFAULT_WEB_PORT
     """Where the browser connects; 0 for any free port."""
 
-    window: float = DEFAULT_WINDOW_S
+    window: Annotated[float, Range(1e-3, 600, "s")] = DEFAULT_WINDOW_S
     """Predictions restart from the measured state after this time [s]."""
 
-    latency: float | None = None
+    latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency in the predictions [s]; by default the calibration's, or 0."""
 
-    at: float | None = None
+    at: Annotated[float | None, Range(0, 1e6, "s")] = None
     """Device time that the screenshot shows [s]; by default where the nominal model errs most."""
 
     quiet: bool = False
     """Print nothing but errors and the address to open."""
 
     def __post_init__(self) -> None:
-        for name, value in (("latency", self.latency), ("at", self.at)):
-            if value is not None and not (math.isfinite(value) and value >= 0):
-                raise ConfigurationError(f"--{name} must be 0 s or more, got {value:g} s")
-        if not 0 <= self.web_port < 65536:
-            raise ConfigurationError(f"--web-port must be between 0 and 65535, got {self.web_port}")
+        check_ranges(self)
+        if self.web_port != DEFAULT_WEB_PORT and not self.web:
+            refuse(["--web-port"], "only --web opens a port")
+        if self.at is not None and self.screenshot is None:
+            refuse(["--at"], "only --screenshot shows a single moment")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,9 +92,9 @@ def inspect(config: Inspect) -> InspectReport:
         ConfigurationError: A setting cannot be used, or this machine cannot show it; the message says what
             would do.
     """
+    episode = read_episode(config.episode)
     if not (config.save or config.screenshot or config.web):
         check_display()
-    episode = read_episode(config.episode)
     description = recorded_description(str(episode.description["name"]))
     result = read_result(config.calibration) if config.calibration else None
     overlay, note = _overlay(config, episode, description, result)
@@ -116,23 +114,6 @@ def inspect(config: Inspect) -> InspectReport:
     if not config.quiet:
         _print(overlay, note, files)
     return InspectReport(overlay=overlay, note=note, files=files)
-
-
-def read_result(path: Path) -> CalibrationResult:
-    """Return a calibration result from its folder or file.
-
-    Raises:
-        ConfigurationError: It is not there or does not hold one.
-    """
-    file = path / RESULT_FILE if path.is_dir() else path
-    try:
-        return CalibrationResult.from_json(json.loads(file.read_text(encoding="utf-8")))
-    except OSError as err:
-        raise ConfigurationError(
-            f"{file} cannot be read: {err.strerror}; `deal-hw calibrate` writes it"
-        ) from err
-    except (KeyError, TypeError, ValueError) as err:
-        raise ConfigurationError(f"{file} does not hold a calibration result: {err!r}") from err
 
 
 def _overlay(

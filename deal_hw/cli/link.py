@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import tyro
 
+from deal_hw.cli.options import given, refuse
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
@@ -56,19 +57,33 @@ class LinkOptions:
     """More about a network."""
 
 
-def plan_options(robot: str, link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
+def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:
     """Return the fields of a :class:`~deal_hw.cli.run_plan.RunPlan` that follow from the options.
+
+    Args:
+        robot: The robot's name.
+        link: How it is reached.
+        legs: What a robot with legs is told.
+        walks: Whether a policy runs that may be told a velocity.
 
     Raises:
         UnknownNameError: There is no such robot.
-        ConfigurationError: It has a description, but no driver.
+        ConfigurationError: It has a description, but no driver; or an option would be ignored.
     """
+    description = driver_description(robot)
+    stands = _stands(description) if legs.stand is None else legs.stand
+    if description.floating_base is None:
+        refuse(given(legs, LegOptions()), f"only robots with legs take that, and robot {robot!r} has none")
+    if not walks:
+        refuse(given(legs, LegOptions(), ["velocity"]), "no policy that walks runs here")
+    if not stands:
+        refuse(given(legs, LegOptions(), ["posture"]), "the robot neither stands up nor lies down")
     return {
         "robot": robot,
         "transport": link.transport or default_transport(robot),
         "wire": link.wire,
         "record_wire": link.record_wire,
-        "stand": _stands(driver_description(robot)) if legs.stand is None else legs.stand,
+        "stand": stands,
         "velocity": legs.velocity,
         "hand_back": legs.hand_back,
         "posture": legs.posture,

@@ -7,15 +7,18 @@ once and `collect` never loads what only `train` needs.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TextIO, cast
 
 from deal_hw import __version__
-from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError
+from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError, short
 
 EXIT_OK = 0
 EXIT_ERROR = 2
@@ -25,6 +28,8 @@ EXIT_INTERRUPTED = 130
 EXIT_PIPE = 141
 """Whoever read the output has gone, as with ``| head``; as shells count it: 128 + SIGPIPE."""
 
+LONGEST_MESSAGE = 2000
+"""Longest error in one line [characters]: part of it may come from a file that somebody else wrote."""
 TRACEBACK_VARIABLE = "DEAL_HW_TRACEBACK"
 
 
@@ -186,6 +191,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
     Raises:
         UnknownNameError: There is no such verb.
+        DealHwError: A setting refuses its value.
         SystemExit: The arguments do not parse, or asked for help.
     """
     verb = find(name)
@@ -194,12 +200,27 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     import tyro
 
     module = importlib.import_module(verb.module)
-    settings = tyro.cli(
-        getattr(module, verb.config),
-        prog=f"deal-hw {name}",
-        args=list(arguments),
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+
+    def read(speak: bool) -> Any:
+        return tyro.cli(
+            getattr(module, verb.config),
+            prog=f"deal-hw {name}",
+            args=list(arguments),
+            config=(tyro.conf.FlagCreatePairsOff,),
+            console_outputs=speak,
+        )
+
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            settings = read(speak=False)
+    except SystemExit as stop:
+        # tyro draws a box around what a setting itself refuses; that gets its one line like other errors.
+        cause: BaseException | None = stop
+        while cause is not None and not isinstance(cause, DealHwError):
+            cause = cause.__context__
+        if cause is not None:
+            raise cause from None
+        settings = read(speak=True)
     return settings, getattr(module, verb.function)
 
 
@@ -228,21 +249,76 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: What follows `deal-hw` on the command line; by default the process's own.
     """
+    _occupy_standard_streams()
+    code = EXIT_INTERRUPTED
     try:
-        code = _answer(list(sys.argv[1:] if arguments is None else arguments))
+        with contextlib.redirect_stderr(cast(TextIO, _Stderr(sys.stderr))):
+            code = _answer(list(sys.argv[1:] if arguments is None else arguments))
+        if arguments is None:
+            # The verb is done and has said so: from here to the end of the process a Ctrl-C changes nothing.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         if _flushed():
             return code
     except BrokenPipeError:
         if not _reader_is_gone():
             raise
+    except KeyboardInterrupt:
+        # Between the end of the verb and here.
+        return code
     except SystemExit:
         if _flushed():
             raise
     # The interpreter flushes once more as it ends, and would complain.
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, sys.stdout.fileno())
-    os.close(nowhere)
+    _to_nowhere(sys.stdout)
     return EXIT_PIPE
+
+
+def _to_nowhere(stream: TextIO) -> None:
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+class _Stderr:
+    """The error output, whose reader may go: the work goes on all the same, to the same exit code.
+
+    Args:
+        stream: The output itself.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except (OSError, ValueError):
+            # What waits in its buffer would fail again as the interpreter ends, and change the exit code.
+            with contextlib.suppress(OSError, ValueError):
+                _to_nowhere(self._stream)
+        return len(text)
+
+    def flush(self) -> None:
+        self.write("")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _occupy_standard_streams() -> None:
+    """Open the null device for each standard stream that the process was started without.
+
+    The next file opened, a recording or a robot's port, would get its number, and whatever a library prints
+    would go into it.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")
 
 
 def _answer(given: list[str]) -> int:
@@ -264,7 +340,7 @@ def _answer(given: list[str]) -> int:
         if show_traceback or (isinstance(err, BrokenPipeError) and _reader_is_gone()):
             raise
         # An OSError is the world's refusal (no such file, disk full), not a bug: it gets its one line, too.
-        print(f"deal-hw: error: {err}", file=sys.stderr)
+        print(f"deal-hw: error: {short(str(err), LONGEST_MESSAGE)}", file=sys.stderr)
         return EXIT_ERROR
 
 

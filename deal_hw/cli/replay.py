@@ -56,7 +56,7 @@ def replay(config: Replay) -> RunReport:
     robot = config.robot or str(trajectory.metadata.get("robot", ""))
     behaviour = ReplayBehaviour(trajectory, driver_description(robot))
     plan = RunPlan(
-        **plan_options(robot, config.link, config.legs),
+        **plan_options(robot, config.link, config.legs, walks=False),
         profile="replay",
         recording=str(config.episode.resolve()),
         seconds=behaviour.duration_s,

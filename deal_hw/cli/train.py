@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.reading import object_of, read_json, reading
 
 if TYPE_CHECKING:
     from deal_hw.description import SensorModel
@@ -29,7 +30,7 @@ POLICY_FILE = Path("policies") / "policy.onnx"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train:
+class Train(Checked):
     """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
 
     robot: tyro.conf.Positional[str] = "cartpole"
@@ -44,13 +45,13 @@ class Train:
     out: Path = Path("runs") / "train"
     """The .onnx file to write, or a run folder, which gets policies/policy.onnx."""
 
-    steps: int | None = None
+    steps: Annotated[int | None, Range(1, 10**9)] = None
     """Environment steps; by default what the shipped policy was trained with."""
 
-    members: int | None = None
+    members: Annotated[int | None, Range(1, 100_000)] = None
     """Robots simulated at once; by default what the shipped policy was trained with."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Decides everything random."""
 
     quiet: bool = False
@@ -64,7 +65,9 @@ def train(config: Train) -> OnnxPolicy:
         ConfigurationError: Not exactly one distribution was asked for, or it cannot be read.
         UnknownNameError: There is no such robot.
     """
-    if (config.distribution is None) == (not config.udr):
+    if config.udr and config.distribution is not None:
+        raise ConfigurationError("--udr and --distribution exclude each other: leave one of them out")
+    if not config.udr and config.distribution is None:
         raise ConfigurationError(
             "say under what to train: --distribution FILE (`deal-hw calibrate` writes it) or --udr"
         )
@@ -156,14 +159,11 @@ def read_distribution(path: Path) -> ParameterDistribution:
     Raises:
         ConfigurationError: There is no such file, or it holds no distribution.
     """
-    try:
-        return ParameterDistribution.from_json(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as err:
-        raise ConfigurationError(
-            f"no such file: {path}; `deal-hw calibrate` writes calibration/distribution.json"
-        ) from err
-    except (ValueError, KeyError, TypeError, AttributeError) as err:
-        raise ConfigurationError(f"{path} holds no parameter distribution: {err}") from err
+    with reading(
+        path, "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json",
+        error=ConfigurationError,
+    ):  # fmt: skip
+        return ParameterDistribution.from_json(object_of(read_json(path)))
 
 
 def _space(robot: str) -> ParameterSpace:

@@ -15,6 +15,9 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.schema import STRICT
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
+LONGEST_S = 3600.0
+"""Longest run [s]."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segment:
@@ -79,8 +82,15 @@ class RichConfig:
 
     def __post_init__(self) -> None:
         low, high = self.hold_s
-        if not (self.duration_s > 0 and self.balance_s >= 0 and self.amplitude > 0 and 0 < low <= high):
-            raise ConfigurationError(f"not a usable collection profile: {self}")
+        if not (
+            0 < self.duration_s <= LONGEST_S and 0 <= self.balance_s <= LONGEST_S
+            and 1e-6 <= self.amplitude <= 1e3 and 1e-3 <= low <= high <= LONGEST_S
+        ):  # fmt: skip
+            raise ConfigurationError(
+                f"not a usable collection profile: duration {self.duration_s:g} s, balance "
+                f"{self.balance_s:g} s, amplitude {self.amplitude:g}, hold {low:g} to "
+                f"{high:g} s; numbers above 0, at most {LONGEST_S:g} s"
+            )
 
 
 class RichBehaviour:

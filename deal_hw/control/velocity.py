@@ -11,7 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, shown
+from deal_hw.reading import MIB, check_size, reading
 from deal_hw.types import FloatArray, RobotState
 
 AXES = ("x", "y", "yaw")
@@ -143,15 +144,16 @@ def _checked(values: Sequence[float], where: str) -> FloatArray:
 
 def _read_script(path: Path) -> list[list[float]]:
     names = ["time_s", *AXES]
-    try:
+    with reading(f"the script {path}", "CSV", error=ConfigurationError):
+        check_size(path, MIB)
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.reader(file)
             head = next(reader, [])
             lines = [line for line in reader if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigurationError(f"the script {path} cannot be read: {error}") from error
     if [name.strip() for name in head] != names:
-        raise ConfigurationError(f"{path}: its first line is {','.join(head)!r}, expected {','.join(names)}")
+        raise ConfigurationError(
+            f"{path}: its first line is {shown(','.join(head))}, expected {','.join(names)}"
+        )
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=2):
         try:
@@ -160,7 +162,7 @@ def _read_script(path: Path) -> list[list[float]]:
             row = []
         if len(row) != len(names) or not math.isfinite(row[0]) or (rows and row[0] <= rows[-1][0]):
             raise ConfigurationError(
-                f"{path}: line {number} is {','.join(line)!r}; expected four numbers, times growing"
+                f"{path}: line {number} is {shown(','.join(line))}; expected four numbers, times growing"
             )
         rows.append(row)
     if not rows:

@@ -1,10 +1,16 @@
-"""Reads files that may hold anything, up to a size, and writes small ones so that a crash leaves no half."""
+"""Reads files that may hold anything, up to a size; writes so that a crash leaves no half of them."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import shutil
+import signal
 import stat
+import tempfile
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -92,6 +98,60 @@ def write_json(path: Path, values: Any) -> None:
     finally:
         fresh.unlink(missing_ok=True)
     _sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def published_together(folder: Path) -> Iterator[Path]:
+    """Yield a folder to write into; at the end all that was written moves to another one.
+
+    Where the block raises, nothing moves and the other folder stays as it was. The folder stands beside the
+    other, so that relative paths from one are right from the other. Files of the same name are replaced,
+    other files stay. Ctrl-C during the moves takes effect after them.
+
+    Args:
+        folder: Where the files go; made if need be.
+
+    Raises:
+        OSError: A folder or a file cannot be written.
+    """
+    # Links are followed first: what is beside a link lies elsewhere than what is beside its folder.
+    folder = Path(os.path.realpath(folder))
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as waiting:
+        yield Path(waiting)
+        for file in sorted(Path(waiting).iterdir()):
+            _sync(file)
+        with interrupts_deferred():
+            for file in sorted(Path(waiting).iterdir()):
+                # Not os.replace: the folder may be a file system of its own.
+                shutil.move(file, folder / file.name)
+    _sync_folder(folder)
+
+
+@contextlib.contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Let Ctrl-C take effect at the end of the block; only the main thread can, others run on as they do.
+
+    Raises:
+        KeyboardInterrupt: At the end, where there was one.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if pressed:
+            # To whoever heeded it before: that may be a block of this kind around ours.
+            signal.raise_signal(signal.SIGINT)
+
+
+def _sync(file: Path) -> None:
+    with open(file, "rb") as opened:
+        os.fsync(opened.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

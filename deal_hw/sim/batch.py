@@ -11,10 +11,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 from mujoco.batch import Batch
 
+from deal_hw.errors import CalibrationError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim import chart
 from deal_hw.sim.fields import BatchFields
@@ -230,7 +232,10 @@ class ServoBatch:
         if not every:
             # Stepping by rollout with a record of one field costs nothing over bare stepping.
             every = steps
-        record = self.batch.rollout(steps, control=control, record=("qpos", "qvel"))
+        try:
+            record = self.batch.rollout(steps, control=control, record=("qpos", "qvel"))
+        except mujoco.FatalError as err:
+            raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
         position = self._chart(record["qpos"][:, every - 1 :: every], reference)
         velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
         bad = self._warnings() > before

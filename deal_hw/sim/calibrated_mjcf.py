@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim import mjcf_tables as tables
 from deal_hw.sim.mjcf_changes import MjcfChanges, differences, numbers
@@ -108,8 +108,7 @@ def change_mjcf(
     Raises:
         ConfigurationError: As :func:`write_calibrated_mjcf`.
     """
-    if target.exists() and target.samefile(path):
-        raise ConfigurationError(f"{target} is the model itself; write the calibrated one to another file")
+    require_other(target, path)
     top = read_files(path)
     spec = mujoco.MjSpec.from_file(str(top.path))
     have = spec.compile()
@@ -136,13 +135,24 @@ def change_mjcf(
     return tuple(sorted(written, key=lambda file: file.name != target.name))
 
 
+def require_other(target: Path, path: Path) -> None:
+    """Check that a file to write is not the model itself.
+
+    Raises:
+        ConfigurationError: It is.
+    """
+    if target.exists() and target.samefile(path):
+        raise ConfigurationError(f"{target} is the model itself; write the calibrated one to another file")
+
+
 def _compile(path: Path) -> Any:
     try:
         # Where MuJoCo finds what included files refer to depends on whether this path is absolute.
         return mujoco.MjModel.from_xml_path(os.path.abspath(path))
-    except ValueError as err:
+    except (ValueError, mujoco.FatalError) as err:
         raise ConfigurationError(
-            f"the calibrated model {path} does not compile: {err}; the values are in result.json beside it"
+            f"the calibrated model {path} does not compile: {short(str(err))}; the values are in "
+            "result.json beside it"
         ) from err
 
 

@@ -44,20 +44,6 @@ class Sampling:
         return self.period_s / self.substeps
 
 
-def compile_model(mjcf: Path) -> Any:
-    """Compile an MJCF.
-
-    Raises:
-        ConfigurationError: The file does not exist or does not compile.
-    """
-    if not mjcf.is_file():
-        raise ConfigurationError(f"model {mjcf} does not exist")
-    try:
-        return mujoco.MjModel.from_xml_path(str(mjcf))
-    except ValueError as err:
-        raise ConfigurationError(f"model {mjcf} does not compile: {err}") from err
-
-
 def sampling(period_s: float, timestep_s: float, window_s: float) -> Sampling:
     """Fit the physics grid to a sampling period: a whole number of steps, each near the wanted one.
 

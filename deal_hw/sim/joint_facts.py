@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.sim.compiling import compile_mjcf
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 
@@ -39,18 +40,17 @@ class JointFacts:
     command: FloatArray
 
 
-def joint_facts(mjcf: Path) -> JointFacts:
+def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
     """Read the joints of a model.
+
+    Args:
+        mjcf: Its file.
+        model: The same, compiled; None to compile it.
 
     Raises:
         ConfigurationError: The file does not exist or does not compile, or has no hinge or slide.
     """
-    if not Path(mjcf).is_file():
-        raise ConfigurationError(f"model {mjcf} does not exist")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(mjcf))
-    except ValueError as error:
-        raise ConfigurationError(f"model {mjcf} does not compile: {error}") from error
+    model = compile_mjcf(mjcf) if model is None else model
     names: list[str] = []
     units, limits, left_out = [], [], []
     index_of: dict[int, int] = {}

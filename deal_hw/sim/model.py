@@ -11,6 +11,7 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.compiling import load_mjcf
 from deal_hw.sim.fields import ModelFields, element_id, element_names
 from deal_hw.sim.parameters import apply_parameters
 from deal_hw.sim.parameters.kind import joint_of
@@ -84,10 +85,7 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
         ConfigurationError: The MJCF does not compile, or the device period is no multiple of the step.
         UnknownNameError: A joint of the description is not in the model.
     """
-    try:
-        model = mujoco.MjModel.from_xml_path(str(description.mjcf))
-    except ValueError as err:
-        raise ConfigurationError(f"{description.mjcf} does not compile: {err}") from err
+    model = load_mjcf(description.mjcf)
     if step_s is None:
         # Two robots may share an MJCF whose step fits only one of them.
         steps = 1.0 / (description.device_rate_hz * model.opt.timestep)

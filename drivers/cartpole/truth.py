@@ -11,6 +11,10 @@ import numpy as np
 from deal_hw.drivers.cartpole.description import k9_space, parameter_space
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
+from deal_hw.reading import number, reading
+
+MOST_TICKS = 1000
+"""Longest latency of one side [device ticks]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,20 +61,23 @@ class Truth:
         Raises:
             ConfigurationError: A value is missing or means nothing.
         """
-        try:
-            parameters = {p.name: float(values["parameters"][p.name]) for p in parameter_space().parameters}
+        with reading(
+            "the values", "the truth of a cart-pole", "--reveal-to writes one", error=ConfigurationError
+        ):
+            ticks = {
+                key: int(number(values[key], key, 0, MOST_TICKS))
+                for key in ("actuation_ticks", "sensing_ticks")
+            }
             return cls(
                 profile=find_profile(values["profile"]).name,
-                seed=int(values["seed"]),
-                parameters=parameters,
-                actuation_ticks=int(values["actuation_ticks"]),
-                sensing_ticks=int(values["sensing_ticks"]),
-                refused=int(values["refused"]),
+                seed=int(number(values["seed"], "seed", 0)),
+                parameters={
+                    p.name: number(values["parameters"][p.name], p.name, 0.1 * p.low, 10 * p.high)
+                    for p in parameter_space().parameters
+                },
+                refused=int(number(values["refused"], "refused", 0)),
+                **ticks,
             )
-        except (KeyError, TypeError) as error:
-            raise ConfigurationError(
-                f"not the truth of a cart-pole: {error!r}; --reveal-to writes one"
-            ) from error
 
 
 def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:

@@ -66,8 +66,10 @@ class Go2Faults:
             value = getattr(self, entry.name)
             if entry.name in SHARES and not 0.0 <= value <= 1.0:
                 raise ConfigurationError(f"{entry.name} is a share from 0 to 1, got {value}")
-            if entry.name.endswith("_after_s") and value is not None and not value >= 0.0:
-                raise ConfigurationError(f"{entry.name} must be 0 or more seconds, got {value}")
+            if entry.name.endswith("_after_s") and value is not None and not 0.0 <= value <= 1e7:
+                raise ConfigurationError(f"{entry.name} must be 0 to 1e7 seconds, got {value}")
+            if entry.name == "push" and not abs(value) <= 1e4:
+                raise ConfigurationError(f"push must be -1e4 to 1e4 N*s, got {value}")
             if entry.name.endswith("_joint") and value not in JOINTS:
                 raise UnknownNameError("Go2 joint", value, JOINTS)
 

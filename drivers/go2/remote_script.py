@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from deal_hw.drivers.go2.remote import Remote, parse_combination
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, shown
+from deal_hw.reading import number, read_json, reading
 
 _KEYS = ("at_s", "buttons", "left_x", "left_y", "right_x", "right_y", "absent")
 
@@ -36,23 +36,20 @@ def read_remote_script(path: Path) -> tuple[RemoteMoment, ...]:
         ConfigurationError: The file holds something else.
         UnknownNameError: There is no such button.
     """
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ConfigurationError(f"{path} is not JSON: {error}") from error
-    if not isinstance(entries, list):
-        raise ConfigurationError(f"{path}: expected a list of objects with at_s and buttons or sticks")
-    return tuple(sorted((_moment(path, entry) for entry in entries), key=lambda moment: moment.at_ms))
+    with reading(path, "a remote's script", error=ConfigurationError):
+        entries = read_json(path)
+        if not isinstance(entries, list):
+            raise ConfigurationError(f"{path}: expected a list of objects with at_s and buttons or sticks")
+        return tuple(sorted((_moment(path, entry) for entry in entries), key=lambda moment: moment.at_ms))
 
 
 def _moment(path: Path, entry: Any) -> RemoteMoment:
     if not isinstance(entry, dict) or "at_s" not in entry or set(entry) - set(_KEYS):
-        raise ConfigurationError(f"{path}: {entry!r} is no moment; keys: {', '.join(_KEYS)}, at_s always")
-    try:
-        at_ms = round(float(entry["at_s"]) * 1e3)
-        sticks = {name: float(entry.get(name, 0.0)) for name in _KEYS[2:6]}
-    except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"{path}: {entry!r}: {error}") from error
+        raise ConfigurationError(
+            f"{path}: {shown(entry)} is no moment; keys: {', '.join(_KEYS)}, at_s always"
+        )
+    at_ms = round(number(entry["at_s"], "at_s", 0.0, 1e6) * 1e3)
+    sticks = {name: number(entry.get(name, 0.0), name, -1.0, 1.0) for name in _KEYS[2:6]}
     if entry.get("absent"):
         return RemoteMoment(at_ms, None)
     return RemoteMoment(at_ms, Remote(parse_combination(str(entry.get("buttons", ""))), **sticks))

@@ -12,6 +12,7 @@ import numpy as np
 from deal_hw.drivers.go2.description import JOINTS
 from deal_hw.drivers.go2.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
+from deal_hw.reading import number, reading
 
 JOINT_DAMPING_NMS_RAD: Final = 0.6
 FRICTIONLOSS_NM: Final = 0.2
@@ -89,16 +90,17 @@ class Truth:
         Raises:
             ConfigurationError: A value is missing or means nothing.
         """
-        try:
-            arrays = {name: tuple(float(values[name][joint]) for joint in JOINTS) for name in _PER_JOINT}
+        with reading("the values", "the truth of a Go2", "--reveal-to writes one", error=ConfigurationError):
+            arrays = {
+                name: tuple(number(values[name][joint], f"{name} of {joint}", -1e3, 1e3) for joint in JOINTS)
+                for name in _PER_JOINT
+            }
             return cls(
                 profile=find_profile(values["profile"]).name,
-                seed=int(values["seed"]),
-                latency_ms=int(values["latency_ms"]),
+                seed=int(number(values["seed"], "seed", 0)),
+                latency_ms=int(number(values["latency_ms"], "latency_ms", 0, 1000)),
                 **arrays,
             )
-        except (KeyError, TypeError) as error:
-            raise ConfigurationError(f"not the truth of a Go2: {error!r}; --reveal-to writes one") from error
 
 
 _PER_JOINT: Final = ("stiffness", "damping", "joint_damping", "frictionloss", "armature", "encoder_bias")

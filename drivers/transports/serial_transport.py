@@ -196,8 +196,13 @@ class SerialTransport(Transport):
                 "(often `dialout`)"
             )
         if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO):
-            known = ", ".join(sorted(entry.device for entry in list_ports.comports())) or "none"
-            return PortNotFoundError(f"there is no serial port {self.port!r}; ports at hand: {known}")
+            return PortNotFoundError(f"there is no serial port {self.port!r}; ports at hand: {_ports()}")
+        if "configure port" in text or code == errno.ENOTTY:
+            # What the kernel says, "inappropriate ioctl for device", tells nobody that it is no port at all.
+            return PortNotFoundError(
+                f"{self.port} cannot be opened as a serial port: it is a file or another device; ports at "
+                f"hand: {_ports()}"
+            )
         return PortNotFoundError(f"{self.port} cannot be opened as a serial port: {text}")
 
     def _lost(self, error: OSError | None) -> TransportLostError:
@@ -217,3 +222,7 @@ def _read_nothing_means_gone(fd: int) -> None:
     settings[6][termios.VMIN] = 1
     settings[6][termios.VTIME] = 0
     termios.tcsetattr(fd, termios.TCSANOW, settings)
+
+
+def _ports() -> str:
+    return ", ".join(sorted(entry.device for entry in list_ports.comports())) or "none"

@@ -75,7 +75,7 @@ def test_damaged_bytes_are_refused_or_harmless(state: dict[str, Any], data: st.D
 @settings(max_examples=100, deadline=None)
 def test_random_bytes_are_refused(data: bytes) -> None:
     """Nothing but a checkpoint passes for one."""
-    with pytest.raises(DatasetError, match="no checkpoint"):
+    with pytest.raises(DatasetError, match="cannot be read as deal_hw"):
         unpack(data)
 
 
@@ -104,7 +104,7 @@ def test_pickles_are_never_loaded() -> None:
     """An NPZ file with a pickled object in it is no checkpoint."""
     buffer = io.BytesIO()
     np.savez(buffer, state=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(DatasetError, match="no checkpoint"):
+    with pytest.raises(DatasetError, match="cannot be read as deal_hw"):
         unpack(buffer.getvalue())
 
 

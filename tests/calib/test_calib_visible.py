@@ -13,7 +13,8 @@ from deal_hw.calib.problem import Problem
 from deal_hw.calib.visible import jumps, look, require_visible
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.describe import compile_model, describe, sampling
+from deal_hw.sim.compiling import load_mjcf
+from deal_hw.sim.describe import describe, sampling
 from deal_hw.sim.episode import Episode
 from deal_hw.sim.model import RobotModel, load_model
 
@@ -38,7 +39,7 @@ def robot(tmp_path: Path) -> RobotModel:
     path = tmp_path / "slider.xml"
     path.write_text(SLIDER, encoding="utf-8")
     rates = sampling(0.01, 0.002, 0.4)
-    return load_model(describe(path, compile_model(path), ("rail",), ("rail",), rates), rates.step_s)
+    return load_model(describe(path, load_mjcf(path), ("rail",), ("rail",), rates), rates.step_s)
 
 
 def steps_of(robot: RobotModel, T: int = 200) -> Episode:
@@ -124,7 +125,7 @@ def test_a_solver_that_stops_early_is_seen_by_what_jumps(solver: str, smooth: bo
     path = tmp_path / "knee.xml"
     path.write_text(KNEE.format(solver=solver), encoding="utf-8")
     rates, names = sampling(0.01, 0.0025, 0.4), ("knee", "ankle")
-    robot = load_model(describe(path, compile_model(path), names, names, rates), rates.step_s)
+    robot = load_model(describe(path, load_mjcf(path), names, names, rates), rates.step_s)
     T, steps = 200, 4 * 199
     rows = np.ones((steps, 2))
     angle = -1.2 + 0.4 * np.sin(np.arange(steps) * 0.0025 * 3.0)[:, None] * [1.0, -1.0]

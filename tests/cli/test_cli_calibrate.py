@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.calib.folder import read_result
+from deal_hw.calibration import read_result
 from deal_hw.cli.calibrate import Calibrate, calibrate, make_space
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
@@ -102,7 +102,7 @@ def test_unknown_method_lists_the_methods(dataset: Path) -> None:
 
 def test_ratio_of_one_is_refused(dataset: Path) -> None:
     """The ratio must be above 1."""
-    with pytest.raises(ConfigurationError, match="xi must be above 1"):
+    with pytest.raises(ConfigurationError, match="--xi 1"):
         calibrate(settings(dataset, xi=1.0))
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from deal_hw.calibration import Progress, ProgressCallback
+from deal_hw.calib.report import page
+from deal_hw.calibration import Progress, ProgressCallback, read_result
 from deal_hw.cli import calibrate as verb
 from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
 from deal_hw.cli.virtual import VirtualCartpole
@@ -122,3 +126,36 @@ def test_view_of_the_search_is_written(dataset: Path, tmp_path: Path) -> None:
         for name in ("watched", "plain")
     )
     assert watched == plain
+
+
+FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "report.html"}
+
+
+@pytest.mark.parametrize("moment", ["report.html", "moving"])
+def test_an_interrupt_at_the_end_leaves_whole_results(
+    dataset: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    moment: str,
+) -> None:
+    """A real SIGINT while a file is written: all files are there, that is said, and the status is 130."""
+    hooks = {"report.html": (page, "write_report"), "moving": (shutil, "move")}
+    where, name = hooks[moment]
+    real, pressed = getattr(where, name), []
+
+    def interrupted(*arguments: Any, **named: Any) -> Any:
+        if not pressed:
+            pressed.append(True)
+            os.kill(os.getpid(), signal.SIGINT)
+        return real(*arguments, **named)
+
+    monkeypatch.setattr(where, name, interrupted)
+    assert main(command(dataset, tmp_path)) == EXIT_INTERRUPTED
+    assert pressed
+    told = capsys.readouterr().err
+    assert f"the results in {tmp_path / 'calibration'} are whole" in told and "--resume" not in told
+    assert {file.name for file in (tmp_path / "calibration").iterdir()} == FILES
+    assert [file.name for file in tmp_path.iterdir()] == ["calibration"]
+    assert read_result(tmp_path / "calibration").method == "default"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -294,7 +294,7 @@ def test_column_map_that_makes_no_sense(values: Any, error: type[Exception], wor
 def test_column_map_file_runs_nothing(tmp_path: Path) -> None:
     """YAML that would build an object is refused, as is what is no YAML."""
     path = write(tmp_path / "map.yaml", "time: !!python/object/apply:os.getcwd []\n")
-    with pytest.raises(ConfigurationError, match="is not YAML"):
+    with pytest.raises(ConfigurationError, match="cannot be read as a column map"):
         read_column_map(path)
     with pytest.raises(ConfigurationError, match="cannot be read"):
         read_column_map(tmp_path / "none.yaml")

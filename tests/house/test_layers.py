@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 SERVICES = ("control", "data", "sim", "testing", "viz")
-VOCABULARY = ("errors", "types", "clock", "findings", "schema")
+VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema")
 CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")
 LAYER = {
     **dict.fromkeys(("deal_hw", *VOCABULARY), 0),

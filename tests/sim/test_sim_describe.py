@@ -12,7 +12,8 @@ import pytest
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.describe import compile_model, describe, sampling
+from deal_hw.sim.compiling import load_mjcf
+from deal_hw.sim.describe import describe, sampling
 from deal_hw.sim.droop import droop
 from deal_hw.sim.episode import SENT, Episode
 from deal_hw.sim.episode_parts import joined, part, split_last, spread, stretches
@@ -44,7 +45,7 @@ def robot_of(folder: Path, text: str = ARM) -> RobotModel:
     """Return the robot of an MJCF text, recorded at 49.85 Hz."""
     path = folder / "arm.xml"
     path.write_text(text, encoding="utf-8")
-    model = compile_model(path)
+    model = load_mjcf(path)
     rates = sampling(1 / 49.85, float(model.opt.timestep), 0.4)
     return load_model(describe(path, model, ("lift", "rail"), ("lift", "rail"), rates), rates.step_s)
 
@@ -133,7 +134,7 @@ def test_unknown_joint_lists_the_joints(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(ARM, encoding="utf-8")
     with pytest.raises(UnknownNameError, match="lift, rail"):
-        describe(path, compile_model(path), ("lift", "knee"), ("lift",), sampling(0.02, 0.002, 0.4))
+        describe(path, load_mjcf(path), ("lift", "knee"), ("lift",), sampling(0.02, 0.002, 0.4))
 
 
 def test_parts_keep_samples_and_commands_together(tmp_path: Path) -> None:

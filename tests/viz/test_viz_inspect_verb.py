@@ -123,10 +123,10 @@ def test_wrong_files_are_named(episode_file: Path, tmp_path: Path) -> None:
     save = tmp_path / "a.rrd"
     with pytest.raises(DatasetError, match=r"none\.mcap"):
         inspect(Inspect(episode=tmp_path / "none.mcap", save=save))
-    with pytest.raises(ConfigurationError, match=r"none\.json cannot be read.*deal-hw calibrate"):
+    with pytest.raises(DatasetError, match=r"none\.json cannot be read.*deal-hw calibrate"):
         inspect(Inspect(episode=episode_file, calibration=tmp_path / "none.json", save=save))
     (tmp_path / "other.json").write_text('{"a": 1}', encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=r"other\.json does not hold a calibration result"):
+    with pytest.raises(ConfigurationError, match=r"other\.json: not a calibration result"):
         inspect(Inspect(episode=episode_file, calibration=tmp_path / "other.json", save=save))
     with pytest.raises(ConfigurationError, match="is a folder"):
         inspect(Inspect(episode=episode_file, save=tmp_path))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deal_hw.errors import DatasetError
+from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
 _PICK = re.compile(r"(?P<array>.+)\[(?P<inside>[^\[\]]+)\]")
@@ -68,8 +68,8 @@ class Channels:
             return self._inside(picked["array"], picked["inside"])
         near = difflib.get_close_matches(name, self.arrays, n=3) or list(self.arrays)[:12]
         raise DatasetError(
-            f"{self.path} has no channel {name!r} ({len(self.arrays)} channels; near it: {', '.join(near)}); "
-            "correct the column map"
+            f"{self.path} has no channel {short(name)!r} ({len(self.arrays)} channels; near it: "
+            f"{short(', '.join(near)) or 'none'}); correct the column map"
         )
 
     def _inside(self, array: str, inside: str) -> FloatArray:
@@ -78,12 +78,13 @@ class Channels:
         labels = self.labels.get(array, ())
         if inside in labels:
             index = labels.index(inside)
-        elif inside.isdigit() and int(inside) < width:
+        elif inside.isdecimal() and len(inside) < 10 and int(inside) < width:
             index = int(inside)
         else:
-            names = f", named {', '.join(labels)}" if labels else ""
+            names = f", named {short(', '.join(labels))}" if labels else ""
             raise DatasetError(
-                f"{self.path}: {array!r} has no column {inside!r}; it has {width}, from 0{names}"
+                f"{self.path}: {short(array)!r} has no column {short(inside)!r}; it has {width}, from 0"
+                f"{names}"
             )
         return values if values.ndim == 1 else values[:, index]
 

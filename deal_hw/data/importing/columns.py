@@ -23,9 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
+from deal_hw.reading import NAMES, read_yaml, reading
 
 TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in one of each."""
@@ -187,8 +186,10 @@ class ColumnMap:
 
     def __post_init__(self) -> None:
         names = [joint.name for joint in self.joints]
-        if not names or len(set(names)) != len(names):
-            raise ConfigurationError(f"column map: joints {names}; name each joint once, and at least one")
+        if not 0 < len(names) <= NAMES or len(set(names)) != len(names):
+            raise ConfigurationError(
+                f"column map: joints {short(names)}; name each joint once, at least one and at most {NAMES}"
+            )
 
 
 def read_column_map(path: Path) -> ColumnMap:
@@ -197,16 +198,8 @@ def read_column_map(path: Path) -> ColumnMap:
     Raises:
         ConfigurationError: It cannot be read or says something that a column map does not.
     """
-    try:
-        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(f"column map {path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"column map {path} is not YAML: {error}") from error
-    try:
-        return parse_column_map(values, (f"column map {Path(path).name}",))
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{path}: {error}") from error
+    with reading(path, "a column map", "docs/import.md describes it", error=ConfigurationError):
+        return parse_column_map(read_yaml(Path(path)), (f"column map {Path(path).name}",))
 
 
 def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
@@ -238,7 +231,9 @@ def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
 
 def _mapping(what: str, values: Any, allowed: set[str]) -> dict[str, Any]:
     if not isinstance(values, dict):
-        raise ConfigurationError(f"{what} is {values!r}, not a mapping; it has {', '.join(sorted(allowed))}")
+        raise ConfigurationError(
+            f"{what} is {shown(values)}, not a mapping; it has {', '.join(sorted(allowed))}"
+        )
     for key in values:
         if key not in allowed:
             raise UnknownNameError(f"entry of {what}", str(key), sorted(allowed))
@@ -246,8 +241,8 @@ def _mapping(what: str, values: Any, allowed: set[str]) -> dict[str, Any]:
 
 
 def _text(what: str, value: Any) -> str | None:
-    if value is not None and not isinstance(value, (str, int)):
-        raise ConfigurationError(f"{what} is {value!r}; name a channel, or a pattern with {{joint}}")
+    if value is not None and not (isinstance(value, (str, int)) and len(str(value)) <= QUOTED):
+        raise ConfigurationError(f"{what} is {shown(value)}; name a channel, or a pattern with {{joint}}")
     return None if value is None else str(value)
 
 
@@ -272,11 +267,11 @@ def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
         entry = {"name": str(entry)}
     values = _mapping("joint", entry, _JOINT_KEYS)
     if "name" not in values:
-        raise ConfigurationError(f"joint {values!r} has no name; give its name in the model")
-    name = str(values["name"])
+        raise ConfigurationError(f"joint {shown(values)} has no name; give its name in the model")
+    name = str(_text("name of a joint", values["name"]))
     index = values.get("index")
     if index is not None and (not isinstance(index, int) or index < 0):
-        raise ConfigurationError(f"joint {name!r}: index {index!r} is not a column number, from 0")
+        raise ConfigurationError(f"joint {name!r}: index {shown(index)} is not a column number, from 0")
     texts = {key: _text(f"joint {name!r}: {key}", values.get(key)) for key in _CHANNELS}
     settings: dict[str, Any] = {**defaults, **texts}
     settings.update({key: str(values[key]) for key in ("unit", "target_unit", "column") if key in values})
@@ -291,7 +286,7 @@ def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
 
 def _number(what: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ConfigurationError(f"{what} is {value!r}, not a number")
+        raise ConfigurationError(f"{what} is {shown(value)}, not a number")
     return float(value)
 
 
@@ -302,7 +297,7 @@ def _normalised(what: str, value: Any) -> Normalised:
         pair = values.get(key)
         if not isinstance(pair, list) or len(pair) != 2:
             raise ConfigurationError(
-                f"{what}: {key} is {pair!r}; give two numbers, such as {{from: [0, 1], to: [-0.2, 1.7]}}"
+                f"{what}: {key} is {shown(pair)}; give two numbers, such as {{from: [0, 1], to: [-0.2, 1.7]}}"
             )
         pairs.append((_number(what, pair[0]), _number(what, pair[1])))
     return Normalised(file=pairs[0], robot=pairs[1])

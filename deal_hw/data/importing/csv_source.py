@@ -7,13 +7,17 @@ import json
 from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels, digest_of_file
-from deal_hw.errors import DatasetError
+from deal_hw.errors import DatasetError, short
+from deal_hw.reading import NAMES, NUMBERS, RECORDING_BYTES, check_size, reading
 from deal_hw.types import FloatArray
 
+LINE = 1 << 20
+"""Longest line [characters]; a file without line ends must not be read at once."""
 _NOTHING = {"", "nan", "null", "none", "na", "n/a", "-"}
 
 
@@ -21,19 +25,26 @@ def read_csv(path: Path) -> Channels:
     """Read a CSV file; the delimiter is a comma, a semicolon or a tab, comment lines start with ``#``.
 
     With a semicolon, a comma is read as the decimal point. An empty cell is NaN. Columns of text are left
-    out. A last row that is cut off is left out with a note.
+    out. A last row that is cut off is left out with a note. Sizes are limited, see :mod:`deal_hw.reading`.
 
     Raises:
         DatasetError: It cannot be read, has no header, or a row does not fit it.
     """
     path = Path(path)
-    digest = digest_of_file(path)
-    try:
+    with reading(path, "CSV"):
+        check_size(path, RECORDING_BYTES)
+        digest = digest_of_file(path)
         with open(path, newline="", encoding="utf-8-sig") as file:
-            arrays, notes = _parse(path, (line for line in file if line.strip() and line[0] != "#"))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError(f"{path} cannot be read as CSV: {error}") from error
+            arrays, notes = _parse(path, _lines(file))
     return Channels(path=path, kind="csv", digest=digest, arrays=arrays, notes=notes)
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    while line := file.readline(LINE):
+        if len(line) == LINE and line[-1] != "\n":
+            raise ValueError(f"a line of {LINE} characters or more")
+        if line.strip() and line[0] != "#":
+            yield line
 
 
 def _parse(path: Path, lines: Iterator[str]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
@@ -46,14 +57,16 @@ def _parse(path: Path, lines: Iterator[str]) -> tuple[dict[str, FloatArray], tup
         raise DatasetError(
             f"{path}: the first line must name the columns, each once, such as time,elbow_pos,elbow_target"
         )
+    if len(names) > NAMES:
+        raise DatasetError(f"{path} has {len(names)} columns; {NAMES} are allowed")
     rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    columns = [_Column(path, name, delimiter == ";") for name in names]
-    short = 0
+    columns = [_Column(path, name, delimiter == ";", NUMBERS // len(names)) for name in names]
+    cut = 0
     for number, row in enumerate(rows, start=1):
-        if short:
-            raise DatasetError(f"{path}: row {short} has fewer than {len(names)} cells; mend the file")
+        if cut:
+            raise DatasetError(f"{path}: row {cut} has fewer than {len(names)} cells; mend the file")
         if len(row) < len(names):
-            short = number  # Only the last one may be: the writer was killed.
+            cut = number  # Only the last one may be: the writer was killed.
             continue
         if len(row) > len(names):
             raise DatasetError(
@@ -62,10 +75,10 @@ def _parse(path: Path, lines: Iterator[str]) -> tuple[dict[str, FloatArray], tup
         for column, cell in zip(columns, row, strict=True):
             column.take(number, cell)
     arrays = {column.name: column.values() for column in columns if not column.is_text}
-    notes = [f"row {short} is cut off and left out"] if short else []
+    notes = [f"row {cut} is cut off and left out"] if cut else []
     text = [column.name for column in columns if column.is_text]
     if text:
-        notes.append(f"columns of text are left out: {', '.join(text)}")
+        notes.append(f"columns of text are left out: {short(', '.join(text))}")
     return arrays, tuple(notes)
 
 
@@ -80,10 +93,11 @@ def _is_number(text: str) -> bool:
 class _Column:
     """Collects the cells of one column; what its first cell is decides: a number, a list or text."""
 
-    def __init__(self, path: Path, name: str, comma_is_point: bool) -> None:
+    def __init__(self, path: Path, name: str, comma_is_point: bool, most: int) -> None:
         self.name = name
         self.is_text = False
         self._path = path
+        self._most = most
         self._comma = comma_is_point
         self._numbers = array("d")
         self._width = 0
@@ -94,6 +108,11 @@ class _Column:
         if self.is_text:
             return
         text = cell.strip()
+        if len(self._numbers) >= self._most:
+            raise DatasetError(
+                f"{self._path}: column {short(self.name, 60)!r} has more than {self._most} numbers; "
+                "cut the file"
+            )
         if text.lower() in _NOTHING:
             self._numbers.extend([float("nan")] * max(self._width, 1))
             return
@@ -102,18 +121,25 @@ class _Column:
                 self._take_list(text)
             else:
                 self._numbers.append(float(text.replace(",", ".") if self._comma else text))
-        except ValueError as error:
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
             if not self._seen:
                 self.is_text = True
                 return
+            wanted = f"a list of {self._width} numbers" if self._width else "a number"
             raise DatasetError(
-                f"{self._path}: row {row}, column {self.name!r} holds {cell!r}, not a number; mend the file"
+                f"{self._path}: row {row}, column {short(self.name, 60)!r} holds {short(cell, 60)!r}, not "
+                f"{wanted}; mend the file"
             ) from error
         self._seen = True
 
     def _take_list(self, text: str) -> None:
-        values: Sequence[float] = [float(value) for value in json.loads(text)]
+        cells = json.loads(text)
+        if not isinstance(cells, list) or not all(type(value) in (int, float) for value in cells):
+            raise TypeError("not a list of numbers")
+        values: Sequence[float] = [float(value) for value in cells]
         if not self._width:
+            if len(self._numbers) * len(values) > self._most:
+                raise ValueError("too many empty cells before so long a list")
             # Empty cells came before: each stood for one number until now.
             self._numbers = array("d", [float("nan")] * len(self._numbers) * len(values))
             self._width = len(values)

@@ -10,7 +10,6 @@ features. The action of a frame is sent right after the frame was observed.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels, as_floats
-from deal_hw.errors import DatasetError, MissingExtraError
+from deal_hw.errors import DatasetError, MissingExtraError, short
+from deal_hw.reading import NUMBERS, RECORDING_BYTES, check_size, number, object_of, read_json, reading
 from deal_hw.types import FloatArray
 
 FLOAT32_STAMP_S = 1e-4
@@ -49,9 +49,9 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
         raise DatasetError(f"{path} has no data/*/*.parquet; is the dataset downloaded whole?")
     found: dict[int, list[dict[str, FloatArray]]] = {}
     for file in files:
-        for number, arrays in _read_file(file, info["features"]):
-            if episodes is None or number in episodes:
-                found.setdefault(number, []).append(arrays)
+        for episode, arrays in _read_file(file, info["features"]):
+            if episodes is None or episode in episodes:
+                found.setdefault(episode, []).append(arrays)
     missing = sorted(set(episodes or ()) - set(found))
     if missing:
         raise DatasetError(f"{path} has no episodes {missing}; it has {len(found)} that were asked for")
@@ -64,49 +64,65 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
             digest=digest,
             arrays=_stamped(_joined(parts), float(info["fps"])),
             labels={name: names for name, names in labels.items() if names},
-            part=f"episode {number}",
+            part=f"episode {episode}",
         )
-        for number, parts in sorted(found.items())
+        for episode, parts in sorted(found.items())
     ]
 
 
 def _info(path: Path) -> dict[str, Any]:
-    try:
-        info: dict[str, Any] = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
-        if not isinstance(info["features"], dict) or not float(info["fps"]) > 0:
-            raise ValueError(f"fps {info['fps']!r}")
-    except OSError as error:
-        raise DatasetError(f"{path} is not a LeRobot dataset: it has no meta/info.json") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(
-            f"{path / 'meta/info.json'} is not that of a LeRobot dataset: {error!r}"
-        ) from error
+    file = path / "meta" / "info.json"
+    if not file.is_file():
+        raise DatasetError(f"{path} is not a LeRobot dataset: it has no meta/info.json")
+    with reading(file, "the description of a LeRobot dataset"):
+        info = dict(object_of(read_json(file)))
+        for name, feature in object_of(info["features"], "features").items():
+            object_of(feature, f"feature {short(name, 60)!r}")
+        number(info["fps"], "fps", low=1e-3, high=1e6)
     return info
 
 
 def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[str, FloatArray]]]:
     """Return number and channels of each episode in a Parquet file."""
     try:
-        import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
         raise MissingExtraError("pyarrow", "lerobot") from error
-    try:
-        known = pq.read_schema(file).names
-        wanted = [
-            name
-            for name, feature in features.items()
-            if name in known and str(feature.get("dtype", "")).startswith(("float", "int", "bool"))
-        ]
-        wanted += [name for name in ("episode_index", "frame_index") if name in known and name not in wanted]
-        table = pq.read_table(file, columns=wanted)
+    with reading(file, "data of a LeRobot dataset"):
+        check_size(file, RECORDING_BYTES)
+        with pq.ParquetFile(file) as opened:
+            known = opened.schema_arrow.names
+            wanted = [
+                name
+                for name, feature in features.items()
+                if name in known and str(feature.get("dtype", "")).startswith(("float", "int", "bool"))
+            ]
+            own = ("episode_index", "frame_index")
+            wanted += [name for name in own if name in known and name not in wanted]
+            _check_extent(opened.metadata, wanted)
+            table = opened.read(columns=wanted)
         arrays = {name: _array(table.column(name)) for name in wanted}
-        number = arrays["episode_index"].astype(np.int64)
-    except (OSError, ValueError, KeyError, pa.ArrowException) as error:
-        raise DatasetError(f"{file} cannot be read as data of a LeRobot dataset: {error}") from error
-    return [
-        (int(n), {name: values[number == n] for name, values in arrays.items()}) for n in np.unique(number)
-    ]
+        index = arrays["episode_index"]
+        if index.ndim != 1 or not np.all((index >= 0) & (index < 2**31) & (index % 1 == 0)):
+            raise ValueError("episode_index is not a column of whole numbers")
+        episode = index.astype(np.int64)
+        return [
+            (int(n), {name: values[episode == n] for name, values in arrays.items()})
+            for n in np.unique(episode)
+        ]
+
+
+def _check_extent(metadata: Any, wanted: list[str]) -> None:
+    """Check how much the columns hold before they are read: a run of one value takes no bytes in the file."""
+    count, size = 0, 0
+    for group in range(metadata.num_row_groups):
+        for place in range(metadata.num_columns):
+            column = metadata.row_group(group).column(place)
+            if column.path_in_schema.partition(".")[0] in wanted or column.path_in_schema in wanted:
+                count += column.num_values
+                size += column.total_uncompressed_size
+    if count > NUMBERS or size > 8 * NUMBERS:
+        raise ValueError(f"more than {NUMBERS} numbers")
 
 
 def _array(column: Any) -> FloatArray:
@@ -146,7 +162,7 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     if isinstance(names, dict):
         lists = [value for value in names.values() if isinstance(value, list)]
         names = lists[0] if len(lists) == 1 else list(names)
-    return tuple(str(name) for name in names) if isinstance(names, list) else ()
+    return tuple(short(str(name)) for name in names) if isinstance(names, list) else ()
 
 
 def _digest(path: Path, files: list[Path]) -> str:

@@ -22,6 +22,7 @@ from deal_hw.data.mcap_scan import Found, scan
 from deal_hw.data.reader import read_trajectory
 from deal_hw.data.recorder import METADATA_NAME
 from deal_hw.errors import DatasetError
+from deal_hw.reading import reading
 from deal_hw.types import Trajectory
 
 Say = Callable[[str], None]
@@ -70,11 +71,12 @@ def load_tables(
         DatasetError: It cannot be read or understood.
     """
     tables = []
-    for number, channels in enumerate(read_channels(path)):
-        used = columns if columns is not None else guess_columns(channels, joints)
-        if say is not None:
-            _tell(say, channels, used, joints, columns is None and number == 0)
-        tables.append(build_table(channels, used, joints))
+    with reading(path, "a recording of a robot", "docs/import.md says what one holds"):
+        for number, channels in enumerate(read_channels(path)):
+            used = columns if columns is not None else guess_columns(channels, joints)
+            if say is not None:
+                _tell(say, channels, used, joints, columns is None and number == 0)
+            tables.append(build_table(channels, used, joints))
     if not tables:
         raise DatasetError(f"{path} holds no recording")
     return tables

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-import struct
+import dataclasses
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
+import zstandard
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.data.importing.channels import Channels, as_floats, digest_of_file
-from deal_hw.errors import DatasetError
+from deal_hw.errors import DatasetError, short
+from deal_hw.reading import MIB, NAMES, NUMBERS, RECORDING_BYTES, check_size, reading
 from deal_hw.types import FloatArray
 
 STAMP_FIELDS = ("log_time", "header.stamp")
 """Times of each topic [s]: when the recorder got the message, and when the sender says it was made."""
+CHUNK_BYTES = 64 * MIB
+"""Largest record, and largest chunk once it is unpacked; recorders write chunks of 1 to 4 MiB."""
+_LEAF_COST = 16
+"""What a field of a message costs in memory, in numbers, beside its values."""
+_SCHEMA_PART = re.compile(r"^={3,}\s*^MSG:\s+(\S+)\s*$", re.MULTILINE)
+_SCHEMA_FIELD = re.compile(r"^[ \t]*(\w+(?:/\w+)*)(?:<=\d+)?(\[[^\]\n]*\])?[ \t]+\w+", re.MULTILINE)
 
 
 def read_mcap(path: Path) -> Channels:
@@ -28,24 +38,41 @@ def read_mcap(path: Path) -> Channels:
     ``/joint_states.log_time`` and ``/joint_states.header.stamp`` (T,) [s], both on one zero. Nested fields
     are joined by dots: ``/imu.orientation.w``.
 
+    Topics whose messages hold lists of messages are left out with a note. Sizes are limited, see
+    :mod:`deal_hw.reading`.
+
     Raises:
         DatasetError: It cannot be read, or the messages of one topic differ in their joints.
     """
     path = Path(path)
-    digest = digest_of_file(path)
+    with reading(path, "MCAP with ROS 2 messages", "if it was cut off, `mcap recover` mends it"):
+        check_size(path, RECORDING_BYTES)
+        digest = digest_of_file(path)
+        return _channels(path, digest)
+
+
+def _channels(path: Path, digest: str) -> Channels:
     topics: dict[str, list[dict[str, Any]]] = {}
-    try:
-        with open(path, "rb") as file:
-            reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            for _, channel, message, decoded in reader.iter_decoded_messages():
-                row = dict(_fields(decoded))
-                row["log_time"] = message.log_time
-                topics.setdefault(channel.topic, []).append(row)
-    except (OSError, McapError, struct.error, ValueError, EOFError) as error:
-        raise DatasetError(
-            f"{path} cannot be read as MCAP with ROS 2 messages: {str(error) or type(error).__name__}; "
-            "if it was cut off, `mcap recover` mends it"
-        ) from error
+    factory, notes = DecoderFactory(), {}
+    budget = NUMBERS
+    for schema, channel, message in _messages(path):
+        if channel.topic not in notes:
+            notes[channel.topic] = _reason_to_leave_out(schema)
+        if notes[channel.topic]:
+            continue
+        decode = factory.decoder_for(channel.message_encoding, schema)
+        if decode is None:
+            raise ValueError(
+                f"{short(channel.topic)} is not in ROS 2's encoding, but {channel.message_encoding}"
+            )
+        row = dict(_fields(decode(message.data)))
+        row["log_time"] = message.log_time
+        budget -= sum(_LEAF_COST + (len(v) if _is_list(v) else 0) for v in row.values())
+        if budget < 0:
+            raise ValueError(f"more than {NUMBERS} numbers; keep the joints' topics (`mcap filter`)")
+        topics.setdefault(channel.topic, []).append(row)
+    for rows in topics.values():
+        rows.sort(key=lambda row: int(row["log_time"]))
     arrays: dict[str, FloatArray] = {}
     labels: dict[str, tuple[str, ...]] = {}
     zero_ns = _first_stamp(topics)
@@ -57,7 +84,70 @@ def read_mcap(path: Path) -> Channels:
                 arrays[f"{topic}.{field}"] = values
                 if names and values.ndim == 2 and values.shape[1] == len(names):
                     labels[f"{topic}.{field}"] = names
-    return Channels(path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels)
+    left_out = tuple(f"{short(topic, 60)} is left out: {why}" for topic, why in notes.items() if why)
+    return Channels(path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels, notes=left_out)
+
+
+def _messages(path: Path) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Yield the messages of a file in its own order, checksums compared."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    with open(path, "rb") as file:
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=CHUNK_BYTES)
+        for top in reader.records:
+            parts: Sequence[McapRecord] = [top]
+            if isinstance(top, Chunk):
+                parts = breakup_chunk(_unpacked(top), validate_crc=True)
+            for record in parts:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    channel = channels[record.channel_id]
+                    yield schemas.get(channel.schema_id), channel, record
+
+
+def _unpacked(chunk: Chunk) -> Chunk:
+    """Return a chunk without compression; a few bytes must not become gigabytes."""
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            data = stream.read(CHUNK_BYTES + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=CHUNK_BYTES + 1)
+    else:
+        return chunk
+    if len(data) > CHUNK_BYTES:
+        raise ValueError(f"a chunk of more than {CHUNK_BYTES / MIB:g} MiB")
+    return dataclasses.replace(chunk, compression="", data=data)
+
+
+def _reason_to_leave_out(schema: Schema | None) -> str:
+    """Return why messages of a schema are not decoded; "" where they are.
+
+    The decoder goes by the schema alone. A list of messages without content may have four thousand million
+    entries, and messages that hold each other twice double with each level, both without a byte of data.
+    """
+    if schema is None:
+        return ""
+    parts = _SCHEMA_PART.split(schema.data.decode("utf-8"))
+    fields = {
+        name.replace("/msg/", "/"): _SCHEMA_FIELD.findall(text)
+        for name, text in zip([schema.name, *parts[1::2]], parts[::2], strict=True)
+    }
+    open_, count = [schema.name.replace("/msg/", "/")], 0
+    while open_:
+        package = open_[-1].partition("/")[0]
+        for kind, is_list in fields.get(open_.pop(), ()):
+            full = kind if "/" in kind else f"{package}/{kind}"
+            if full.replace("/msg/", "/") in fields:
+                if is_list:
+                    return f"{kind}{is_list} is a list of messages"
+                open_.append(full.replace("/msg/", "/"))
+            count += 1
+            if count > NAMES:
+                return f"its messages have more than {NAMES} fields"
+    return ""
 
 
 def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -15,8 +15,9 @@ from typing import Any, Final
 
 import yaml
 
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
+from deal_hw.reading import YAML_BYTES, parse_yaml, read_bytes, reading
 from deal_hw.sim.fields import element_id, element_names
 from deal_hw.sim.parameters import check_space, find_kind
 from deal_hw.sim.parameters.kind import Kind
@@ -42,11 +43,8 @@ def read_space(path: Path, model: Any) -> ParameterSpace:
         ConfigurationError: The file cannot be used; the message says which entry, and what to write instead.
         UnknownNameError: A kind or an element is not known; the message lists the names.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as err:
-        raise ConfigurationError(f"cannot read {path}: {err}") from err
-    return parse_space(text, model, source=str(path))
+    with reading(path, "parameters", "docs/parameters.md describes them", error=ConfigurationError):
+        return parse_space(read_bytes(path, YAML_BYTES).decode("utf-8"), model, source=str(path))
 
 
 def parse_space(text: str, model: Any, source: str = "params.yaml") -> ParameterSpace:
@@ -57,10 +55,8 @@ def parse_space(text: str, model: Any, source: str = "params.yaml") -> Parameter
         model: The MjModel.
         source: What messages call the text.
     """
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as err:
-        raise ConfigurationError(f"{source} is not YAML: {err}") from err
+    with reading(source, "YAML", error=ConfigurationError):
+        content = parse_yaml(text)
     if not isinstance(content, Mapping) or list(content) != ["parameters"]:
         raise ConfigurationError(f"{source} must hold one key, `parameters`, with a list of entries")
     entries = content["parameters"]
@@ -75,7 +71,9 @@ def parse_space(text: str, model: Any, source: str = "params.yaml") -> Parameter
             raise
     names = [p.name for p in parameters]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigurationError(f"{source}: parameter names repeat: {twice}; give one of them a `name`")
+        raise ConfigurationError(
+            f"{source}: parameter names repeat: {short(twice)}; give one of them a `name`"
+        )
     space = ParameterSpace(parameters)
     try:
         check_space(model, space)
@@ -105,7 +103,7 @@ def _entry(p: Parameter) -> dict[str, Any]:
 
 def _parameters(entry: Any, model: Any) -> list[Parameter]:
     if not isinstance(entry, Mapping):
-        raise ConfigurationError(f"an entry must have keys ({', '.join(_KEYS)}), got {entry!r}")
+        raise ConfigurationError(f"an entry must have keys ({', '.join(_KEYS)}), got {shown(entry)}")
     for key in entry:
         if key not in _KEYS:
             raise _unknown("key", str(key), _KEYS)
@@ -127,7 +125,7 @@ def _elements(value: Any, kind: Kind, model: Any) -> list[str]:
     if not isinstance(patterns, Sequence) or not patterns or not all(isinstance(x, str) for x in patterns):
         raise ConfigurationError(
             f"`elements` must be a {kind.element} name, a pattern such as '*_hip', or a list of them; "
-            f"got {value!r}"
+            f"got {shown(value)}"
         )
     names = [name for name in element_names(model, kind.element) if name]
     if kind.element == "body":
@@ -199,7 +197,7 @@ def _range(
     if "range" in entry:
         ends = entry["range"]
         if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
-            raise ConfigurationError(f"parameter {name!r}: `range` must be [low, high], got {ends!r}")
+            raise ConfigurationError(f"parameter {name!r}: `range` must be [low, high], got {shown(ends)}")
         low, high = (_number(end, f"range of {name!r}") for end in ends)
         if low >= high:
             hint = "they are reversed" if low > high else "for a fixed value use `known`"
@@ -241,7 +239,9 @@ def _prior(entry: Mapping[str, Any], name: str) -> tuple[float | None, float | N
         return None, None
     prior = entry["prior"]
     if not isinstance(prior, Mapping) or set(prior) != {"mean", "std"}:
-        raise ConfigurationError(f"parameter {name!r}: `prior` must have `mean` and `std`, got {prior!r}")
+        raise ConfigurationError(
+            f"parameter {name!r}: `prior` must have `mean` and `std`, got {shown(prior)}"
+        )
     return _number(prior["mean"], f"prior of {name!r}"), _number(prior["std"], f"prior of {name!r}")
 
 
@@ -253,20 +253,20 @@ def _number(value: Any, what: str) -> float:
         except ValueError:
             pass
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigurationError(f"the {what} must be a number, got {value!r}")
+        raise ConfigurationError(f"the {what} must be a number, got {shown(value)}")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise ConfigurationError(f"the {what} must be finite, got {value!r}")
+        raise ConfigurationError(f"the {what} must be finite, got {shown(value)}")
     return number
 
 
 def _text(entry: Mapping[str, Any], key: str) -> str:
     value = entry.get(key)
-    if not isinstance(value, str) or not value:
-        raise ConfigurationError(f"`{key}` must be a text, got {value!r}")
+    if not isinstance(value, str) or not 0 < len(value) <= QUOTED:
+        raise ConfigurationError(f"`{key}` must be a text of 1 to {QUOTED} characters, got {shown(value)}")
     return value
 
 

@@ -1,0 +1,282 @@
+"""Reads files that may be damaged or hostile: a size limit before, one clear line after.
+
+Every reader of JSON, YAML and NPZ goes through here, so that a limit is stated once and an exception of a
+parser never reaches the user as a traceback. What a file means is for the caller to say, inside
+:func:`reading`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import stat
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, MissingExtraError, short
+from deal_hw.types import FloatArray
+
+MIB: Final = 1 << 20
+JSON_BYTES: Final = 16 * MIB
+"""Largest JSON file; the values take up to thirty times that in memory."""
+YAML_BYTES: Final = MIB
+"""Largest YAML file. The longest hand-written one is a hundredth of that."""
+YAML_NODES: Final = 100_000
+"""Most values of a YAML file, those behind aliases counted each time they are referred to."""
+YAML_TEXT: Final = 10_000
+"""Longest single text of a YAML file [characters]."""
+RECORDING_BYTES: Final = 1024 * MIB
+"""Largest file of a foreign recording (CSV, NPZ, MCAP)."""
+NUMBERS: Final = 1 << 27
+"""Most numbers of one recording: 1 GiB, as 30 joints with five quantities at 1 kHz give in 15 minutes."""
+NAMES: Final = 4096
+"""Most columns of a table, and most names of a list."""
+_DIRECTORY_BYTES: Final = 16 * MIB
+"""Largest table of contents of an NPZ file."""
+
+
+@contextlib.contextmanager
+def reading(
+    path: object, what: str, advice: str = "", *, error: type[DealHwError] = DatasetError
+) -> Iterator[None]:
+    """Turn whatever goes wrong inside the block into one line that names the file.
+
+    Parsers of damaged bytes raise nearly anything (`struct.error`, `zlib.error`, `RecursionError`,
+    `MemoryError`, ...), and so does code that walks values of another structure than expected. Errors of our
+    own keep their class and get the path in front. ``--traceback`` shows where it came from.
+
+    Args:
+        path: The file, as messages call it.
+        what: What it should be, such as "CSV" or "a calibration result".
+        advice: What to do instead, such as "`deal-hw calibrate` writes one".
+        error: What to raise.
+    """
+    then = f"; {advice}" if advice else ""
+    try:
+        yield
+    except MissingExtraError:
+        raise
+    except DealHwError as err:
+        if str(path) not in str(err):
+            err.args = (f"{path}: {err}",)
+        raise
+    except FileNotFoundError as err:
+        raise error(f"{path} cannot be read: there is no such file{then}") from err
+    except OSError as err:
+        raise error(f"{path} cannot be read: {err.strerror or short(err)}{then}") from err
+    except Exception as err:
+        raise error(f"{path} cannot be read as {what}: {_reason(err)}{then}") from err
+
+
+def _reason(err: Exception) -> str:
+    if isinstance(err, KeyError):
+        return f"{short(str(err))} is missing"
+    if isinstance(err, RecursionError):
+        return "its parts are nested too deep"
+    if isinstance(err, MemoryError):
+        return "it needs more memory than there is"
+    if isinstance(err, UnicodeDecodeError):
+        return f"byte {err.start} is no UTF-8 text"
+    return short(err) or type(err).__name__
+
+
+def check_size(path: Path, most: int) -> None:
+    """Check that a path is an ordinary file of a bounded size.
+
+    Raises:
+        OSError: There is none, or it cannot be looked at.
+        ConfigurationError: It is a folder or a device, or too large.
+    """
+    status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
+        # A pipe or a device could keep the reader waiting, or feed it, for ever.
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device"
+        raise ConfigurationError(f"{path} is {kind}; name an ordinary file")
+    if status.st_size > most:
+        raise ConfigurationError(
+            f"{path} has {status.st_size / MIB:.1f} MiB; files of this kind may have {most / MIB:g} MiB"
+        )
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """Return a file's bytes; errors as :func:`check_size`."""
+    check_size(path, most)
+    with open(path, "rb") as file:
+        return file.read(most)
+
+
+def read_json(path: Path) -> Any:
+    """Return the values of a JSON file; to be called inside :func:`reading`."""
+    return json.loads(read_bytes(path, JSON_BYTES))
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the values of a YAML file; to be called inside :func:`reading`."""
+    return parse_yaml(read_bytes(path, YAML_BYTES).decode("utf-8"))
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the plain values of YAML text; to be called inside :func:`reading`."""
+    # Only here: control processes read no YAML.
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def get_single_node(self) -> Any:
+            node = super().get_single_node()
+            if node is not None:
+                _weigh(node, {})
+            return node
+
+    if len(text) > YAML_BYTES:
+        raise ConfigurationError(f"{len(text)} characters of YAML; {YAML_BYTES} are allowed")
+    return yaml.load(text, Loader)
+
+
+def _weigh(node: Any, weights: dict[int, float]) -> float:
+    """Return how many values a YAML node stands for.
+
+    Eight lists that each name the one before nine times are a line each, and 43 million values: merging or
+    printing them would not end. A node inside itself weighs infinitely much.
+    """
+    known = weights.get(id(node))
+    if known is not None:
+        return known
+    weights[id(node)] = math.inf
+    value, weight = node.value, 1.0
+    if isinstance(value, str):
+        if len(value) > YAML_TEXT:
+            raise ValueError(f"a text of {len(value)} characters; {YAML_TEXT} are allowed")
+    else:
+        for entry in value:
+            weight += sum(_weigh(n, weights) for n in (entry if isinstance(entry, tuple) else (entry,)))
+    if weight > YAML_NODES:
+        raise ValueError(f"more than {YAML_NODES} values; aliases count each time")
+    weights[id(node)] = weight
+    return weight
+
+
+class _Sipped(io.FileIO):
+    """A file that is never read far at once: the ZIP reader takes a table of contents at its word."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > _DIRECTORY_BYTES:
+            raise ValueError(f"a table of contents of {size / MIB:.0f} MiB")
+        return super().read(-1 if size is None else size) or b""
+
+
+def read_arrays(
+    source: Path | bytes, wanted: Callable[[np.dtype[Any], tuple[int, ...]], bool]
+) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, str]]:
+    """Return the arrays of an NPZ file; to be called inside :func:`reading`.
+
+    Sizes are read from the table of contents and from each array's own header before any memory is taken:
+    a file of 3 MB may claim terabytes. Nothing is unpickled.
+
+    Args:
+        source: The file, or its bytes.
+        wanted: Says by kind and shape whether an array is to be read.
+
+    Returns:
+        The arrays by name, and what was left out with the reason.
+
+    Raises:
+        ValueError: It holds more than :data:`NUMBERS` numbers, or an array is not as long as it says.
+        Exception: What ZIP and NPY readers raise.
+    """
+    if isinstance(source, Path):
+        check_size(source, RECORDING_BYTES)
+    opened: IO[bytes] = io.BytesIO(source) if isinstance(source, bytes) else _Sipped(source)
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
+    left_out: dict[str, str] = {}
+    budget = NUMBERS
+    with opened, zipfile.ZipFile(opened) as archive:
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            with archive.open(entry) as member:
+                shape, fortran, dtype = _header(member)
+                count = math.prod(shape)
+                if dtype.hasobject:
+                    left_out[name] = "Python objects, which could run anything"
+                elif not wanted(dtype, shape):
+                    left_out[name] = f"{short(dtype, 40)} {short(shape, 40)}"
+                else:
+                    budget -= count
+                    size = count * dtype.itemsize
+                    if budget < 0 or size > 8 * NUMBERS:
+                        raise ValueError(f"more than {NUMBERS} numbers")
+                    if size > entry.file_size:
+                        raise ValueError(f"{short(name, 60)!r} is shorter than its shape {short(shape, 60)}")
+                    flat = np.frombuffer(bytearray(member.read(size)), dtype, count)
+                    arrays[name] = flat.reshape(shape, order="F" if fortran else "C")
+    return arrays, left_out
+
+
+def _header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(member)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in read:
+        raise ValueError(f"an array of NPY version {version}; 1.0 and 2.0 are known")
+    shape, fortran, dtype = read[version](member)
+    if any(n < 0 for n in shape):
+        raise ValueError(f"an array of shape {short(shape, 60)}")
+    return shape, fortran, dtype
+
+
+def object_of(values: Any, what: str = "an object") -> Mapping[str, Any]:
+    """Return plain JSON values that must be an object.
+
+    Raises:
+        ConfigurationError: They are something else.
+    """
+    if not isinstance(values, Mapping):
+        raise ConfigurationError(f"{what} was expected, got {short(values)}")
+    return values
+
+
+def texts(values: Any, what: str) -> tuple[str, ...]:
+    """Return a list of texts; errors as :func:`object_of`."""
+    if not isinstance(values, list | tuple) or not all(isinstance(v, str) for v in values):
+        raise ConfigurationError(f"{what} must be a list of texts, got {short(values)}")
+    return tuple(values)
+
+
+def number(value: Any, what: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return a finite number in [low, high].
+
+    Raises:
+        ConfigurationError: It is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigurationError(f"{what} must be a number, got {short(value)}")
+    try:
+        found = float(value)
+    except OverflowError:
+        found = math.inf
+    if not (math.isfinite(found) and low <= found <= high):
+        span = "" if (low, high) == (-math.inf, math.inf) else f" from {low:g} to {high:g}"
+        raise ConfigurationError(f"{what} must be a finite number{span}, got {found:g}")
+    return found
+
+
+def numbers(values: Any, what: str, shape: tuple[int, ...], *, finite: bool = True) -> FloatArray:
+    """Return nested lists of numbers as an array of a given shape.
+
+    Raises:
+        ConfigurationError: They have another shape, or hold what is no (finite) number.
+    """
+    try:
+        found = np.asarray(values, dtype=float)
+    except (TypeError, ValueError, OverflowError) as err:
+        raise ConfigurationError(f"{what} must be numbers, got {short(values)}") from err
+    if found.shape != shape:
+        raise ConfigurationError(f"{what} has the shape {short(found.shape, 60)}; it must have {shape}")
+    if finite and not np.isfinite(found).all():
+        raise ConfigurationError(f"{what} holds a value that is not finite")
+    return found

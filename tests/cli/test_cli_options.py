@@ -1,0 +1,182 @@
+"""Options: numbers are inside their ranges, and what would be ignored is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import math
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any
+
+import pytest
+
+from deal_hw.cli.main import VERBS, main, run
+from deal_hw.cli.options import Range
+from deal_hw.errors import ConfigurationError, UnknownNameError
+
+NO_USE: tuple[float, ...] = (math.nan, math.inf, -math.inf, 1e300)
+"""No option takes one of these."""
+DOUBTFUL: tuple[float, ...] = (-1, 0, 1e-300, 2**63)
+"""Refused, or of use: zero is a seed, and a share."""
+FINE_AT_ZERO = {
+    "seed", "episodes", "holdout", "web_port", "at", "latency", "drop", "duplicate", "corrupt", "reorder",
+    "domain", "split", "rounds", "tick_start_ms", "holdout_part", "vigor", "balance_s", "leave_out", "known",
+    "range", "push", "duration_s", "freeze_after_s", "vanish_after_s", "wire_after_s", "stale_after_s",
+    "lost_after_s", "sport_after_s", "battery_after_s", "nan_after_s", "hot_after_s", "stop_after_s",
+    "push_after_s",
+}  # fmt: skip
+FINE_BELOW_ZERO = {"vigor", "known", "range", "push"}
+REQUIRED: dict[str, Any] = {
+    "robot": "cartpole", "port": "p", "out": Path("o"), "paths": (Path("p"),), "path": Path("p"),
+    "episode": Path("e"), "bench": "loop", "dataset": Path("d"),
+}  # fmt: skip
+
+
+def dataclasses_of(hint: Any) -> Iterator[type[Any]]:
+    """Yield the dataclasses in a type, those inside them included."""
+    if typing.get_origin(hint) in (Annotated, UnionType, typing.Union):
+        for part in typing.get_args(hint):
+            yield from dataclasses_of(part)
+    elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        yield hint
+        for inner in typing.get_type_hints(hint, include_extras=True).values():
+            yield from dataclasses_of(inner)
+
+
+def numeric_fields() -> list[tuple[type[Any], str, Any]]:
+    """Return every numeric field of every verb's settings with its type."""
+    found = {}
+    for verb in VERBS.values():
+        module = importlib.import_module(verb.module)
+        for settings in dataclasses_of(getattr(module, verb.config)):
+            for name, hint in typing.get_type_hints(settings).items():
+                if "float" in str(hint) or "int" in str(hint).replace("print", ""):
+                    found[settings.__name__, name] = (settings, name, hint)
+    return list(found.values())
+
+
+FIELDS = numeric_fields()
+
+
+def value_for(hint: Any, number: float) -> Any:
+    """Return a value of a field's type whose number is the given one."""
+    text = str(hint)
+    if "tuple[tuple[str, float, float]" in text:
+        return (("name", number, number),)
+    if "tuple[tuple[str, float]" in text:
+        return (("name", number),)
+    if "tuple[float, float]" in text:
+        return (number, number)
+    return (number,) if text.startswith("tuple") else number
+
+
+def make(settings: type[Any], **values: Any) -> Any:
+    """Return settings with only what they require, and some values."""
+    needed = {
+        f.name: REQUIRED[f.name]
+        for f in dataclasses.fields(settings)
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    }
+    return settings(**{**needed, **values})
+
+
+def test_the_sweep_sees_the_options() -> None:
+    """The list of numeric options is not empty by a mistake of the test."""
+    names = {(settings.__name__, name) for settings, name, _ in FIELDS}
+    assert len(names) > 80
+    assert names >= {("Collect", "seconds"), ("Calibrate", "known"), ("WireOptions", "domain")}
+
+
+@pytest.mark.parametrize(("settings", "name", "hint"), FIELDS, ids=lambda v: getattr(v, "__name__", str(v)))
+def test_every_number_has_a_range(settings: type[Any], name: str, hint: Any) -> None:
+    """What is no number, endless or absurd is refused; negative and zero where they mean nothing."""
+    for number in NO_USE:
+        with pytest.raises(ConfigurationError) as caught:
+            make(settings, **{name: value_for(hint, number)})
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
+    for number in DOUBTFUL:
+        fine = (number == -1 and name in FINE_BELOW_ZERO) or (0 <= number < 1 and name in FINE_AT_ZERO)
+        try:
+            make(settings, **{name: value_for(hint, number)})
+        except ConfigurationError as error:
+            assert "\n" not in str(error)
+        else:
+            assert fine, f"{settings.__name__}.{name} takes {number}"
+
+
+def test_a_range_says_milliseconds_where_seconds_are_small() -> None:
+    """Option, value and range are in the message, and a latency's range is in ms."""
+    with pytest.raises(ConfigurationError, match=r"^--latency 12 s: allowed are 0 to 40 ms$"):
+        Range(0, 0.04, "s").check("--latency", 12)
+    Range(0, 0.04, "s").check("--latency", None)
+    with pytest.raises(ConfigurationError, match="--seed 1000000"):
+        Range(0, 5).check("--seed", 10**4000)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("calibrate d --latency 12", "--latency 12.0 s: allowed are 0 to 40 ms"),
+        ("calibrate d --seed -1", "--seed -1: allowed are 0 to"),
+        ("emulate cartpole --drop nan", "--drop nan: allowed are 0 to 1"),
+        ("deploy cartpole --port p --domain 233", "DDS domain 233: 0 to 232"),
+        ("bench loop --seeds 0-99999999999", "--seeds 99999999999: allowed are"),
+    ],
+)
+def test_a_refused_number_gets_one_line(line: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """No box, no traceback: one line like other errors, exit code 2."""
+    assert main(line.split()) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"deal-hw: error: {words}") and printed.err.count("\n") == 1
+    assert not printed.out
+
+
+def test_words_that_do_not_parse_still_get_the_box(capsys: pytest.CaptureFixture[str]) -> None:
+    """What the parser itself refuses is shown by it, once."""
+    with pytest.raises(SystemExit) as caught:
+        main(["calibrate", "--nosuch"])
+    assert caught.value.code == 2 and capsys.readouterr().err.count("nosuch") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        ("calibrate d --parameters nothere.yaml", "--parameters"),
+        ("calibrate d --columns nothere.yaml", "--columns"),
+        ("calibrate d --leave-out nosuch 0 99", "--leave-out"),
+        ("calibrate d --fit-seconds 3", "--fit-seconds"),
+        ("calibrate d --feet a", "--feet"),
+        ("calibrate d --holdout-part 0.5", "--holdout-part"),
+        ("calibrate --model m.xml --data r.csv --sample-hz 50", "--sample-hz"),
+        ("deploy cartpole --port p --velocity 0.3,0,0", "--velocity"),
+        ("collect go2 --port p --out o --velocity 0.3,0,0", "--velocity"),
+        ("deploy cartpole --port p --hand-back", "--hand-back"),
+        ("collect cartpole --port p --out o --profile chirp --excite multisine", "--profile"),
+        ("collect cartpole --port p --out o --profile chirp --vigor 1", "--vigor"),
+        ("collect cartpole --port p --out o --profile hold --policy a.onnx", "--policy"),
+        ("excite cartpole --out o --amplitude 0.5", "--amplitude"),
+        ("excite cartpole --out o --family steps --draws 3", "--draws"),
+        ("inspect e --web-port 1234", "--web-port"),
+        ("bench loop --model m.xml", "--model"),
+        ("bench loop --rate 100", "--rate"),
+    ],
+)
+def test_an_option_without_effect_is_refused(line: str, option: str) -> None:
+    """Nobody is to believe that an option worked which was ignored."""
+    verb, *arguments = line.split()
+    with pytest.raises(ConfigurationError, match=rf"^{option} would have no effect: .{{9}}") as caught:
+        run(verb, arguments)
+    assert not isinstance(caught.value, UnknownNameError)
+
+
+def test_a_missing_recording_is_told_before_the_missing_desktop(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a desktop, `inspect nothere.mcap` says that the file is not there."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["inspect", "nothere.mcap"]) == 2
+    assert "nothere.mcap cannot be read" in capsys.readouterr().err
