@@ -24,7 +24,7 @@ from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
-from deal_hw.control.realtime import SUPERVISOR_PRIORITY, priority
+from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
 from deal_hw.data.recorder_launch import RecorderHandle, RecorderOutcome
 
 START_SILENCE_S = 30.0
@@ -205,6 +205,7 @@ class Supervisor:
         self._killed = self._killed or why
         if self._child is not None:
             self._child.kill()
+            hurry(self._child.pid)
 
     def _reap(self) -> int:
         """Return the exit code of the control process, which has said its last word or never will."""
