@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
+from deal_hw.cli.emulate_common import (
+    cut_on_signal,
+    happenings,
+    read_truth,
+    realtime_priority,
+    reveal,
+    run_until,
+    stop_on_signals,
+)
 from deal_hw.cli.emulate_go2 import DEFAULT_PORTS, Go2Options, emulate_go2
 from deal_hw.cli.options import Range, Ratio, Seed, Share, check_ranges
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
@@ -57,7 +65,7 @@ class Emulate:
     """Make a symbolic link to the port here."""
 
     reveal: bool = False
-    """Print the truth (and for the Go2 what happened) as one line of JSON at the end."""
+    """Print the truth and what happened as one line of JSON at the end."""
 
     reveal_to: Path | None = None
     """Write the same to this JSON file at the end."""
@@ -77,8 +85,22 @@ class Emulate:
     freeze_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """The firmware hangs this long after the motor was first armed, or commanded [s]."""
 
+    cut_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The wire is cut this long after the motor was first armed, or commanded [s]: nothing goes out and
+    nothing is heard. The signal SIGUSR1 cuts it at any moment."""
+
+    cut_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
+    """How long the wire is cut [s]."""
+
     vanish_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
-    """The port vanishes this long after the motor was first armed [s]."""
+    """The port vanishes this long after the motor was first armed, like a cable that is pulled [s]."""
+
+    return_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The port comes back under --link so long after it vanished [s]; without it the emulator ends there."""
+
+    events_to: Path | None = None
+    """Append to this file what the robot is told, while it happens: lines of JSON with device time [ms], host
+    time [ns] and what it was."""
 
     parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
@@ -96,12 +118,20 @@ class Emulate:
             raise ConfigurationError(f"emulate {self.robot} has no {', '.join(foreign)}")
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
+        if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
+            raise ConfigurationError(
+                "--return-after-s needs --vanish-after-s and --link: the new port has another name"
+            )
 
     def _foreign(self) -> list[str]:
         """Return the flags given that belong to another robot."""
         if self.robot == "cartpole":
             return self.go2.given() + (["--port"] if self.port is not None else [])
-        own = {"--link": self.link, "--vanish-after-s": self.vanish_after_s}
+        own = {
+            "--link": self.link,
+            "--vanish-after-s": self.vanish_after_s,
+            "--return-after-s": self.return_after_s,
+        }
         return [flag for flag, value in own.items() if value is not None]
 
 
@@ -119,7 +149,7 @@ def emulate(config: Emulate) -> int:
         if error.name in ("mujoco", "scipy"):
             raise MissingExtraError(error.name, "sim") from error
         raise
-    stop = stop_on_signals()
+    stop, cut = stop_on_signals(), cut_on_signal()
     truth = _truth(config)
     emulator = CartpoleEmulator(CartpoleDevice(truth), link=config.link, hazards=_hazards(config))
     try:
@@ -128,11 +158,21 @@ def emulate(config: Emulate) -> int:
             f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused; Ctrl-C ends",
             flush=True,
         )
-        with realtime_priority():
-            run_until(emulator.step, stop, config.duration_s, config.parent)
+        with realtime_priority(), happenings(config.events_to, emulator.changes) as tell:
+
+            def step() -> bool:
+                if cut.is_set():
+                    cut.clear()
+                    emulator.cut()
+                going_on = emulator.step()
+                tell()
+                return going_on
+
+            run_until(step, stop, config.duration_s, config.parent)
     finally:
         emulator.close()
-        reveal(truth.to_json(), on_stdout=config.reveal, path=config.reveal_to)
+        report = {**truth.to_json(), **emulator.report()}
+        reveal(report, on_stdout=config.reveal, path=config.reveal_to)
     print(f"emulator: {emulator.slips} stalls, {emulator.dropped} writes dropped", file=sys.stderr)
     return 0
 
@@ -157,7 +197,10 @@ def _hazards(config: Emulate) -> Hazards:
     rates = FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate)
     return Hazards(
         freeze_after_s=config.freeze_after_s,
+        cut_after_s=config.cut_after_s,
+        cut_s=config.cut_s,
         vanish_after_s=config.vanish_after_s,
+        return_after_s=config.return_after_s,
         faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]))
         if rates != FaultRates()
         else None,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,6 +30,40 @@ def stop_on_signals() -> threading.Event:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
     return stop
+
+
+def cut_on_signal() -> threading.Event:
+    """Return an event that SIGUSR1 sets: the wire is to be cut now."""
+    cut = threading.Event()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGUSR1, lambda *_: cut.set())
+    return cut
+
+
+@contextlib.contextmanager
+def happenings(path: Path | None, *logs: Sequence[tuple[int, int, str]]) -> Iterator[Callable[[], None]]:
+    """Yield a function that appends to a file what is new in the logs, one line of JSON an entry.
+
+    A program that tests a robot's commander reads there what the robot was told, while it happens.
+
+    Args:
+        path: The file; None for none.
+        logs: Entries of device time [ms], host time [ns] and what happened; they grow.
+    """
+    if path is None:
+        yield lambda: None
+        return
+    told = [0] * len(logs)
+    with path.open("a", encoding="utf-8") as file:
+
+        def tell() -> None:
+            for number, log in enumerate(logs):
+                for entry in log[told[number] :]:
+                    file.write(json.dumps(entry) + "\n")
+                    file.flush()
+                told[number] = len(log)
+
+        yield tell
 
 
 def realtime_priority() -> AbstractContextManager[None]:

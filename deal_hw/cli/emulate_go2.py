@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from deal_hw.cli.emulate_common import read_truth, realtime_priority, reveal, run_until, stop_on_signals
+from deal_hw.cli.emulate_common import (
+    cut_on_signal,
+    happenings,
+    read_truth,
+    realtime_priority,
+    reveal,
+    run_until,
+    stop_on_signals,
+)
 from deal_hw.cli.options import Range, check_ranges
 from deal_hw.drivers.go2.faults import FaultPlan, Go2Faults
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
@@ -121,7 +129,7 @@ def emulate_go2(config: Emulate) -> int:
         if error.name == "mujoco":
             raise MissingExtraError(error.name, "sim") from error
         raise
-    stop = stop_on_signals()
+    stop, cut = stop_on_signals(), cut_on_signal()
     truth = _truth(config)
     device = _device(config, truth)
     transport = config.transport or "dds"
@@ -136,11 +144,18 @@ def emulate_go2(config: Emulate) -> int:
             print(f"port {port}", flush=True)
             print(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends", flush=True)
 
-            def step() -> bool:
-                emulator.step()
-                return True
+            log = device.log
+            with happenings(config.events_to, log.requests, log.changes) as tell:
 
-            run_until(step, stop, config.duration_s, config.parent)
+                def step() -> bool:
+                    if cut.is_set():
+                        cut.clear()
+                        device.begin_fault("cut")
+                    emulator.step()
+                    tell()
+                    return True
+
+                run_until(step, stop, config.duration_s, config.parent)
         finally:
             emulator.close()
     report = emulator.report()
@@ -199,7 +214,8 @@ def _device(config: Emulate, truth: Truth) -> Go2Device:
     own = config.go2
     plan = FaultPlan(
         drop=config.drop, duplicate=config.duplicate, corrupt=config.corrupt,
-        freeze_after_s=config.freeze_after_s, **asdict(own.faults),
+        freeze_after_s=config.freeze_after_s, cut_after_s=config.cut_after_s, cut_s=config.cut_s,
+        **asdict(own.faults),
     )  # fmt: skip
     if own.no_remote and own.remote_script is not None:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")

@@ -91,6 +91,18 @@ def priority(level: int, *, children: bool = False, lock: bool = False) -> Itera
             os.sched_setscheduler(0, *before)
 
 
+def hurry(pid: int) -> None:
+    """Let all threads of a process run ahead of ordinary ones where permitted: a killed one is gone soon.
+
+    It is gone only once each of its threads has run once more. On a busy machine those of ordinary priority,
+    as a network's runtime has some, take hundreds of ms for that.
+    """
+    with contextlib.suppress(OSError):
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+
+
 def _lock_memory() -> str | None:
     """Lock the process's memory; return why not."""
     # With MCL_FUTURE under a finite limit, a later allocation beyond it fails and kills the loop in the

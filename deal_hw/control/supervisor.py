@@ -24,7 +24,7 @@ from typing import IO, Any, cast
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
-from deal_hw.control.realtime import SUPERVISOR_PRIORITY, priority
+from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
 from deal_hw.data.recorder_launch import RecorderHandle, RecorderOutcome
 
 START_SILENCE_S = 30.0
@@ -205,6 +205,7 @@ class Supervisor:
         # SIGKILL also ends a process that was stopped by SIGSTOP.
         self._killed = self._killed or why
         child.kill()
+        hurry(child.pid)
 
     def _reap(self, child: subprocess.Popen[bytes]) -> int:
         """Return the exit code of the control process, which has said its last word or never will."""

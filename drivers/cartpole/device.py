@@ -67,6 +67,9 @@ class CartpoleDevice:
     Until armed the motor is off: the pole hangs, or is held upright by a hand after homing. Between arming
     and the first target the force is zero, because gains come only with targets.
 
+    Attributes:
+        received_bytes: How many have come from the host.
+
     Args:
         truth: Hidden parameters, latency, profile and seed.
         keep_truth: Whether to keep the true trajectory for :meth:`true_trajectory`.
@@ -90,6 +93,7 @@ class CartpoleDevice:
         self._motor_m = 0.0
         self._decoder = protocol.FrameDecoder()
         self._inbox = b""
+        self.received_bytes = 0
         self._tick = 0
         self._mode = _Mode.IDLE
         self._homed = self._watchdog = False
@@ -121,6 +125,16 @@ class CartpoleDevice:
         return self._mode is _Mode.ARMED
 
     @property
+    def mode(self) -> str:
+        """What the motor does: "idle" and "held" are without torque, "homing" and "armed" are not."""
+        return self._mode.name.lower()
+
+    @property
+    def watchdog(self) -> bool:
+        """Whether the motor was stopped because commands stayed away, since it was last armed."""
+        return self._watchdog
+
+    @property
     def frame_errors(self) -> int:
         """Corrupt frames received so far."""
         return self._decoder.errors
@@ -128,6 +142,7 @@ class CartpoleDevice:
     def receive(self, data: bytes) -> None:
         """Take bytes from the host; the next tick handles them."""
         self._inbox += data
+        self.received_bytes += len(data)
 
     def advance_to(self, device_ns: int) -> bytes:
         """Run every tick up to and including ``device_ns``; return the bytes sent meanwhile."""

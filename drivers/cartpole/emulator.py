@@ -8,6 +8,7 @@ import select
 import tty
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.cartpole.device import CartpoleDevice
@@ -17,6 +18,8 @@ from deal_hw.testing.faults import FrameFaults
 STALL_NS = 50_000_000
 """Behind by more than this, the device's time stands still instead of catching up."""
 
+_MOST_CHANGES = 2000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hazards:
@@ -24,12 +27,20 @@ class Hazards:
 
     Attributes:
         freeze_after_s: The firmware hangs: nothing is sent or heard any more [s]; None for never.
-        vanish_after_s: The port disappears as if unplugged [s]; None for never.
+        cut_after_s: The wire is cut: nothing goes out or is heard, the firmware goes on [s]; None for
+            never.
+        cut_s: How long it is cut [s].
+        vanish_after_s: The port disappears as if unplugged, the firmware goes on [s]; None for never.
+        return_after_s: It comes back so long after that, as a new port under the same link [s]; None: never,
+            and the emulator ends.
         faults: What happens to frames from the device.
     """
 
     freeze_after_s: float | None = None
+    cut_after_s: float | None = None
+    cut_s: float = 1.0
     vanish_after_s: float | None = None
+    return_after_s: float | None = None
     faults: FrameFaults | None = None
 
 
@@ -41,6 +52,8 @@ class CartpoleEmulator:
     Attributes:
         slips: Times that this process was stalled and device time stood still.
         dropped: Writes that found no room.
+        changes: What the motor and the port did, and when: device ms, host ns, and a mode of the device,
+            "cut", "gone" or "back"; the first 2000.
 
     Args:
         device: The device.
@@ -66,9 +79,17 @@ class CartpoleEmulator:
         self._origin_ns = 0
         self._unsent = b""
         self._armed_ns: int | None = None
+        self._cut_after_s, self._vanish_after_s = self._hazards.cut_after_s, self._hazards.vanish_after_s
+        self._cut_end_ns, self._gone_ns = 0, -1
+        self.changes: list[tuple[int, int, str]] = []
+        self._mode = device.mode
 
     def open(self) -> str:
         """Make the pty; return the path of the port."""
+        self._origin_ns = self._clock.now_ns() - self._device.device_ns
+        return self._open_port()
+
+    def _open_port(self) -> str:
         self._master, self._slave = os.openpty()
         # Our own copy of the slave keeps the pair alive while no host has it open.
         tty.setraw(self._slave)
@@ -83,7 +104,6 @@ class CartpoleEmulator:
                     f"{self._link} exists and is not a symbolic link; choose another --link"
                 )
             self._link.symlink_to(port)
-        self._origin_ns = self._clock.now_ns() - self._device.device_ns
         return port if self._link is None else str(self._link)
 
     def close(self) -> None:
@@ -104,11 +124,7 @@ class CartpoleEmulator:
         """
         next_tick_ns = self._origin_ns + self._device.device_ns
         wait_s = min(wait_s, max(0, next_tick_ns - self._clock.now_ns()) / 1e9)
-        readable, _, _ = select.select([self._master], [], [], wait_s)
-        data = b""
-        if readable:
-            with contextlib.suppress(BlockingIOError):
-                data = os.read(self._master, 4096)
+        data = self._read(wait_s)
         now_ns = self._clock.now_ns()
         late_ns = now_ns - self._origin_ns - self._device.device_ns
         if late_ns > STALL_NS:
@@ -116,17 +132,70 @@ class CartpoleEmulator:
             self._origin_ns += late_ns
             self.slips += 1
         armed_s = 0.0 if self._armed_ns is None else (now_ns - self._armed_ns) / 1e9
-        if _passed(self._hazards.vanish_after_s, armed_s):
-            self.close()
+        if not self._have_port(now_ns, armed_s):
             return False
+        if _passed(self._cut_after_s, armed_s):
+            self._cut_after_s = None
+            self.cut()
+        silent = self._gone_ns >= 0 or now_ns < self._cut_end_ns
         out = self._device.advance_to(now_ns - self._origin_ns)
-        if _passed(self._hazards.freeze_after_s, armed_s):
+        self._follow(now_ns)
+        if silent or _passed(self._hazards.freeze_after_s, armed_s):
             return True
         self._device.receive(data)
         if self._armed_ns is None and self._device.armed:
             self._armed_ns = now_ns
         self._write(out)
         return True
+
+    def cut(self) -> None:
+        """Cut the wire from now on, for as long as the hazards say."""
+        now_ns = self._clock.now_ns()
+        self._cut_end_ns = now_ns + round(self._hazards.cut_s * 1e9)
+        self._note(now_ns, "cut")
+
+    def report(self) -> dict[str, Any]:
+        """Return what happened, as plain JSON values."""
+        device = self._device
+        return {
+            "device_ms": device.device_ns // 10**6,
+            "changes": [list(change) for change in self.changes],
+            "last_mode": device.mode,
+            "watchdog": device.watchdog,
+            "received_bytes": device.received_bytes,
+            "slips": self.slips,
+        }
+
+    def _have_port(self, now_ns: int, armed_s: float) -> bool:
+        """Pull the cable and put it back when it is time; return False where nothing is left to do."""
+        again_s = self._hazards.return_after_s
+        if self._gone_ns < 0 and _passed(self._vanish_after_s, armed_s):
+            self.close()
+            self._vanish_after_s, self._gone_ns = None, now_ns
+            self._note(now_ns, "gone")
+            return again_s is not None
+        if self._gone_ns >= 0 and _passed(again_s, (now_ns - self._gone_ns) / 1e9):
+            self._open_port()
+            self._unsent, self._gone_ns = b"", -1
+            self._note(now_ns, "back")
+        return True
+
+    def _read(self, wait_s: float) -> bytes:
+        if self._master < 0:
+            self._clock.sleep_until_ns(self._clock.now_ns() + round(wait_s * 1e9))
+        elif select.select([self._master], [], [], wait_s)[0]:
+            with contextlib.suppress(BlockingIOError):
+                return os.read(self._master, 4096)
+        return b""
+
+    def _follow(self, now_ns: int) -> None:
+        if (mode := self._device.mode) != self._mode:
+            self._mode = mode
+            self._note(now_ns, mode)
+
+    def _note(self, now_ns: int, what: str) -> None:
+        if len(self.changes) < _MOST_CHANGES:
+            self.changes.append((self._device.device_ns // 10**6, now_ns, what))
 
     def _write(self, out: bytes) -> None:
         if out and self._hazards.faults is not None:

@@ -52,6 +52,7 @@ class CommandLog:
         largest_gap_ms: Longest time without a command while stiff [ms].
         faults: What went wrong on purpose.
         changes: When the kind of command changed: device ms, host ns, kind; the first 2000.
+        requests: When the robot's services were asked: device ms, host ns, service; the first 2000.
     """
 
     def __init__(self) -> None:
@@ -63,7 +64,13 @@ class CommandLog:
         self.largest_gap_ms = 0
         self.faults: list[FaultRecord] = []
         self.changes: list[tuple[int, int, str]] = []
+        self.requests: list[tuple[int, int, str]] = []
         self._kind = ""
+
+    def ask(self, service: str, now_ms: int, host_ns: int) -> None:
+        """Note a request to a service of the robot."""
+        if len(self.requests) < _MOST_CHANGES:
+            self.requests.append((now_ms, host_ns, service))
 
     def refuse(self, reason: str) -> None:
         """Note a command that was not taken."""
@@ -105,5 +112,6 @@ class CommandLog:
             "last_kind": self._kind or None,
             "largest_gap_ms": self.largest_gap_ms,
             "changes": [list(change) for change in self.changes],
+            "requests": [list(request) for request in self.requests],
             "faults": [asdict(fault) for fault in self.faults],
         }

@@ -113,7 +113,7 @@ class Go2Device:
         self._commands: deque[tuple[int, LowCommand]] = deque()
         self._tick, self._tick_offset = 0, tick_ms
         self.host_origin_ns = 0
-        self._frozen = False
+        self._frozen, self._cut_end = False, 0
         self._stale: bytes | None = None
         self._push_end: int | None = None
         self._last: LowState | None = None
@@ -163,7 +163,8 @@ class Go2Device:
             payload: CDR with its header.
             stamp_ns: Host clock at reception, for the log [ns].
         """
-        self._inbox.append((topic, payload, stamp_ns))
+        if self._tick >= self._cut_end:
+            self._inbox.append((topic, payload, stamp_ns))
 
     def advance_to(self, device_ns: int) -> list[Outgoing]:
         """Run every tick up to and including ``device_ns``; return what was sent meanwhile."""
@@ -189,7 +190,7 @@ class Go2Device:
         out += self._reports(now)
         self._move(velocity)
         self._tick = now + 1
-        if self._frozen:
+        if self._frozen or now < self._cut_end:
             return []
         for topic, _ in out:
             self._sent[topic] += 1
@@ -225,6 +226,8 @@ class Go2Device:
                 self._wire_faulty = True
             case "freeze":
                 self._frozen = True
+            case "cut":
+                self._cut_end = self._tick + round(plan.cut_s * 1e3)
             case "stale":
                 self._stale = encode_low_state(self._last or self._state(self._tick))
             case "lost":
@@ -275,6 +278,7 @@ class Go2Device:
         if topic == topics.LOW_COMMAND:
             self._take_command(payload, stamp_ns)
         elif (service := self._service_of.get(topic)) is not None:
+            self.log.ask(service, self._tick, stamp_ns)
             try:
                 answer = self._services.answer(
                     service, payload, self._sim.position() + self._bias, self._tick

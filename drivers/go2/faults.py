@@ -11,7 +11,9 @@ from deal_hw.drivers.go2.description import JOINTS
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 SHARES: Final = ("drop", "duplicate", "reorder", "corrupt")
-MOMENTS: Final = ("wire", "freeze", "stale", "lost", "sport", "battery", "nan", "hot", "stop", "push")
+MOMENTS: Final = (
+    "wire", "freeze", "cut", "stale", "lost", "sport", "battery", "nan", "hot", "stop", "push",
+)  # fmt: skip
 """Faults that begin at a moment, as in ``<name>_after_s``; ``wire`` is that of the four shares."""
 
 
@@ -89,6 +91,12 @@ class FaultPlan(Go2Faults):
 
     freeze_after_s: float | None = None
     """When the robot says nothing any more; it still hears [s]."""
+
+    cut_after_s: float | None = None
+    """When the wire is cut: nothing goes out or is heard; the robot does what it was last told [s]."""
+
+    cut_s: float = 1.0
+    """How long the wire is cut [s]."""
 
     def due(self) -> list[tuple[int, str]]:
         """Return when faults begin, in ms since the first stiff command, and which; earliest first."""

@@ -1,0 +1,194 @@
+"""What can go wrong with any robot's run: signals, a link that is away, a second run; and rows of that."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from fault_rig import (
+    ANY,
+    CONNECTING,
+    ENDING,
+    LYING_DOWN,
+    PATIENCE_S,
+    RISING,
+    RUNNING,
+    TAKING_OVER,
+    Case,
+    Rig,
+    headline,
+)
+
+from deal_hw.testing.faulty_proxy import FaultyProxy, State
+
+
+def signal_run(number: signal.Signals) -> Callable[[Rig], None]:
+    """Return an act: a signal to the process that the operator started."""
+    return lambda rig: rig.signal(rig.run.pid, number)
+
+
+def signal_control(number: signal.Signals) -> Callable[[Rig], None]:
+    """Return an act: a signal to the control process."""
+    return lambda rig: rig.signal(rig.control_pid(), number)
+
+
+def kill_control_sometime(rig: Rig) -> None:
+    """The control process dies, sooner or later: of a dry run the robot tells no phases."""
+    pid = rig.control_pid()
+    time.sleep(float(rig.rng.uniform(0.0, 3.0)))
+    rig.signal(pid, signal.SIGKILL)
+
+
+def kill_both(rig: Rig) -> None:
+    """Both processes die, as when the machine is out of memory."""
+    pid = rig.control_pid()
+    rig.signal(rig.run.pid, signal.SIGKILL)
+    rig.signal(pid, signal.SIGKILL)
+
+
+def stop_supervisor(rig: Rig) -> None:
+    """The operator's process stands still, until its control process has ended; then it goes on."""
+    control = rig.control_pid()
+    rig.signal(rig.run.pid, signal.SIGSTOP)
+    with contextlib.suppress(TimeoutError):
+        rig.until(lambda: not _runs(control), 10.0)
+    rig.run.send_signal(signal.SIGCONT)
+
+
+def suspend(rig: Rig) -> None:
+    """Ctrl-Z: the robot must be passive before the process stops; then `fg`."""
+    rig.signal(rig.run.pid, signal.SIGTSTP)
+    stopped = rig.until(lambda: rig.process_state() == "T", 20.0)
+    if not stopped:
+        rig.notes.append("it ended instead of stopping")
+        return
+    time.sleep(0.02)
+    if rig.is_active:
+        rig.notes.append("stopped while the motors obey")
+    time.sleep(0.3)
+    if rig.is_active:
+        rig.notes.append("the motors obey while it is stopped")
+    rig.run.send_signal(signal.SIGCONT)
+
+
+def freeze_link(seconds: float) -> Callable[[Rig], None]:
+    """Return an act: the link is silent both ways for a time [s]."""
+
+    def act(rig: Rig) -> None:
+        rig.fault()
+        if rig.proxy is None:
+            os.kill(rig.process.pid, signal.SIGUSR1)
+        else:
+            _away(rig.proxy, "frozen", seconds)
+
+    return act
+
+
+def reset_link(seconds: float) -> Callable[[Rig], None]:
+    """Return an act: the connection is reset, and refused for a time [s]."""
+
+    def act(rig: Rig) -> None:
+        rig.fault()
+        if rig.proxy is None:
+            raise RuntimeError("this wire has no connections")
+        _away(rig.proxy, "refused", seconds)
+
+    return act
+
+
+def _away(proxy: FaultyProxy, state: State, seconds: float) -> None:
+    until = time.monotonic() + seconds
+    proxy.set(state)
+    time.sleep(max(until - time.monotonic(), 0.0))
+    proxy.set("open")
+
+
+def second_run(elsewhere: bool = False) -> Callable[[Rig], None]:
+    """Return an act: a second run of the same robot; later Ctrl-C ends the first, and nobody takes over.
+
+    Args:
+        elsewhere: Whether the second comes by another address, as from another computer.
+    """
+
+    def act(rig: Rig) -> None:
+        second = rig.launch("second", rig.process.port if elsewhere else "")
+        begun = time.monotonic()
+        try:
+            code = second.wait(30.0)
+        except subprocess.TimeoutExpired:
+            second.kill()
+            code = second.wait()
+            rig.notes.append("the second run was not refused within 30 s")
+        rig.notes += [] if code == 2 else [f"the second run ended with {code}"]
+        text = (rig.folder / "out" / "second").read_text()
+        rig.notes += [] if "in use" in text else [f"the second run said {headline(text)!r}"]
+        rig.said.append(f"second run, after {time.monotonic() - begun:.1f} s: {headline(text)}")
+        if rig.run.poll() is not None:
+            rig.notes.append("the first run did not go on")
+            return
+        rig.until(lambda: rig.is_active)
+        time.sleep(float(rig.rng.uniform(0.1, 0.5)))
+        rig.signal(rig.run.pid, signal.SIGINT)
+        rig.run.wait(PATIENCE_S)
+        time.sleep(3.0)
+
+    return act
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+LINK_S = (0.1, 0.5, 1.5, 3.0, 8.0)
+
+
+def process_cases() -> tuple[Case, ...]:
+    """Return the rows in which something happens to a process; the same for every robot."""
+    stop, kill = signal_control(signal.SIGSTOP), signal_control(signal.SIGKILL)
+    connected = ANY[1:]
+    return (
+        Case(name="Ctrl-C", act=signal_run(signal.SIGINT), phases=ANY, codes=(130,)),
+        # Before there is a control process, the shell's own stop is all; then the run goes on.
+        Case(name="Ctrl-Z, then fg", act=suspend, phases=ANY, codes=(130, 0)),
+        Case(name="the supervisor stands still (SIGSTOP)", act=stop_supervisor, phases=connected,
+             codes=(130, 0), within_ms=2000.0),
+        Case(name="the supervisor is killed (SIGKILL)", act=signal_run(signal.SIGKILL), phases=connected,
+             codes=(-9,)),
+        Case(name="the control process stands still (SIGSTOP)", act=stop, codes=(2,), within_ms=1500.0),
+        Case(name="the control process is killed (SIGKILL)", act=kill, phases=connected, codes=(2,)),
+        Case(name="a policy that hangs", policy="hang", codes=(2,), phases=(), within_ms=1500.0),
+        Case(name="a second run while the first connects, starts or runs", act=second_run(), codes=(130,),
+             phases=(CONNECTING, TAKING_OVER, RISING, RUNNING), seconds=60.0),
+        Case(name="dry run: a policy that hangs", policy="hang", dry=True, expect="untouched", codes=(2,),
+             phases=()),
+        Case(name="dry run: the control process is killed", act=kill_control_sometime, dry=True,
+             policy="hold", expect="untouched", codes=(2,), phases=(CONNECTING,), seconds=6.0),
+    )  # fmt: skip
+
+
+def link_cases(
+    kinds: Mapping[str, Callable[[float], Callable[[Rig], None]]], cut: bool, wires: tuple[str, ...] = ()
+) -> Iterator[Case]:
+    """Yield the rows in which the link is away for a time, while the run ends and at any other moment.
+
+    Args:
+        kinds: What happens to the link, in words with "{}" for the time, and what makes an act of a time [s].
+        cut: Whether the emulator must be told how long a cut is.
+        wires: Where they are possible.
+    """
+    for words, make in kinds.items():
+        for when, phases in ((" as the run ends", (ENDING,)), ("", (RISING, RUNNING, LYING_DOWN))):
+            for seconds in LINK_S:
+                yield Case(
+                    name=words.format(f"{seconds:g} s") + when, act=make(seconds), phases=phases,
+                    codes=(0, 3) if phases == (ENDING,) else (3,), from_ms=1e3 * seconds,
+                    emulator=("--cut-s", f"{seconds}") if cut else (), within_ms=2500.0, wires=wires,
+                )  # fmt: skip

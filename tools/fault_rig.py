@@ -1,0 +1,333 @@
+"""What the fault tables share: an emulator and a run of deal-hw, processes of their own over a real wire."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.description import RobotDescription
+from deal_hw.policies.onnx_export import write_policy
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
+from deal_hw.testing.faulty_proxy import FaultyProxy
+
+PATIENCE_S = 75.0
+"""A run that has not ended by then hangs [s]."""
+CONNECTING, TAKING_OVER, ARMING, RISING, RUNNING, LYING_DOWN, ENDING = (
+    "connecting", "taking over", "arming", "standing up", "running", "lying down", "ending",
+)  # fmt: skip
+COMMANDING = (RISING, RUNNING, LYING_DOWN, ENDING)
+ANY = (CONNECTING, TAKING_OVER, ARMING, *COMMANDING)
+_POLL_S = 0.004
+LATE_S, HANG_S = 0.12, 1000.0
+"""How long a policy that comes late takes, and one that hangs [s of a processor]."""
+GOES_WRONG_AT_S = 0.4
+"""When a faulty policy goes wrong [s]."""
+
+Expect = Literal["goes on", "passive", "contested", "untouched", "unhomed", "stiff"]
+"""What must be true at the end: the run finished; the robot is passive and stays so; the same while somebody
+else goes on commanding; nothing at all was sent; no motor was commanded; the robot holds its last command,
+because only its own side could help."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Case:
+    """One row of the table.
+
+    Attributes:
+        name: The fault, in words.
+        expect: What must be true at the end.
+        codes: Exit codes that are right.
+        act: Lets it go wrong; called at a random moment of a random phase. None: the emulator does it itself.
+        phases: Those phases.
+        emulator: Options of the emulator; "{t}" becomes a random moment after the first command [s].
+        policy: "nan", "late" or "hang" for a faulty policy; "" to hold the pose.
+        dry: Whether it is a dry run.
+        seconds: Length of the run without standing up and lying down [s]; 0: the rig's.
+        within_ms: The robot must be passive within this time of the fault, or of the link's return [ms].
+        wires: The wires on which it is possible; empty: all.
+        from_ms: Time counts from so long after the fault [ms]: how long the link is away.
+    """
+
+    name: str
+    expect: Expect = "passive"
+    codes: tuple[int, ...] = (3,)
+    act: Callable[[Rig], None] | None = None
+    phases: tuple[str, ...] = COMMANDING
+    emulator: tuple[str, ...] = ()
+    policy: str = ""
+    dry: bool = False
+    seconds: float = 0.0
+    within_ms: float = 600.0
+    wires: tuple[str, ...] = ()
+    from_ms: float = 0.0
+
+
+class Rig(ABC):
+    """An emulator, a run, and what can happen to them. One repetition of one case.
+
+    Args:
+        case: The case.
+        wire: The transport.
+        folder: For files.
+        rng: Draws the moment.
+        slot: Number of the job, for ports and domains of its own.
+        typical_s: How long connecting and taking over have taken on this machine lately [s].
+    """
+
+    robot: ClassVar[str]
+    description: ClassVar[RobotDescription]
+    phases: ClassVar[tuple[str, ...]]
+    """Those that a run of this robot has."""
+    wires: ClassVar[tuple[str, ...]]
+    longest_s: ClassVar[float]
+    """The latest moment after the first command at which an emulator's own faults begin [s]."""
+    active: ClassVar[frozenset[str]]
+    """Entries of the emulator's log after which the motors obey."""
+    inactive: ClassVar[frozenset[str]]
+
+    def __init__(
+        self,
+        case: Case,
+        wire: str,
+        folder: Path,
+        rng: np.random.Generator,
+        slot: int = 0,
+        typical_s: Mapping[str, float] | None = None,
+    ) -> None:
+        self.case, self.wire, self.folder, self.rng, self.slot = case, wire, folder, rng, slot
+        self.typical_s = dict(typical_s or {CONNECTING: 2.0, TAKING_OVER: 0.5})
+        self.fault_ns = self.start_ns = -1
+        self.phase = ""
+        self.notes: list[str] = []
+        self.events: list[tuple[int, str]] = []
+        self.port = ""
+        self.proxy: FaultyProxy | None = None
+        self.run: subprocess.Popen[str]
+        self.said: list[str] = []
+        self._events_at = 0
+        self._pids: set[int] = set()
+
+    @abstractmethod
+    def emulator_options(self) -> list[str]:
+        """Return the options of the emulator for this wire."""
+
+    @abstractmethod
+    def arguments(self) -> list[str]:
+        """Return the arguments of deal-hw, without port, folder and dry run."""
+
+    @abstractmethod
+    def phase_at(self, phase: str) -> tuple[str, float, float]:
+        """Return a phase as the event that comes before it, its begin after that and its length [s]."""
+
+    @abstractmethod
+    def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
+        """Return what the robot was told or did, from the emulator's report: host time [ns] and what."""
+
+    @abstractmethod
+    def untouched(self, report: Mapping[str, Any]) -> str:
+        """Return what the robot was told, in words; "" where it was told nothing at all."""
+
+    def by_itself(self, report: Mapping[str, Any]) -> int:
+        """Return when the emulator let something go wrong by itself [host ns]; -1: it did not."""
+        return -1
+
+    @contextlib.contextmanager
+    def emulator(self) -> Iterator[EmulatorProcess]:
+        """Run the emulator."""
+        moment = f"{self.rng.uniform(0.2, self.longest_s):.3f}"
+        options = [word.replace("{t}", moment) for word in self.case.emulator]
+        process = EmulatorProcess(
+            self.robot, *self.emulator_options(), "--reveal-to", str(self.folder / "emulator.json"),
+            "--events-to", str(self.folder / "events"), *options,
+        )  # fmt: skip
+        (self.folder / "events").touch()
+        with process, self._before(process):
+            yield process
+
+    @contextlib.contextmanager
+    def _before(self, process: EmulatorProcess) -> Iterator[None]:
+        """Put the proxy before the emulator where the wire has connections."""
+        self.process, self.port = process, process.port
+        if self.wire != "zenoh":
+            yield
+            return
+        with FaultyProxy(("127.0.0.1", int(process.port.rpartition(":")[2]))) as self.proxy:
+            self.port = f"tcp/127.0.0.1:{self.proxy.port}"
+            yield
+
+    def policy_arguments(self) -> list[str]:
+        """Write the case's policy, and return the arguments that deploy it."""
+        policy, script = self.folder / "policy.onnx", self.folder / "wanted.csv"
+        if not policy.exists():
+            write_faulty(policy, self.description, self.case.policy)
+            wanted = 0.0 if self.case.policy == "hold" else RARE_M_S
+            script.write_text(f"time_s,x,y,yaw\n{GOES_WRONG_AT_S},{wanted},0,0\n", encoding="utf-8")
+        return ["--policy", str(policy), "--velocity", str(script)]
+
+    def command(self, out: str, port: str = "") -> list[str]:
+        """Return the command line of a run."""
+        dry = ["--dry-run"] if self.case.dry else []
+        where = ["--port", port or self.port, "--out", str(self.folder / out)]
+        return [sys.executable, "-m", "deal_hw", *self.arguments(), *where, *dry]
+
+    def launch(self, out: str, port: str = "") -> subprocess.Popen[str]:
+        """Start a run in a process group of its own, as a shell with job control does."""
+        (self.folder / "out").mkdir(exist_ok=True)
+        with (self.folder / "out" / out).open("w") as file:
+            return subprocess.Popen(
+                self.command(out, port), stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+                text=True, process_group=0,
+            )  # fmt: skip
+
+    def start(self) -> None:
+        """Start the run."""
+        self.start_ns = time.monotonic_ns()
+        self.run = self.launch("run")
+
+    # What can be waited for.
+
+    def pump(self) -> None:
+        """Take in what the emulator told since."""
+        if (self.folder / "events").stat().st_size == self._events_at:
+            return
+        with (self.folder / "events").open() as file:
+            file.seek(self._events_at)
+            while (line := file.readline()).endswith("\n"):
+                _, host_ns, what = json.loads(line)
+                self.events.append((host_ns, what))
+                self._events_at = file.tell()
+
+    def until(self, ready: Callable[[], Any], seconds: float = 40.0, *, ends: bool = False) -> Any:
+        """Return what ``ready`` returns as soon as that is true; None when the run has ended before.
+
+        Raises:
+            TimeoutError: It takes too long.
+        """
+        until_ns = time.monotonic_ns() + round(seconds * 1e9)
+        while time.monotonic_ns() < until_ns:
+            self.pump()
+            if found := ready():
+                return found
+            if self.run.poll() is not None and not ends:
+                return None
+            time.sleep(_POLL_S)
+        raise TimeoutError(f"waited {seconds:g} s in vain: {getattr(ready, '__doc__', '')}")
+
+    def event_ns(self, what: str) -> int:
+        """Return when something was first told [host ns]; 0: not yet. "start": when the run was started."""
+        if what == "start":
+            return self.start_ns
+        return next((ns for ns, told in self.events if told == what), 0)
+
+    def await_moment(self) -> None:
+        """Draw a phase and a moment of it, and return then."""
+        self.phase = str(self.rng.choice([phase for phase in self.case.phases if phase in self.phases]))
+        event, begin_s, length_s = self.phase_at(self.phase)
+        offset_s = begin_s + length_s * float(self.rng.uniform())
+        begun_ns = self.until(lambda: self.event_ns(event))
+        if begun_ns:
+            due_ns = begun_ns + round(offset_s * 1e9)
+            time.sleep(max(due_ns - time.monotonic_ns(), 0) * 1e-9)
+
+    def control_pid(self) -> int:
+        """Return the control process's pid once it exists; -1 where the run ended before."""
+        return self.until(lambda: self._child("control_process")) or -1
+
+    def _child(self, module: str) -> int:
+        with contextlib.suppress(OSError):
+            for pid in Path(f"/proc/{self.run.pid}/task/{self.run.pid}/children").read_text().split():
+                self._pids.add(int(pid))
+                with contextlib.suppress(OSError):
+                    if module in Path(f"/proc/{pid}/cmdline").read_text():
+                        return int(pid)
+        return 0
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the motors obey, as far as the emulator has told."""
+        self.pump()
+        told = [what for _, what in self.events if what in self.active | self.inactive]
+        return bool(told) and told[-1] in self.active
+
+    # What can be done.
+
+    def fault(self) -> None:
+        """The fault is now."""
+        if self.fault_ns < 0:
+            self.fault_ns = time.monotonic_ns()
+
+    def signal(self, pid: int, number: signal.Signals) -> None:
+        """Send a signal, which is the fault; to a process that has just ended, nothing."""
+        self.fault()
+        if pid > 0:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, number)
+
+    def process_state(self) -> str:
+        """Return the state of the run's process as the kernel has it, such as T for stopped."""
+        try:
+            return Path(f"/proc/{self.run.pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return "X"
+
+    def finish(self) -> None:
+        """Wait until the run and its children have ended; kill what hangs."""
+        self._child("")
+        deadline = time.monotonic() + PATIENCE_S
+        try:
+            self.run.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.notes.append("the run hung")
+            self.run.kill()
+            self.run.wait()
+        while alive := [pid for pid in self._pids if Path(f"/proc/{pid}").exists()]:
+            if time.monotonic() > deadline:
+                self.notes.append(f"{len(alive)} processes outlived the run")
+                for pid in alive:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+                break
+            time.sleep(0.01)
+
+
+def headline(said: str) -> str:
+    """Return the line that tells the operator how it ended."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    wanted = [line for line in lines if re.match(r"(tripped|finished|stopped|failed|deal-hw: error)", line)]
+    return (wanted or lines or [""])[0]
+
+
+def write_faulty(path: Path, description: RobotDescription, fault: str) -> None:
+    """Write a policy that goes wrong as soon as the wanted velocity is not zero.
+
+    Args:
+        path: The file.
+        description: The robot.
+        fault: "nan"; "late", for which it computes so long as :data:`LATE_S`; "hang", for ever.
+    """
+    rounds = 1000
+    if fault in ("late", "hang"):
+        write_policy(*faulty_policy(description, "late", rounds, rare=True), path)
+        policy, wish = OnnxPolicy(path), np.array([RARE_M_S, 0.0, 0.0], dtype=np.float32)
+        times = []
+        for _ in range(5):
+            begun = time.thread_time()
+            policy.act(wish)
+            times.append(time.thread_time() - begun)
+        rounds = round(rounds * (LATE_S if fault == "late" else HANG_S) / min(times))
+    write_policy(*faulty_policy(description, "nan" if fault == "nan" else "late", rounds, rare=True), path)

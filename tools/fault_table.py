@@ -1,0 +1,328 @@
+"""Fault tables: repetitions at random moments beside a stall monitor, and pages of them.
+
+A repetition waits for a random moment of a phase of the run, lets one thing go wrong, and asks who knows: the
+emulator (what the robot was told, by its own log, on the machine's monotonic clock that all processes share),
+the operator's terminal and exit code, and the recording. deal-hw's own word on the robot counts for nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fault_rig import ARMING, COMMANDING, CONNECTING, TAKING_OVER, Case, Rig, headline
+
+from deal_hw.cli.bench import describe_machine
+from deal_hw.cli.witness import witnesses
+from deal_hw.control.realtime import priority
+from deal_hw.data.dataset import Dataset
+from deal_hw.errors import DealHwError
+
+FORMAT = "deal_hw.faults/2"
+CYCLE_NS = 20_000_000
+PAUSE_NS = 3_000_000
+"""Shorter pauses of the machine are not noted [ns]."""
+_RIG_PRIORITY = 45
+"""Of the thread that lets things go wrong: a moment that was drawn must not slip."""
+
+
+def repetition(
+    rig_type: type[Rig],
+    case: Case,
+    wire: str,
+    seed: int,
+    number: int,
+    slot: int,
+    typical: dict[str, float],
+) -> dict[str, Any]:
+    """Run one repetition of a case and return what came of it."""
+    rng = np.random.default_rng([seed, number, *case.name.encode()])
+    with tempfile.TemporaryDirectory() as text, priority(_RIG_PRIORITY):
+        rig = rig_type(case, wire, Path(text), rng, slot, typical)
+        with rig.emulator():
+            rig.start()
+            try:
+                if case.act is not None:
+                    rig.await_moment()
+                    case.act(rig)
+            except TimeoutError as error:
+                rig.notes.append(str(error))
+            rig.finish()
+            # What is still under way shall arrive.
+            time.sleep(0.3)
+            rig.pump()
+        learn(typical, rig)
+        said = (rig.folder / "out" / "run").read_text()
+        report = json.loads((rig.folder / "emulator.json").read_text())
+        row = recording(rig.folder / "run" / "dataset")
+        last_cycle_ns = row.pop("last_cycle_ns")
+        if rig.fault_ns < 0:
+            rig.fault_ns = last_cycle_ns if case.policy else rig.by_itself(report)
+        return {
+            "phase": rig.phase, "exit_code": rig.run.returncode, **row, **judge(rig, report),
+            "operator": headline(said), "notes": rig.said, "complaints": complaints(rig, report, row),
+            "start_ns": rig.start_ns, "fault_ns": rig.fault_ns,
+        }  # fmt: skip
+
+
+def recording(folder: Path) -> dict[str, Any]:
+    """Return whether the recording is whole, after the repair that the next opening does by itself."""
+    if not folder.exists():
+        return {"dataset": "none", "states": 0, "last_cycle_ns": -1}
+    try:
+        opened = Dataset.open(folder, notify=lambda text: None)
+        episodes = [opened.read(i) for i in range(len(opened.episodes))]
+    except (DealHwError, OSError) as error:
+        # A run that ended before the first state has a sound file without one.
+        word = "empty" if "no state sample" in str(error) else f"not readable: {error}"
+        return {"dataset": word, "states": 0, "last_cycle_ns": -1}
+    states = sum(len(episode.trajectory.device_s) for episode in episodes)
+    last_ns = -1
+    if episodes and len(starts := episodes[-1].cycles.start_s):
+        # The cycle that went wrong is the one that was judged, or, where it never ended, the one that had to
+        # follow the last record.
+        said = episodes[-1].cycles.safety_state
+        good = [i for i in range(len(starts)) if said[i] != "passive"]
+        passive = [i for i in range(len(starts)) if said[i] == "passive"]
+        index = passive[0] if passive else good[-1]
+        last_ns = episodes[-1].start_ns + round(starts[index] * 1e9) + (0 if passive else CYCLE_NS)
+    return {"dataset": "whole" if states else "empty", "states": states, "last_cycle_ns": last_ns}
+
+
+def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by the emulator's log how the robot ends, and how long after the fault it became so for good."""
+    told = [(ns, what in rig.active) for ns, what in rig.changes(report) if what in rig.active | rig.inactive]
+    ends = "never commanded"
+    if any(active for _, active in told):
+        ends = "active" if told[-1][1] else "passive"
+    from_ns = rig.fault_ns + round(rig.case.from_ms * 1e6)
+    before = [active for ns, active in told if ns < from_ns]
+    after = [(ns, active) for ns, active in told if ns >= from_ns]
+    passive_ms: float | None = None
+    if rig.fault_ns > 0 and ends != "active":
+        obeys = bool(before and before[-1]) or any(active for _, active in after)
+        first = next((i for i in range(len(after)) if not any(active for _, active in after[i:])), 0)
+        passive_ms = round((after[first][0] - from_ns) * 1e-6, 1) if obeys else 0.0
+    return {"ends": ends, "passive_ms": passive_ms}
+
+
+def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
+    """Return what was not as the case expects."""
+    case, found = rig.case, list(rig.notes)
+    end = judge(rig, report)
+    late = end["passive_ms"] is None or end["passive_ms"] > case.within_ms
+    went_on = rig.run.returncode == 0
+    match case.expect:
+        case "goes on":
+            found += [] if went_on and end["ends"] == "passive" else [f"it ends {end['ends']}"]
+        case "passive":
+            found += ["it ends active"] if end["ends"] == "active" else []
+            found += [f"passive after {end['passive_ms']} ms"] if late and not went_on else []
+        case "contested":
+            found += [] if end["ends"] != "never commanded" else ["it was never commanded"]
+        case "untouched":
+            found += [told] if (told := rig.untouched(report)) else []
+        case "unhomed":
+            found += [f"it ends {end['ends']}"] if end["ends"] != "never commanded" else []
+        case "stiff":
+            found += [f"it ends {end['ends']}"] if end["ends"] != "active" else []
+    if rig.run.returncode not in case.codes:
+        found.append(f"exit code {rig.run.returncode}")
+    if row["dataset"] not in ("whole", "empty", "none"):
+        found.append(row["dataset"])
+    if row["dataset"] != "whole" and rig.phase in COMMANDING[1:]:
+        found.append(f"recording: {row['dataset']}")
+    return found
+
+
+def learn(typical_s: dict[str, float], rig: Rig) -> None:
+    """Follow how long connecting and taking over take on this machine [s], so that moments fall into them."""
+    begun_ns = rig.start_ns
+    for phase, event in ((CONNECTING, rig.phase_at(TAKING_OVER)[0]), (TAKING_OVER, rig.phase_at(ARMING)[0])):
+        if not (end_ns := rig.event_ns(event)):
+            return
+        typical_s[phase] += 0.3 * ((end_ns - begun_ns) * 1e-9 - typical_s[phase])
+        begun_ns = end_ns
+
+
+def run_cases(
+    rig_type: type[Rig], cases: Sequence[Case], wire: str, given: argparse.Namespace
+) -> Iterator[dict[str, Any]]:
+    """Run every case its repetitions, some at a time, and yield its row."""
+    typical = {CONNECTING: 3.0, TAKING_OVER: 0.5}
+    slots = threading.local()
+    free = list(range(given.jobs))
+
+    def one(case: Case, number: int) -> dict[str, Any]:
+        if not hasattr(slots, "number"):
+            slots.number = free.pop()
+        return repetition(rig_type, case, wire, given.seed, number, slots.number, typical)
+
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for case in cases:
+            load = os.getloadavg()[0]
+            with witnesses(PAUSE_NS) as account:
+                done = list(pool.map(lambda number, case=case: one(case, number), range(given.repetitions)))
+            for row in done:
+                from_ns = row["fault_ns"] + round(1e6 * case.from_ms)
+                to_ns = from_ns + round(1e6 * (row["passive_ms"] or 0.0))
+                pause_ns = account.longest_between_ns(from_ns - 10**7, to_ns + 10**7) if from_ns > 0 else 0
+                row["pause_ms"] = round(pause_ns * 1e-6, 1)
+                del row["fault_ns"], row["start_ns"]
+            yield summary(case, wire, done, [load, os.getloadavg()[0]])
+
+
+def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]) -> dict[str, Any]:
+    """Return a case's row from its repetitions."""
+    # A run that went on has no time to tell.
+    counted = [r for r in done if r["passive_ms"] is not None and r["exit_code"] != 0]
+    times = [r["passive_ms"] for r in counted] if case.expect in ("passive", "contested") else []
+    worst = max(counted, key=lambda r: r["passive_ms"]) if times else None
+    return {
+        "fault": case.name, "wire": wire, "expected": case.expect,
+        "median_ms": round(statistics.median(times), 1) if times else None,
+        "worst_ms": worst["passive_ms"] if worst else None,
+        "pause_beside_worst_ms": worst["pause_ms"] if worst else None,
+        "from_return": case.from_ms > 0, "count": len(done),
+        "went_on": sum(r["exit_code"] == 0 for r in done),
+        "as_expected": sum(not r["complaints"] for r in done), "load": load, "repetitions": done,
+    }  # fmt: skip
+
+
+# Pages and programs.
+
+
+def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]]) -> str:
+    """Return the tables of several wires as one page."""
+    wires = [result["rows"][0]["wire"] for result in results]
+    names = dict.fromkeys(row["fault"] for result in results for row in result["rows"])
+    loads = [load for result in results for row in result["rows"] for load in row["load"]]
+    first = results[0]["calls"][-1]["machine"]
+    lines = [
+        f"# {title}",
+        "",
+        *words,
+        f"Machine: {first['platform']}, {first['processors']} processors, shared with other work, load "
+        f"{min(loads):.1f} to {max(loads):.1f}.",
+        "",
+        "Times: median / worst of the repetitions, from the fault (where a link was away: from its return)",
+        "to the moment from which on the robot was passive, by the emulator's own log. In brackets: the",
+        "longest pause of the machine beside the worst one, where a stall monitor saw any. `3/20`: three of",
+        "20 were as expected. `went on`: the fault came too late or did no harm, and the run finished.",
+        "",
+        f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
+        "the operator reads |",
+        "|---|---|" + "---:|" * len(wires) + "---|---|---|",
+    ]
+    for name in names:
+        rows = [next((r for r in result["rows"] if r["fault"] == name), None) for result in results]
+        known = [row for row in rows if row is not None]
+        each = [r for row in known for r in row["repetitions"]]
+        codes = ", ".join(str(code) for code in sorted({r["exit_code"] for r in each}))
+        data = ", ".join(sorted({r["dataset"].partition(":")[0] for r in each}))
+        said = next((r["operator"] for r in each if r["operator"]), "(nothing)").replace("|", "/")
+        cells = " | ".join(cell(row) for row in rows)
+        lines.append(f"| {name} | {known[0]['expected']} | {cells} | {codes} | {data} | {said[:160]} |")
+    bad = []
+    for row in (row for result in results for row in result["rows"]):
+        if row["as_expected"] < row["count"]:
+            why = sorted({text for r in row["repetitions"] for text in r["complaints"]})
+            bad.append(f"- {row['wire']}, {row['fault']}: {'; '.join(why)}")
+    lines += ["", "Not as expected: " + ("none." if not bad else ""), *(["", *bad] if bad else [])]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def cell(row: Mapping[str, Any] | None) -> str:
+    """Return a row's times as a page shows them."""
+    if row is None:
+        return ""
+    text = "as expected"
+    if row["median_ms"] is not None:
+        text = f"{row['median_ms']:.0f} / {row['worst_ms']:.0f}"
+        text += f" ({row['pause_beside_worst_ms']:.0f})" if row["pause_beside_worst_ms"] else ""
+    text += f", {row['went_on']} went on" if row["went_on"] and row["expected"] == "passive" else ""
+    return text if row["as_expected"] == row["count"] else f"{text}, {row['as_expected']}/{row['count']}"
+
+
+def main(
+    rig_type: type[Rig], cases: Sequence[Case], title: str, words: Sequence[str], doc: str | None
+) -> int:
+    """Run a table, or write a page; return 1 where something was not as expected."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
+    if len(rig_type.wires) > 1:
+        parser.add_argument("--transport", choices=rig_type.wires, default=rig_type.wires[0])
+    parser.add_argument("--repetitions", type=int, default=20)
+    parser.add_argument("--only", default="", help="rows whose name this regular expression finds")
+    parser.add_argument("--skip", default="^$", help="rows whose name this one finds are left out")
+    parser.add_argument("--seed", type=int, default=0, help="draws phases and moments")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="repetitions at a time, each on a wire of its own"
+    )
+    parser.add_argument("--list", action="store_true", help="list the rows")
+    parser.add_argument("--out", type=Path, default=None, help="results as JSON, written after each row")
+    parser.add_argument("--table", type=Path, nargs="+", default=None, metavar="FILE",
+                        help="write a page (first) from results (others), and measure nothing")  # fmt: skip
+    given = parser.parse_args()
+    if given.table is not None:
+        results = [json.loads(path.read_text(encoding="utf-8")) for path in given.table[1:]]
+        given.table[0].write_text(page(title, words, results), encoding="utf-8")
+        return 0
+    wire = getattr(given, "transport", rig_type.wires[0])
+    chosen = [
+        case
+        for case in cases
+        if wire in (case.wires or rig_type.wires)
+        and re.search(given.only, case.name)
+        and not re.search(given.skip, case.name)
+    ]
+    if given.list:
+        print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
+        return 0
+    calls, rows = earlier(given.out, {case.name for case in chosen})
+    calls.append({"argv": sys.argv[1:], "machine": describe_machine()})
+    bad = 0
+    for row in run_cases(rig_type, chosen, wire, given):
+        rows.append(row)
+        bad += row["as_expected"] < row["count"]
+        print(line(row), flush=True)
+        if given.out is not None:
+            text = json.dumps({"format": FORMAT, "calls": calls, "rows": rows}, indent=1, ensure_ascii=False)
+            given.out.write_text(text + "\n", encoding="utf-8")
+    return int(bad > 0)
+
+
+def earlier(path: Path | None, names: set[str]) -> tuple[list[Any], list[Any]]:
+    """Return the calls and rows that are in a results file, without the rows that are measured anew."""
+    if path is None or not path.exists():
+        return [], []
+    known = json.loads(path.read_text(encoding="utf-8"))
+    if known["format"] != FORMAT:
+        return [], []
+    return known["calls"], [row for row in known["rows"] if row["fault"] not in names]
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """Return a row for the terminal."""
+    good = row["as_expected"] == row["count"]
+    times = "" if row["median_ms"] is None else f"{row['median_ms']:.0f} / {row['worst_ms']:.0f} ms"
+    codes = sorted({r["exit_code"] for r in row["repetitions"]})
+    text = (
+        f"{'ok ' if good else 'BAD'} {row['fault']:62} {times:>16} {row['as_expected']}/{row['count']} "
+        f"exit {codes} load {row['load'][0]:.1f}"
+    )
+    for r in row["repetitions"]:
+        if r["complaints"]:
+            text += f"\n      {r['phase']}: {'; '.join(r['complaints'])} [{r['operator'][:150]}]"
+    return text

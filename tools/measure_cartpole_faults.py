@@ -1,0 +1,104 @@
+#!/usr/bin/env python3
+"""Fault table of the cart-pole: what happens when something goes wrong, and how soon its motor is off.
+
+python tools/measure_cartpole_faults.py --jobs 2 --out cartpole.json
+python tools/measure_cartpole_faults.py --table faults.md cartpole.json
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from fault_acts import LINK_S, freeze_link, kill_both, link_cases, process_cases
+from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
+from fault_table import main
+
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+
+SECONDS = 1.2
+HOMING, ARMED, IDLE, HELD = "homing", "armed", "idle", "held"
+GONE = "gone"
+
+
+class CartpoleRig(Rig):
+    """A cart-pole that plays a chirp."""
+
+    robot = "cartpole"
+    wires = ("serial",)
+    longest_s = 1.0
+    active = frozenset({ARMED})
+    inactive = frozenset({IDLE, HELD})
+    description = DESCRIPTION
+    phases = (CONNECTING, TAKING_OVER, ARMING, RUNNING, ENDING)
+
+    def emulator_options(self) -> list[str]:
+        """A port whose name stays when the cable is put back."""
+        return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port")]
+
+    def arguments(self) -> list[str]:
+        """Play a chirp, or what a faulty policy says."""
+        verb, what = "collect", ["--profile", "chirp"]
+        if self.case.policy or self.case.dry:
+            verb, what = "deploy", self.policy_arguments()
+        return [verb, "cartpole", *what, "--seconds", str(self._seconds)]
+
+    @property
+    def _seconds(self) -> float:
+        return self.case.seconds or SECONDS
+
+    def phase_at(self, phase: str) -> tuple[str, float, float]:
+        """Phases by the device's modes; the run's own times follow the moment of arming."""
+        return {
+            CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
+            TAKING_OVER: (HOMING, 0.0, self.typical_s[TAKING_OVER]),
+            ARMING: (ARMED, 0.0, 0.02),
+            RUNNING: (ARMED, 0.05, self._seconds - 0.2),
+            ENDING: (ARMED, self._seconds - 0.1, 0.15),
+        }[phase]
+
+    def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
+        """Modes of the device."""
+        return [(ns, what) for _, ns, what in report["changes"]]
+
+    def untouched(self, report: Mapping[str, Any]) -> str:
+        """No byte came."""
+        return f"{report['received_bytes']} bytes" if report["received_bytes"] else ""
+
+    def by_itself(self, report: Mapping[str, Any]) -> int:
+        """The port vanished, the wire was cut, or the firmware hung."""
+        return next((ns for ns, what in self.changes(report) if what in (GONE, "cut", "frozen")), -1)
+
+
+def after(option: str) -> tuple[str, ...]:
+    """Return an option of the emulator with a random moment."""
+    return (option, "{t}")
+
+
+CASES = (
+    Case(name="none", expect="goes on", codes=(0,)),
+    *process_cases(),
+    Case(name="both processes are killed (SIGKILL); the device's watchdog stops the motor", act=kill_both,
+         codes=(-9,)),
+    *link_cases({"the cable is cut for {}": freeze_link}, cut=True),
+    *(Case(name=f"the cable is pulled, and put back after {seconds:g} s", codes=(3, 0),
+           emulator=(*after("--vanish-after-s"), "--return-after-s", f"{seconds}"))
+      for seconds in LINK_S),
+    Case(name="5 % of the frames lost", emulator=("--drop", "0.05"), expect="goes on", codes=(0,)),
+    Case(name="60 % of the frames corrupt", emulator=("--corrupt", "0.6"), codes=(2, 3)),
+    Case(name="the firmware hangs", emulator=after("--freeze-after-s")),
+    Case(name="the policy answers NaN", policy="nan"),
+    Case(name="the policy takes over 100 ms", policy="late"),
+)  # fmt: skip
+TITLE = "Cart-pole: from a fault to a motor without torque"
+WORDS = (
+    "By `tools/measure_cartpole_faults.py` on the emulated cart-pole, profile `sensor`, over a",
+    "pseudo-terminal. Each repetition draws a phase (connecting, homing, arming, running, ending) and a",
+    "moment of it. The device's own watchdog stops the motor 200 ms after the last command.",
+    "",
+)
+
+
+if __name__ == "__main__":
+    sys.exit(main(CartpoleRig, CASES, TITLE, WORDS, __doc__))
