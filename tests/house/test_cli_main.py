@@ -17,7 +17,7 @@ import pytest
 import tyro
 
 from deal_hw.cli import main as cli
-from deal_hw.errors import MissingExtraError, PortNotFoundError, UnknownNameError
+from deal_hw.errors import ConfigurationError, MissingExtraError, PortNotFoundError, UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "torch", "mujoco", "rerun", "scipy", "serial", "tyro", "rich")
@@ -216,6 +216,65 @@ def test_reader_that_left_ends_it_quietly(arguments: list[str], unbuffered: str)
     finally:
         os.close(write)
     assert (done.returncode, done.stderr) == (cli.EXIT_PIPE, b"")
+
+
+@pytest.mark.parametrize("how", ["closed", "no reader"])
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(["--help"], 0), (["nosuch"], 2), (["calibrate", "d", "--latency", "12"], 2)]
+)
+def test_an_error_output_that_nobody_reads_changes_nothing(
+    arguments: list[str], code: int, how: str, tmp_path: Path
+) -> None:
+    """`2>&-`, or a reader of stderr that has left: the same exit code and the same output."""
+    words = [sys.executable, "-m", "deal_hw.cli.main", *arguments]
+    before = subprocess.run(words, capture_output=True, check=False)
+    if how == "closed":
+        quoted = " ".join(map(shlex.quote, words))
+        done = subprocess.run(["sh", "-c", f"exec {quoted} 2>&-"], stdout=subprocess.PIPE, check=False)
+    else:
+        read, write = os.pipe()
+        os.close(read)
+        try:
+            done = subprocess.run(words, stdout=subprocess.PIPE, stderr=write, check=False)
+        finally:
+            os.close(write)
+    assert (done.returncode, done.stdout) == (before.returncode, before.stdout) == (code, before.stdout)
+
+
+def test_no_file_gets_the_number_of_a_closed_output() -> None:
+    """What is opened later must not be written to by whoever prints an error."""
+    code = (
+        "import os, sys; from deal_hw.cli.main import main; main(['--version']);"
+        "sys.exit(os.open(os.devnull, os.O_RDONLY))"
+    )
+    quoted = " ".join(map(shlex.quote, [sys.executable, "-c", code]))
+    done = subprocess.run(["sh", "-c", f"exec {quoted} 2>&-"], stdout=subprocess.PIPE, check=False)
+    assert done.returncode >= 3
+
+
+def test_an_error_is_one_bounded_line(
+    add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever a file had in it: no control characters, no second line, an end."""
+
+    def fail(settings: Settings) -> None:
+        raise ConfigurationError("a\nb \x1b[31m" + "x" * 10**6)
+
+    add_verb(fail)
+    assert cli.main(["probe"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("deal-hw: error: a b ?[31mxxx") and told.count("\n") == 1 and len(told) < 2100
+
+
+def test_an_interrupt_after_the_end_changes_nothing() -> None:
+    """From the verb's last word to the end of the process, SIGINT no longer decides about the exit code."""
+    code = (
+        "import atexit, os, signal, sys; from deal_hw.cli import main as cli;"
+        "sys.argv = ['deal-hw', '--version'];"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT)); sys.exit(cli.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_broken_pipe_of_a_robot_is_told(

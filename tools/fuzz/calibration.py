@@ -26,6 +26,7 @@ from deal_hw.data.importing.grid import common_period, to_trajectories
 from deal_hw.data.importing.load import load_tables
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.errors import ConfigurationError
 from deal_hw.sim.compiling import problem_of
 from deal_hw.sim.parameters.template import template
 from deal_hw.sim.parameters.yaml_space import read_space
@@ -280,7 +281,8 @@ def damage_attributes(rng: random.Random, data: bytes, others: Sequence[bytes]) 
 def read_model(path: Path) -> None:
     """Compile and step a model as the process that tries it does."""
     # In this process, so that a hang or a crash is seen as such.
-    problem_of(str(path))
+    if problem := problem_of(str(path)):
+        raise ConfigurationError(f"model {path} {problem}")
 
 
 def _checkpoint(path: Path) -> None:
