@@ -186,7 +186,7 @@ TITLE = "Go2: from a fault to damping"
 WORDS = (
     "By `tools/measure_go2_faults.py` on the emulated robot, profile `sensor`, over real wires.",
     "Each repetition draws a phase (connecting, taking over, arming, standing up, running, lying down,",
-    "ending) and a moment of it. *Cut* is the emulator's: nothing goes out and nothing is heard. *Freezes* and",
+    "ending) and a moment of it. *Cut* is the emulator's: nothing goes out or is heard. *Freezes* and",
     "*reset* are done to the TCP connection by a proxy.",
     "",
 )

@@ -27,7 +27,7 @@ class Hazards:
 
     Attributes:
         freeze_after_s: The firmware hangs: nothing is sent or heard any more [s]; None for never.
-        cut_after_s: The wire is cut: nothing goes out and nothing is heard, the firmware goes on [s]; None for
+        cut_after_s: The wire is cut: nothing goes out or is heard, the firmware goes on [s]; None for
             never.
         cut_s: How long it is cut [s].
         vanish_after_s: The port disappears as if unplugged, the firmware goes on [s]; None for never.

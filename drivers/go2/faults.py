@@ -91,7 +91,7 @@ class FaultPlan(Go2Faults):
     """When the robot says nothing any more; it still hears [s]."""
 
     cut_after_s: float | None = None
-    """When the wire is cut: nothing goes out and nothing is heard; the robot does what it was last told [s]."""
+    """When the wire is cut: nothing goes out or is heard; the robot does what it was last told [s]."""
 
     cut_s: float = 1.0
     """How long the wire is cut [s]."""
