@@ -159,7 +159,7 @@ def process_cases() -> tuple[Case, ...]:
         # Before there is a control process, the shell's own stop is all; then the run goes on.
         Case(name="Ctrl-Z, then fg", act=suspend, phases=ANY, codes=(130, 0)),
         Case(name="the supervisor stands still (SIGSTOP)", act=stop_supervisor, phases=connected,
-             codes=(130, 0), within_ms=2000.0),
+             codes=(130, 0), within_ms=2000.0, seconds=3.0),
         Case(name="the supervisor is killed (SIGKILL)", act=signal_run(signal.SIGKILL), phases=connected,
              codes=(-9,)),
         Case(name="the control process stands still (SIGSTOP)", act=stop, codes=(2,), within_ms=1500.0),

@@ -77,6 +77,10 @@ class Case:
     from_ms: float = 0.0
 
 
+class SpoiledError(Exception):
+    """A repetition shows nothing: the run ended by itself before anything went wrong, on a busy machine."""
+
+
 class Rig(ABC):
     """An emulator, a run, and what can happen to them. One repetition of one case.
 
@@ -199,6 +203,11 @@ class Rig(ABC):
         self.start_ns = time.monotonic_ns()
         self.run = self.launch("run")
 
+    @property
+    def output(self) -> str:
+        """What the run has printed."""
+        return (self.folder / "out" / "run").read_text()
+
     # What can be waited for.
 
     def pump(self) -> None:
@@ -235,7 +244,11 @@ class Rig(ABC):
         return next((ns for ns, told in self.events if told == what), 0)
 
     def await_moment(self) -> None:
-        """Draw a phase and a moment of it, and return then."""
+        """Draw a phase and a moment of it, and return then.
+
+        Raises:
+            SpoiledError: The run ended before.
+        """
         self.phase = str(self.rng.choice([phase for phase in self.case.phases if phase in self.phases]))
         event, begin_s, length_s = self.phase_at(self.phase)
         offset_s = begin_s + length_s * float(self.rng.uniform())
@@ -243,6 +256,8 @@ class Rig(ABC):
         if begun_ns:
             due_ns = begun_ns + round(offset_s * 1e9)
             time.sleep(max(due_ns - time.monotonic_ns(), 0) * 1e-9)
+        if not begun_ns or (self.phase != ENDING and self.run.poll() is not None):
+            raise SpoiledError(f"the run ended before its phase {self.phase!r} was through")
 
     def control_pid(self) -> int:
         """Return the control process's pid once it exists; -1 where the run ended before."""

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fault_rig import ARMING, COMMANDING, CONNECTING, TAKING_OVER, Case, Rig, headline
+from fault_rig import ARMING, COMMANDING, CONNECTING, TAKING_OVER, Case, Rig, SpoiledError, headline
 
 from deal_hw.cli.bench import describe_machine
 from deal_hw.cli.witness import witnesses
@@ -32,49 +32,71 @@ from deal_hw.errors import DealHwError
 
 FORMAT = "deal_hw.faults/2"
 CYCLE_NS = 20_000_000
+_BESIDE_NS = 10_000_000
 PAUSE_NS = 3_000_000
 """Shorter pauses of the machine are not noted [ns]."""
+_ATTEMPTS = 4
+"""So often a repetition is begun anew where the run ended before anything went wrong."""
 _RIG_PRIORITY = 45
 """Of the thread that lets things go wrong: a moment that was drawn must not slip."""
 
 
 def repetition(
-    rig_type: type[Rig],
-    case: Case,
-    wire: str,
-    seed: int,
-    number: int,
-    slot: int,
-    typical: dict[str, float],
+    rig_type: type[Rig], case: Case, wire: str, entropy: Sequence[int], slot: int, typical_s: dict[str, float]
 ) -> dict[str, Any]:
-    """Run one repetition of a case and return what came of it."""
-    rng = np.random.default_rng([seed, number, *case.name.encode()])
-    with tempfile.TemporaryDirectory() as text, priority(_RIG_PRIORITY):
-        rig = rig_type(case, wire, Path(text), rng, slot, typical)
-        with rig.emulator():
-            rig.start()
+    """Run one repetition of a case and return what came of it.
+
+    Args:
+        rig_type: The robot.
+        case: The case.
+        wire: The transport.
+        entropy: Decides the moment.
+        slot: Number of the job.
+        typical_s: How long connecting and taking over take; followed.
+
+    Raises:
+        SpoiledError: Again and again the run ended before anything went wrong.
+    """
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.default_rng([*entropy, attempt, *case.name.encode()])
+        with tempfile.TemporaryDirectory() as text, priority(_RIG_PRIORITY):
+            rig = rig_type(case, wire, Path(text), rng, slot, typical_s)
             try:
-                if case.act is not None:
-                    rig.await_moment()
-                    case.act(rig)
-            except TimeoutError as error:
-                rig.notes.append(str(error))
+                return {**_repetition(rig, typical_s), "spoiled_before": attempt}
+            except SpoiledError as error:
+                if attempt == _ATTEMPTS - 1:
+                    raise SpoiledError(f"{case.name}: {error}: {headline(rig.output)}") from error
+    raise AssertionError("unreachable")
+
+
+def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
+    case = rig.case
+    with rig.emulator():
+        rig.start()
+        try:
+            if case.act is not None:
+                rig.await_moment()
+                case.act(rig)
+        except TimeoutError as error:
+            rig.notes.append(str(error))
+        finally:
             rig.finish()
-            # What is still under way shall arrive.
-            time.sleep(0.3)
-            rig.pump()
-        learn(typical, rig)
-        said = (rig.folder / "out" / "run").read_text()
-        report = json.loads((rig.folder / "emulator.json").read_text())
-        row = recording(rig.folder / "run" / "dataset")
-        last_cycle_ns = row.pop("last_cycle_ns")
-        if rig.fault_ns < 0:
-            rig.fault_ns = last_cycle_ns if case.policy else rig.by_itself(report)
-        return {
-            "phase": rig.phase, "exit_code": rig.run.returncode, **row, **judge(rig, report),
-            "operator": headline(said), "notes": rig.said, "complaints": complaints(rig, report, row),
-            "start_ns": rig.start_ns, "fault_ns": rig.fault_ns,
-        }  # fmt: skip
+        # What is still under way shall arrive.
+        time.sleep(0.3)
+        rig.pump()
+    learn(typical_s, rig)
+    report = json.loads((rig.folder / "emulator.json").read_text())
+    row = recording(rig.folder / "run" / "dataset")
+    last_cycle_ns = row.pop("last_cycle_ns")
+    if rig.fault_ns < 0:
+        rig.fault_ns = last_cycle_ns if case.policy else rig.by_itself(report)
+        if any(word == "{t}" for word in case.emulator) and rig.fault_ns < 0 and case.expect == "passive":
+            raise SpoiledError("the run ended before the emulator's fault began")
+    return {
+        "phase": rig.phase, "exit_code": rig.run.returncode, **row, **judge(rig, report),
+        "operator": headline(rig.output), "notes": rig.said, "complaints": complaints(rig, report, row),
+        "fault_ns": rig.fault_ns,
+    }  # fmt: skip
 
 
 def recording(folder: Path) -> dict[str, Any]:
@@ -158,30 +180,42 @@ def learn(typical_s: dict[str, float], rig: Rig) -> None:
 
 
 def run_cases(
-    rig_type: type[Rig], cases: Sequence[Case], wire: str, given: argparse.Namespace
+    rig_type: type[Rig], cases: Sequence[Case], wire: str, given: argparse.Namespace, have: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """Run every case its repetitions, some at a time, and yield its row."""
-    typical = {CONNECTING: 3.0, TAKING_OVER: 0.5}
+    """Run every case its repetitions, some at a time, and yield its row.
+
+    Args:
+        rig_type: The robot.
+        cases: The rows.
+        wire: The transport.
+        given: Repetitions, jobs and seed.
+        have: Rows of earlier calls by their fault: their repetitions count.
+    """
+    typical_s = {CONNECTING: 3.0, TAKING_OVER: 0.5}
     slots = threading.local()
     free = list(range(given.jobs))
 
     def one(case: Case, number: int) -> dict[str, Any]:
         if not hasattr(slots, "number"):
             slots.number = free.pop()
-        return repetition(rig_type, case, wire, given.seed, number, slots.number, typical)
+        return repetition(rig_type, case, wire, [given.seed, number], slots.number, typical_s)
 
     with ThreadPoolExecutor(given.jobs) as pool:
         for case in cases:
-            load = os.getloadavg()[0]
+            row = have.get(case.name, {"load": [], "repetitions": []})
+            numbers = range(len(row["repetitions"]), given.repetitions)
+            if not numbers:
+                continue
+            load = [round(os.getloadavg()[0], 1)]
             with witnesses(PAUSE_NS) as account:
-                done = list(pool.map(lambda number, case=case: one(case, number), range(given.repetitions)))
-            for row in done:
-                from_ns = row["fault_ns"] + round(1e6 * case.from_ms)
-                to_ns = from_ns + round(1e6 * (row["passive_ms"] or 0.0))
-                pause_ns = account.longest_between_ns(from_ns - 10**7, to_ns + 10**7) if from_ns > 0 else 0
-                row["pause_ms"] = round(pause_ns * 1e-6, 1)
-                del row["fault_ns"], row["start_ns"]
-            yield summary(case, wire, done, [load, os.getloadavg()[0]])
+                done = list(pool.map(lambda number, case=case: one(case, number), numbers))
+            for found in done:
+                from_ns = found.pop("fault_ns") + round(1e6 * case.from_ms)
+                to_ns = from_ns + round(1e6 * (found["passive_ms"] or 0.0))
+                pause_ns = account.longest_between_ns(from_ns - _BESIDE_NS, to_ns + _BESIDE_NS)
+                found["pause_ms"] = round(pause_ns * 1e-6, 1)
+            load.append(round(os.getloadavg()[0], 1))
+            yield summary(case, wire, [*row["repetitions"], *done], [*row["load"], *load])
 
 
 def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]) -> dict[str, Any]:
@@ -219,8 +253,8 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         "",
         "Times: median / worst of the repetitions, from the fault (where a link was away: from its return)",
         "to the moment from which on the robot was passive, by the emulator's own log. In brackets: the",
-        "longest pause of the machine beside the worst one, where a stall monitor saw any. `3/20`: three of",
-        "20 were as expected. `went on`: the fault came too late or did no harm, and the run finished.",
+        "longest pause of the whole machine beside the worst one, where a stall monitor saw any. *3/20*:",
+        "three of twenty were as expected. *Went on*: the fault came too late or did no harm.",
         "",
         f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
         "the operator reads |",
@@ -271,7 +305,7 @@ def main(
         "--jobs", type=int, default=1, help="repetitions at a time, each on a wire of its own"
     )
     parser.add_argument("--list", action="store_true", help="list the rows")
-    parser.add_argument("--out", type=Path, default=None, help="results as JSON, written after each row")
+    parser.add_argument("--out", type=Path, default=None, help="results; repetitions in it count")
     parser.add_argument("--table", type=Path, nargs="+", default=None, metavar="FILE",
                         help="write a page (first) from results (others), and measure nothing")  # fmt: skip
     given = parser.parse_args()
@@ -290,27 +324,29 @@ def main(
     if given.list:
         print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
         return 0
-    calls, rows = earlier(given.out, {case.name for case in chosen})
+    calls, rows = earlier(given.out)
     calls.append({"argv": sys.argv[1:], "machine": describe_machine()})
     bad = 0
-    for row in run_cases(rig_type, chosen, wire, given):
-        rows.append(row)
+    for row in run_cases(rig_type, chosen, wire, given, rows):
+        rows[row["fault"]] = row
         bad += row["as_expected"] < row["count"]
         print(line(row), flush=True)
         if given.out is not None:
-            text = json.dumps({"format": FORMAT, "calls": calls, "rows": rows}, indent=1, ensure_ascii=False)
+            order = [case.name for case in cases]
+            known = sorted(rows.values(), key=lambda one: order.index(one["fault"]))
+            text = json.dumps({"format": FORMAT, "calls": calls, "rows": known}, indent=1, ensure_ascii=False)
             given.out.write_text(text + "\n", encoding="utf-8")
     return int(bad > 0)
 
 
-def earlier(path: Path | None, names: set[str]) -> tuple[list[Any], list[Any]]:
-    """Return the calls and rows that are in a results file, without the rows that are measured anew."""
+def earlier(path: Path | None) -> tuple[list[Any], dict[str, Any]]:
+    """Return the calls that are in a results file, and its rows by their fault."""
     if path is None or not path.exists():
-        return [], []
+        return [], {}
     known = json.loads(path.read_text(encoding="utf-8"))
-    if known["format"] != FORMAT:
-        return [], []
-    return known["calls"], [row for row in known["rows"] if row["fault"] not in names]
+    if known.get("format") != FORMAT:
+        return [], {}
+    return known["calls"], {row["fault"]: row for row in known["rows"]}
 
 
 def line(row: Mapping[str, Any]) -> str:

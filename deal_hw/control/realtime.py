@@ -92,7 +92,7 @@ def priority(level: int, *, children: bool = False, lock: bool = False) -> Itera
 
 
 def hurry(pid: int) -> None:
-    """Let all threads of a process run ahead of ordinary ones where permitted: a killed one is gone soon.
+    """Let the threads of a process run ahead of ordinary ones where permitted: a killed one is gone sooner.
 
     It is gone only once each of its threads has run once more. On a busy machine those of ordinary priority,
     as a network's runtime has some, take hundreds of ms for that.

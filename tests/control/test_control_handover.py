@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from deal_hw.control.handover import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
-from deal_hw.control.realtime import become_realtime, die_with_parent
+from deal_hw.control.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, hurry
 from deal_hw.data.record import CycleRecord, decode
 from deal_hw.errors import DatasetError
 from deal_hw.transport import Message
@@ -128,3 +131,32 @@ def test_a_process_whose_parent_is_gone_does_not_start() -> None:
             os._exit(7)
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
+
+
+def test_every_thread_of_a_killed_process_is_hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is gone only once each thread has run once more; what is refused, or gone already, is no error."""
+    program = """if 1:
+        import threading
+        for _ in range(3):
+            threading.Thread(target=threading.Event().wait, daemon=True).start()
+        print("ready", flush=True)
+        input()
+    """
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+        threads = {int(name) for name in os.listdir(f"/proc/{process.pid}/task")}
+        lifted: set[int] = set()
+
+        def lift(thread: int, policy: int, parameters: os.sched_param) -> None:
+            assert (policy, parameters.sched_priority) == (os.SCHED_FIFO, FIFO_PRIORITY)
+            lifted.add(thread)
+            raise PermissionError(1, "Operation not permitted")
+
+        monkeypatch.setattr(os, "sched_setscheduler", lift)
+        hurry(process.pid)
+        assert lifted == threads
+        assert len(threads) == 4
+        process.kill()
+    assert not Path(f"/proc/{process.pid}").exists()
+    hurry(process.pid)

@@ -149,6 +149,50 @@ def test_the_port_vanishes_on_request() -> None:
         bench.close()
 
 
+def test_the_wire_is_cut_for_a_time() -> None:
+    """0.3 s after arming nothing is heard or said for 0.4 s; the device's watchdog acts meanwhile."""
+    bench = Bench(Hazards(cut_after_s=0.3, cut_s=0.4))
+    try:
+        bench.arm()
+        assert len(bench.run(1000)) in range(201 - 90, 201 - 70)
+        # Disarmed 0.2 s after the last word, 0.1 s before the cut: a robot goes on without its host.
+        told = [what for _, _, what in bench.emulator.changes]
+        assert told == ["homing", "held", "armed", "idle", "cut"]
+        assert bench.emulator.report()["watchdog"]
+        bench.emulator.cut()
+        bench.send(protocol.Arm(3))
+        assert bench.run(300) == []
+        bench.run(300)
+        assert not bench.device.armed
+    finally:
+        bench.close()
+
+
+def test_the_port_comes_back_under_its_link(tmp_path: Path) -> None:
+    """0.3 s after arming the cable is pulled for 0.5 s: a new port, and a device that lived on."""
+    bench = Bench(Hazards(vanish_after_s=0.3, return_after_s=0.5), link=tmp_path / "robot")
+    try:
+        bench.arm()
+        with pytest.raises(TransportLostError, match="check the cable"):
+            bench.run(1000)
+        assert not (tmp_path / "robot").exists()
+        for _ in range(150):
+            bench.clock.advance_ns(5 * MS)
+            assert bench.emulator.step(0.0)
+        bench.port.reopen()
+        bench.decoder = protocol.FrameDecoder()
+        state = bench.run(50)[-1]
+        assert state.device_us == bench.clock.now_ns() // 1000
+        assert Status.WATCHDOG in Status(state.status)
+        times = {what: ns for _, ns, what in bench.emulator.changes}
+        assert 500 * MS <= times["back"] - times["gone"] <= 510 * MS
+        bench.arm()
+        # It vanishes once.
+        bench.run(1000)
+    finally:
+        bench.close()
+
+
 def test_a_link_is_made_replaced_and_removed(tmp_path: Path) -> None:
     """The link points at the port while it exists; a stale link is replaced, a file is not."""
     link = tmp_path / "robot"
@@ -174,6 +218,8 @@ def test_settings_are_checked() -> None:
         Emulate(transport="smoke")
     with pytest.raises(ConfigurationError, match="vanish_after_s"):
         Emulate(vanish_after_s=-1.0)
+    with pytest.raises(ConfigurationError, match="--return-after-s needs"):
+        Emulate(vanish_after_s=1.0, return_after_s=1.0)
     with pytest.raises(ConfigurationError, match="exclude each other"):
         Emulate(nominal=True, truth_from=Path("truth.json"))
     with pytest.raises(ConfigurationError, match="probability"):

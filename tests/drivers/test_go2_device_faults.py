@@ -55,6 +55,28 @@ def test_freeze_says_nothing_and_still_hears(make_go2: Any) -> None:
     assert bench.device.log.faults[0].first_damping_ms == 201
 
 
+def test_a_cut_is_silent_both_ways_and_ends(make_go2: Any) -> None:
+    """For 0.3 s nothing goes out or is heard, and the drives hold their last command; then all is well."""
+    bench = faulty(make_go2, "cut", cut_s=0.3)
+    assert bench.out == []
+    bench.run(150, DAMP)
+    log = bench.device.log
+    assert bench.out == [] and log.to_json()["last_kind"] == "stiff"
+    assert bench.device.base_height > 0.25
+    bench.run(100, DAMP)
+    assert log.faults[0].first_damping_ms in range(400, 404)
+    assert len([topic for topic, _ in bench.out if topic == topics.LOW_STATE]) in range(23, 27)
+
+
+def test_requests_are_noted(make_go2: Any) -> None:
+    """What a service is asked stands in the log with its moment, for whoever must know that nobody asked."""
+    bench = make_go2(start="standing")
+    assert bench.device.report()["commands"]["requests"] == []
+    bench.call("motion_switcher", 1001)
+    (request,) = bench.device.report()["commands"]["requests"]
+    assert request[2] == "motion_switcher"
+
+
 def test_stale_repeats_the_same_bytes(make_go2: Any) -> None:
     """The same state comes 500 times a second; the robot itself goes on."""
     bench = faulty(make_go2, "stale")
