@@ -15,8 +15,8 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from deal_hw.errors import ConfigurationError
-from deal_hw.reading import MIB, check_size, reading, short
+from deal_hw.errors import ConfigurationError, short
+from deal_hw.reading import MIB, check_size, reading
 
 MJCF_BYTES: Final = 64 * MIB
 """Largest top file of a model; what it includes counts as memory."""

@@ -32,11 +32,11 @@ def test_what_is_given_wins() -> None:
         **plan_options(
             "go2",
             LinkOptions(transport="zenoh", record_wire=False, wire=wire),
-            LegOptions(stand=False, velocity="remote", hand_back=True, posture=posture, stop_buttons="R2+A"),
+            LegOptions(stand=True, velocity="remote", hand_back=True, posture=posture, stop_buttons="R2+A"),
         )
     )
     assert plan == RunPlan(
-        robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=False, velocity="remote",
+        robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=True, velocity="remote",
         hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A"},
     )  # fmt: skip
 
