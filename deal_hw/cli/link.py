@@ -72,7 +72,7 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
     """
     description = driver_description(robot)
     stands = _stands(description) if legs.stand is None else legs.stand
-    if description.floating_base is None:
+    if not description.rest_position:
         refuse(given(legs, LegOptions()), f"only robots with legs take that, and robot {robot!r} has none")
     if not walks:
         refuse(given(legs, LegOptions(), ["velocity"]), "no policy that walks runs here")

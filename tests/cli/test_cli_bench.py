@@ -58,7 +58,7 @@ def test_foreign_file_is_not_overwritten(tmp_path: Path) -> None:
     """A file that is no bench file stays as it is."""
     out = tmp_path / "notes.json"
     out.write_text('{"a": 1}')
-    with pytest.raises(DatasetError, match="not a bench file"):
+    with pytest.raises(DatasetError, match="cannot be read as rows of a bench"):
         bench(Bench(bench="loop", methods="centre", out=out))
     assert out.read_text() == '{"a": 1}'
 

@@ -93,7 +93,7 @@ def test_settings_that_do_not_fit_are_refused() -> None:
     """A robot needs a port, an unknown one is named."""
     with pytest.raises(ConfigurationError, match="or neither"):
         Doctor(robot="go2")
-    with pytest.raises(ConfigurationError, match=r"from 0\.5 to 600"):
+    with pytest.raises(ConfigurationError, match=r"allowed are 0.5 to 600 s"):
         Doctor(seconds=0.0)
     with pytest.raises(UnknownNameError, match="go2"):
         doctor(Doctor(robot="gotwo", port="lo"))

@@ -35,7 +35,7 @@ def test_what_is_given_wins() -> None:
             "go2",
             LinkOptions(transport="zenoh", record_wire=False, wire=wire),
             LegOptions(
-                stand=False,
+                stand=True,
                 velocity="remote",
                 hand_back=True,
                 posture=posture,
@@ -45,7 +45,7 @@ def test_what_is_given_wins() -> None:
         )
     )
     assert plan == RunPlan(
-        robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=False, velocity="remote",
+        robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=True, velocity="remote",
         hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A", "support_check": False},
     )  # fmt: skip
 
