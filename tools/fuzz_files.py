@@ -49,7 +49,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=1000, help="inputs of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="read this one input, without guards")
-    parser.add_argument("--limit-s", type=float, default=5.0, help="processor time for one input [s]")
+    parser.add_argument("--limit-s", type=float, default=10.0, help="processor time for one input [s]")
     parser.add_argument("--limit-mb", type=int, default=1024, help="memory for one input [MiB]")
     parser.add_argument("--list", action="store_true", help="name the kinds and end")
     given = parser.parse_args()

@@ -24,8 +24,10 @@ from mcap.writer import MCAP0_MAGIC
 MAX_CHUNK_BYTES = 16 << 20
 """Longest record, and the most that a chunk may hold [B]. The recorder closes a chunk at 1 MiB."""
 MAX_RATIO = 256
-"""Decompressed, the chunks of a file may have so many times its size and one longest chunk besides. A Go2 at
-rest that sends the same bytes all the time reaches 46."""
+"""Decompressed, the chunks of a file may have so many times its size. A Go2 at rest that sends the same bytes
+all the time reaches 46."""
+_FREE_BYTES = 2 << 20
+"""So much the chunks may have whatever the ratio: more than the longest chunk of the recorder [B]."""
 _TRIES = 4
 """Bytes of unusable records that are looked into, per byte of the file: a damaged chunk is met twice, in its
 place and in the search for the next one. Only a file of records that overlap each other needs more."""
@@ -123,7 +125,7 @@ class _Scanner:
         self._data = data
         self._view = memoryview(data)
         self._left = _TRIES * len(data) + MAX_CHUNK_BYTES
-        self._room = MAX_RATIO * len(data) + MAX_CHUNK_BYTES
+        self._room = MAX_RATIO * len(data) + _FREE_BYTES
         self._chunk: Found | None = None
         self._searched = 0
 
@@ -156,7 +158,8 @@ class _Scanner:
                 in_data_section = in_data_section and not isinstance(result.record, DataEnd)
                 if isinstance(result.record, Footer):
                     if self._view[end:] != MCAP0_MAGIC:
-                        yield Lost(end, len(data) - end, "the file does not end after its footer", torn=True)
+                        left = len(data) - end
+                        yield Lost(end, left, "bytes behind the footer", torn=left < len(MCAP0_MAGIC))
                     return
             offset = end
 

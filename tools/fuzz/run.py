@@ -88,8 +88,9 @@ def _child(
             # A hang inside C code never gets to the signal's handler: then the process ends.
             faulthandler.dump_traceback_later(2 * _PATIENCE * limit_s, exit=True)
             outcome = _outcome(kind, data, Path(folder) / "read", limit_s)
-            if (grown := _peak() - base) > limit_bytes:
-                outcome = f"{grown >> 20} MiB of memory ({outcome})"
+            faulthandler.cancel_dump_traceback_later()
+            if _peak() - base > limit_bytes:
+                outcome = f"more than {limit_bytes >> 20} MiB of memory"
             if outcome not in ("read", "refused"):
                 failure = outcome
                 break
