@@ -32,7 +32,7 @@ from collections.abc import Iterable, Mapping
 
 QUOTED = 200
 """Most characters of a file's content that a message repeats."""
-LISTED = 1000
+LISTED = 800
 """Most characters of the names that a message lists."""
 
 

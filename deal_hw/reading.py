@@ -20,7 +20,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, MissingExtraError, short
+from deal_hw.errors import LISTED, ConfigurationError, DatasetError, DealHwError, MissingExtraError, short
 from deal_hw.types import FloatArray
 
 MIB: Final = 1 << 20
@@ -64,8 +64,9 @@ def reading(
     except MissingExtraError:
         raise
     except DealHwError as err:
-        if str(path) not in str(err):
-            err.args = (f"{path}: {err}",)
+        text = str(err) if str(path) in str(err) else f"{path}: {err}"
+        # What is ours may list the names that a file holds.
+        err.args = (short(text, LISTED + len(str(path))),)
         raise
     except FileNotFoundError as err:
         raise error(f"{path} cannot be read: there is no such file{then}") from err

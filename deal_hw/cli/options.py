@@ -52,8 +52,8 @@ class Range:
 
     def __str__(self) -> str:
         if self.unit == "s" and self.high < 1:
-            return f"{1e3 * self.low:g} to {1e3 * self.high:g} ms"
-        return f"{self.low:g} to {self.high:g}{self._unit}"
+            return f"{1e3 * self.low:.12g} to {1e3 * self.high:.12g} ms"
+        return f"{self.low:.12g} to {self.high:.12g}{self._unit}"
 
 
 Seed = Annotated[int, Range(0, 2**32 - 1)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,3 +127,76 @@ def test_result_there_and_back() -> None:
     assert covariance is not None
     # The linear one: (0.6 - 0.4) / 2 / 1.645 = 0.0608.
     assert np.sqrt(covariance[1, 1]) == pytest.approx(0.0608, abs=1e-4)
+
+
+def damaged(**changes: Any) -> dict[str, Any]:
+    """Return the values of a good distribution of two parameters with some of them replaced."""
+    space = ParameterSpace(
+        [
+            Parameter.around("a", "mass", ["x"], "kg", 1.0),
+            Parameter(
+                name="b",
+                kind="bias",
+                elements=("y",),
+                unit="rad",
+                nominal=0.0,
+                low=-1.0,
+                high=1.0,
+                scale="linear",
+            ),
+        ]
+    )
+    good = ParameterDistribution(
+        space=space, mean=space.nominal, covariance=np.diag([0.01, 0.02]), latency_s=(0.0, 0.01)
+    )
+    return {**good.to_json(), **changes}
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"mean": {"a": float("nan"), "b": 0.0}}, "mean"),
+        ({"mean": {"a": -1.0, "b": 0.0}}, "mean of 'a'"),
+        ({"mean": {"a": [1.0], "b": 0.0}}, "mean"),
+        ({"covariance": [[float("nan"), 0.0], [0.0, 1.0]]}, "covariance"),
+        ({"covariance": [[1e300, 0.0], [0.0, 1.0]]}, "covariance"),
+        ({"covariance": [[1.0, 0.5], [0.0, 1.0]]}, "covariance"),
+        ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "covariance"),
+        ({"covariance": [[1.0]]}, "covariance"),
+        ({"covariance": "x"}, "covariance"),
+        ({"latency_s": [0.01, 0.0]}, "latency_s"),
+        ({"latency_s": [0.0, float("inf")]}, "latency_s"),
+        ({"latency_s": [0.0, 12.0]}, "latency_s"),
+    ],
+)
+def test_a_distribution_that_cannot_be_drawn_from_is_refused(changes: dict[str, Any], field: str) -> None:
+    """It is refused when it is read, by the field, and not by a policy that learnt from NaN."""
+    with pytest.raises(ConfigurationError, match=f"^{field}"):
+        ParameterDistribution.from_json(damaged(**changes))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    mean=st.tuples(st.floats(), st.floats()),
+    spread=st.tuples(st.floats(), st.floats()),
+    latency=st.floats(),
+    covariance=st.floats(),
+)
+def test_what_is_read_gives_finite_draws(
+    mean: tuple[float, float], spread: tuple[float, float], latency: float, covariance: float
+) -> None:
+    """Whatever numbers a file holds: refused, or every draw is finite and inside its range."""
+    values = damaged(
+        mean={"a": mean[0], "b": mean[1]},
+        latency_s=[0.0, latency],
+        covariance=[[spread[0], covariance], [covariance, spread[1]]],
+    )
+    try:
+        found = ParameterDistribution.from_json(values)
+    except ConfigurationError as error:
+        assert "\n" not in str(error)
+        return
+    rng = np.random.default_rng(0)
+    draws = found.sample(rng, 20)
+    assert np.isfinite(draws).all() and np.isfinite(found.sample_latency(rng, 20)).all()
+    assert (draws >= found.space.low).all() and (draws <= found.space.high).all()
