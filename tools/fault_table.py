@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import re
+import signal
 import statistics
 import sys
 import tempfile
@@ -33,6 +34,7 @@ from deal_hw.errors import DealHwError
 FORMAT = "deal_hw.faults/2"
 CYCLE_NS = 20_000_000
 _BESIDE_NS = 10_000_000
+_LONG_PAUSE_NS = 20_000_000
 PAUSE_NS = 3_000_000
 """Shorter pauses of the machine are not noted [ns]."""
 _ATTEMPTS = 4
@@ -95,7 +97,7 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
     return {
         "phase": rig.phase, "exit_code": rig.run.returncode, **row, **judge(rig, report),
         "operator": headline(rig.output), "notes": rig.said, "complaints": complaints(rig, report, row),
-        "fault_ns": rig.fault_ns,
+        "fault_ns": rig.fault_ns, "start_ns": rig.start_ns, "end_ns": time.monotonic_ns(),
     }  # fmt: skip
 
 
@@ -124,27 +126,33 @@ def recording(folder: Path) -> dict[str, Any]:
 
 
 def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by the emulator's log how the robot ends, and how long after the fault it became so for good."""
+    """Return by the emulator's log how the robot ends, and how long after the fault it became so for good.
+
+    Where somebody else goes on commanding, the first time that it was made passive counts.
+    """
     told = [(ns, what in rig.active) for ns, what in rig.changes(report) if what in rig.active | rig.inactive]
     ends = "never commanded"
     if any(active for _, active in told):
         ends = "active" if told[-1][1] else "passive"
     from_ns = rig.fault_ns + round(rig.case.from_ms * 1e6)
-    before = [active for ns, active in told if ns < from_ns]
+    obeys = any(active for _, active in [pair for pair in told if pair[0] < from_ns][-1:])
     after = [(ns, active) for ns, active in told if ns >= from_ns]
-    passive_ms: float | None = None
-    if rig.fault_ns > 0 and ends != "active":
-        obeys = bool(before and before[-1]) or any(active for _, active in after)
-        first = next((i for i in range(len(after)) if not any(active for _, active in after[i:])), 0)
-        passive_ms = round((after[first][0] - from_ns) * 1e-6, 1) if obeys else 0.0
-    return {"ends": ends, "passive_ms": passive_ms}
+    if rig.case.expect == "contested":
+        times = [ns for ns, active in after if not active][:1]
+    elif obeys or any(active for _, active in after):
+        last_active = max((i for i, (_, active) in enumerate(after) if active), default=-1)
+        times = [ns for ns, _ in after[last_active + 1 :]][:1]
+    else:
+        times = [from_ns]
+    known = rig.fault_ns > 0 and bool(times)
+    return {"ends": ends, "passive_ms": round((times[0] - from_ns) * 1e-6, 1) if known else None}
 
 
 def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
     """Return what was not as the case expects."""
     case, found = rig.case, list(rig.notes)
     end = judge(rig, report)
-    late = end["passive_ms"] is None or end["passive_ms"] > case.within_ms
+    late = rig.fault_ns > 0 and (end["passive_ms"] is None or end["passive_ms"] > case.within_ms)
     went_on = rig.run.returncode == 0
     match case.expect:
         case "goes on":
@@ -214,6 +222,10 @@ def run_cases(
                 to_ns = from_ns + round(1e6 * (found["passive_ms"] or 0.0))
                 pause_ns = account.longest_between_ns(from_ns - _BESIDE_NS, to_ns + _BESIDE_NS)
                 found["pause_ms"] = round(pause_ns * 1e-6, 1)
+                longest_ns = account.longest_between_ns(found.pop("start_ns"), found.pop("end_ns"))
+                if found["complaints"] and longest_ns > _LONG_PAUSE_NS:
+                    ms = round(longest_ns * 1e-6)
+                    found["complaints"].append(f"the whole machine stood still for {ms} ms in that run")
             load.append(round(os.getloadavg()[0], 1))
             yield summary(case, wire, [*row["repetitions"], *done], [*row["load"], *load])
 
@@ -324,6 +336,8 @@ def main(
     if given.list:
         print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
         return 0
+    # A shell that starts a program in the background has it ignore Ctrl-C, and so would all that it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     calls, rows = earlier(given.out)
     calls.append({"argv": sys.argv[1:], "machine": describe_machine()})
     bad = 0
