@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fault_rig import ARMING, COMMANDING, CONNECTING, TAKING_OVER, Case, Rig, SpoiledError, headline
+from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case, Rig, SpoiledError, headline
 
 from deal_hw.cli.bench import describe_machine
 from deal_hw.cli.witness import witnesses
@@ -145,7 +145,11 @@ def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
     else:
         times = [from_ns]
     known = rig.fault_ns > 0 and bool(times)
-    return {"ends": ends, "passive_ms": round((times[0] - from_ns) * 1e-6, 1) if known else None}
+    return {
+        "ends": ends,
+        "obeyed": any(active for _, active in [pair for pair in told if pair[0] < rig.fault_ns][-1:]),
+        "passive_ms": round(max(times[0] - from_ns, 0) * 1e-6, 1) if known else None,
+    }
 
 
 def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
@@ -153,10 +157,12 @@ def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> l
     case, found = rig.case, list(rig.notes)
     end = judge(rig, report)
     late = rig.fault_ns > 0 and (end["passive_ms"] is None or end["passive_ms"] > case.within_ms)
-    went_on = rig.run.returncode == 0
+    went_on = rig.run.returncode == 0 and rig.phase != ENDING
     match case.expect:
         case "goes on":
-            found += [] if went_on and end["ends"] == "passive" else [f"it ends {end['ends']}"]
+            found += (
+                [] if rig.run.returncode == 0 and end["ends"] == "passive" else [f"it ends {end['ends']}"]
+            )
         case "passive":
             found += ["it ends active"] if end["ends"] == "active" else []
             found += [f"passive after {end['passive_ms']} ms"] if late and not went_on else []
@@ -232,8 +238,9 @@ def run_cases(
 
 def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]) -> dict[str, Any]:
     """Return a case's row from its repetitions."""
-    # A run that went on has no time to tell.
-    counted = [r for r in done if r["passive_ms"] is not None and r["exit_code"] != 0]
+    # A robot that did not obey when the fault came, and a run that was not ended by it, have no time to tell.
+    went_on = [r for r in done if r["exit_code"] == 0 and r["phase"] != ENDING]
+    counted = [r for r in done if r["obeyed"] and r["passive_ms"] is not None and r not in went_on]
     times = [r["passive_ms"] for r in counted] if case.expect in ("passive", "contested") else []
     worst = max(counted, key=lambda r: r["passive_ms"]) if times else None
     return {
@@ -242,7 +249,7 @@ def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]
         "worst_ms": worst["passive_ms"] if worst else None,
         "pause_beside_worst_ms": worst["pause_ms"] if worst else None,
         "from_return": case.from_ms > 0, "count": len(done),
-        "went_on": sum(r["exit_code"] == 0 for r in done),
+        "timed": len(times), "went_on": len(went_on),
         "as_expected": sum(not r["complaints"] for r in done), "load": load, "repetitions": done,
     }  # fmt: skip
 
@@ -263,10 +270,10 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         f"Machine: {first['platform']}, {first['processors']} processors, shared with other work, load "
         f"{min(loads):.1f} to {max(loads):.1f}.",
         "",
-        "Times: median / worst of the repetitions, from the fault (where a link was away: from its return)",
-        "to the moment from which on the robot was passive, by the emulator's own log. In brackets: the",
-        "longest pause of the whole machine beside the worst one, where a stall monitor saw any. *3/20*:",
-        "three of twenty were as expected. *Went on*: the fault came too late or did no harm.",
+        "*20/20*: all twenty repetitions were as expected. Times: median / worst of those in which the robot",
+        "obeyed when the fault came (*of 13*, where that were not all), from the fault (where a link was",
+        "away: from its return) to the moment from which on the robot was passive, by the log of the emulator.",
+        "In brackets: the longest pause of the whole machine beside the worst one, by a stall monitor.",
         "",
         f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
         "the operator reads |",
@@ -294,12 +301,13 @@ def cell(row: Mapping[str, Any] | None) -> str:
     """Return a row's times as a page shows them."""
     if row is None:
         return ""
-    text = "as expected"
+    text = ""
     if row["median_ms"] is not None:
         text = f"{row['median_ms']:.0f} / {row['worst_ms']:.0f}"
+        text += f" of {row['timed']}" if row["timed"] < row["count"] else ""
         text += f" ({row['pause_beside_worst_ms']:.0f})" if row["pause_beside_worst_ms"] else ""
     text += f", {row['went_on']} went on" if row["went_on"] and row["expected"] == "passive" else ""
-    return text if row["as_expected"] == row["count"] else f"{text}, {row['as_expected']}/{row['count']}"
+    return f"{text}; {row['as_expected']}/{row['count']}".removeprefix("; ")
 
 
 def main(

@@ -106,7 +106,7 @@ class Go2Rig(Rig):
             RISING: (STIFF, 0.0, before_s),
             RUNNING: (STIFF, before_s, min(self._seconds, SECONDS)),
             LYING_DOWN: (STIFF, before_s + self._seconds, POSTURE.lie_s - 0.1),
-            ENDING: (STIFF, total_s - 0.1, 0.13),
+            ENDING: (STIFF, total_s - 0.12, 0.12),
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
