@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import re
+import signal
 import statistics
 import sys
 import tempfile
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fault_rig import ARMING, COMMANDING, CONNECTING, TAKING_OVER, Case, Rig, SpoiledError, headline
+from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case, Rig, SpoiledError, headline
 
 from deal_hw.cli.bench import describe_machine
 from deal_hw.cli.witness import witnesses
@@ -33,6 +34,7 @@ from deal_hw.errors import DealHwError
 FORMAT = "deal_hw.faults/2"
 CYCLE_NS = 20_000_000
 _BESIDE_NS = 10_000_000
+_LONG_PAUSE_NS = 20_000_000
 PAUSE_NS = 3_000_000
 """Shorter pauses of the machine are not noted [ns]."""
 _ATTEMPTS = 4
@@ -95,7 +97,7 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
     return {
         "phase": rig.phase, "exit_code": rig.run.returncode, **row, **judge(rig, report),
         "operator": headline(rig.output), "notes": rig.said, "complaints": complaints(rig, report, row),
-        "fault_ns": rig.fault_ns,
+        "fault_ns": rig.fault_ns, "start_ns": rig.start_ns, "end_ns": time.monotonic_ns(),
     }  # fmt: skip
 
 
@@ -124,31 +126,43 @@ def recording(folder: Path) -> dict[str, Any]:
 
 
 def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by the emulator's log how the robot ends, and how long after the fault it became so for good."""
+    """Return by the emulator's log how the robot ends, and how long after the fault it became so for good.
+
+    Where somebody else goes on commanding, the first time that it was made passive counts.
+    """
     told = [(ns, what in rig.active) for ns, what in rig.changes(report) if what in rig.active | rig.inactive]
     ends = "never commanded"
     if any(active for _, active in told):
         ends = "active" if told[-1][1] else "passive"
     from_ns = rig.fault_ns + round(rig.case.from_ms * 1e6)
-    before = [active for ns, active in told if ns < from_ns]
+    obeys = any(active for _, active in [pair for pair in told if pair[0] < from_ns][-1:])
     after = [(ns, active) for ns, active in told if ns >= from_ns]
-    passive_ms: float | None = None
-    if rig.fault_ns > 0 and ends != "active":
-        obeys = bool(before and before[-1]) or any(active for _, active in after)
-        first = next((i for i in range(len(after)) if not any(active for _, active in after[i:])), 0)
-        passive_ms = round((after[first][0] - from_ns) * 1e-6, 1) if obeys else 0.0
-    return {"ends": ends, "passive_ms": passive_ms}
+    if rig.case.expect == "contested":
+        times = [ns for ns, active in after if not active][:1]
+    elif obeys or any(active for _, active in after):
+        last_active = max((i for i, (_, active) in enumerate(after) if active), default=-1)
+        times = [ns for ns, _ in after[last_active + 1 :]][:1]
+    else:
+        times = [from_ns]
+    known = rig.fault_ns > 0 and bool(times)
+    return {
+        "ends": ends,
+        "obeyed": any(active for _, active in [pair for pair in told if pair[0] < rig.fault_ns][-1:]),
+        "passive_ms": round(max(times[0] - from_ns, 0) * 1e-6, 1) if known else None,
+    }
 
 
 def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
     """Return what was not as the case expects."""
     case, found = rig.case, list(rig.notes)
     end = judge(rig, report)
-    late = end["passive_ms"] is None or end["passive_ms"] > case.within_ms
-    went_on = rig.run.returncode == 0
+    late = rig.fault_ns > 0 and (end["passive_ms"] is None or end["passive_ms"] > case.within_ms)
+    went_on = rig.run.returncode == 0 and rig.phase != ENDING
     match case.expect:
         case "goes on":
-            found += [] if went_on and end["ends"] == "passive" else [f"it ends {end['ends']}"]
+            found += (
+                [] if rig.run.returncode == 0 and end["ends"] == "passive" else [f"it ends {end['ends']}"]
+            )
         case "passive":
             found += ["it ends active"] if end["ends"] == "active" else []
             found += [f"passive after {end['passive_ms']} ms"] if late and not went_on else []
@@ -214,14 +228,19 @@ def run_cases(
                 to_ns = from_ns + round(1e6 * (found["passive_ms"] or 0.0))
                 pause_ns = account.longest_between_ns(from_ns - _BESIDE_NS, to_ns + _BESIDE_NS)
                 found["pause_ms"] = round(pause_ns * 1e-6, 1)
+                longest_ns = account.longest_between_ns(found.pop("start_ns"), found.pop("end_ns"))
+                if found["complaints"] and longest_ns > _LONG_PAUSE_NS:
+                    ms = round(longest_ns * 1e-6)
+                    found["complaints"].append(f"the whole machine stood still for {ms} ms in that run")
             load.append(round(os.getloadavg()[0], 1))
             yield summary(case, wire, [*row["repetitions"], *done], [*row["load"], *load])
 
 
 def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]) -> dict[str, Any]:
     """Return a case's row from its repetitions."""
-    # A run that went on has no time to tell.
-    counted = [r for r in done if r["passive_ms"] is not None and r["exit_code"] != 0]
+    # A robot that did not obey when the fault came, and a run that was not ended by it, have no time to tell.
+    went_on = [r for r in done if r["exit_code"] == 0 and r["phase"] != ENDING]
+    counted = [r for r in done if r["obeyed"] and r["passive_ms"] is not None and r not in went_on]
     times = [r["passive_ms"] for r in counted] if case.expect in ("passive", "contested") else []
     worst = max(counted, key=lambda r: r["passive_ms"]) if times else None
     return {
@@ -230,7 +249,7 @@ def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]
         "worst_ms": worst["passive_ms"] if worst else None,
         "pause_beside_worst_ms": worst["pause_ms"] if worst else None,
         "from_return": case.from_ms > 0, "count": len(done),
-        "went_on": sum(r["exit_code"] == 0 for r in done),
+        "timed": len(times), "went_on": len(went_on),
         "as_expected": sum(not r["complaints"] for r in done), "load": load, "repetitions": done,
     }  # fmt: skip
 
@@ -251,10 +270,10 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         f"Machine: {first['platform']}, {first['processors']} processors, shared with other work, load "
         f"{min(loads):.1f} to {max(loads):.1f}.",
         "",
-        "Times: median / worst of the repetitions, from the fault (where a link was away: from its return)",
-        "to the moment from which on the robot was passive, by the emulator's own log. In brackets: the",
-        "longest pause of the whole machine beside the worst one, where a stall monitor saw any. *3/20*:",
-        "three of twenty were as expected. *Went on*: the fault came too late or did no harm.",
+        "*20/20*: all twenty repetitions were as expected. Times: median / worst of those in which the robot",
+        "obeyed when the fault came (*of 13*, where that were not all), from the fault (where a link was",
+        "away: from its return) to the moment from which on the robot was passive, by the log of the emulator.",
+        "In brackets: the longest pause of the whole machine beside the worst one, by a stall monitor.",
         "",
         f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
         "the operator reads |",
@@ -282,12 +301,13 @@ def cell(row: Mapping[str, Any] | None) -> str:
     """Return a row's times as a page shows them."""
     if row is None:
         return ""
-    text = "as expected"
+    text = ""
     if row["median_ms"] is not None:
         text = f"{row['median_ms']:.0f} / {row['worst_ms']:.0f}"
+        text += f" of {row['timed']}" if row["timed"] < row["count"] else ""
         text += f" ({row['pause_beside_worst_ms']:.0f})" if row["pause_beside_worst_ms"] else ""
     text += f", {row['went_on']} went on" if row["went_on"] and row["expected"] == "passive" else ""
-    return text if row["as_expected"] == row["count"] else f"{text}, {row['as_expected']}/{row['count']}"
+    return f"{text}; {row['as_expected']}/{row['count']}".removeprefix("; ")
 
 
 def main(
@@ -324,6 +344,8 @@ def main(
     if given.list:
         print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
         return 0
+    # A shell that starts a program in the background has it ignore Ctrl-C, and so would all that it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     calls, rows = earlier(given.out)
     calls.append({"argv": sys.argv[1:], "machine": describe_machine()})
     bad = 0

@@ -54,7 +54,7 @@ class CartpoleRig(Rig):
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (HOMING, 0.0, self.typical_s[TAKING_OVER]),
             ARMING: (ARMED, 0.0, 0.02),
-            RUNNING: (ARMED, 0.05, self._seconds - 0.2),
+            RUNNING: (ARMED, 0.05, min(self._seconds, SECONDS) - 0.2),
             ENDING: (ARMED, self._seconds - 0.1, 0.15),
         }[phase]
 
@@ -80,7 +80,7 @@ CASES = (
     Case(name="none", expect="goes on", codes=(0,)),
     *process_cases(),
     Case(name="both processes are killed (SIGKILL); the device's watchdog stops the motor", act=kill_both,
-         codes=(-9,)),
+         codes=(-9,), phases=(RUNNING,)),
     *link_cases({"the cable is cut for {}": freeze_link}, cut=True),
     *(Case(name=f"the cable is pulled, and put back after {seconds:g} s", codes=(3, 0),
            emulator=(*after("--vanish-after-s"), "--return-after-s", f"{seconds}"))

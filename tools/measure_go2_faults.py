@@ -104,9 +104,9 @@ class Go2Rig(Rig):
             TAKING_OVER: (REQUEST, 0.0, self.typical_s[TAKING_OVER]),
             ARMING: (DAMPING, 0.0, 0.02),
             RISING: (STIFF, 0.0, before_s),
-            RUNNING: (STIFF, before_s, self._seconds),
+            RUNNING: (STIFF, before_s, min(self._seconds, SECONDS)),
             LYING_DOWN: (STIFF, before_s + self._seconds, POSTURE.lie_s - 0.1),
-            ENDING: (STIFF, total_s - 0.1, 0.13),
+            ENDING: (STIFF, total_s - 0.12, 0.12),
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
@@ -152,7 +152,8 @@ WIRE = after("--wire-after-s")
 CASES = (
     Case(name="none", expect="goes on", codes=(0,)),
     *process_cases(),
-    Case(name="both processes are killed (SIGKILL)", act=kill_both, expect="stiff", codes=(-9,)),
+    Case(name="both processes are killed (SIGKILL)", act=kill_both, expect="stiff", codes=(-9,),
+         phases=(RISING, RUNNING, LYING_DOWN)),
     Case(name="a second run by another address, as from another computer", act=second_run(elsewhere=True),
          codes=(130,), phases=(CONNECTING, TAKING_OVER, RISING, RUNNING), seconds=60.0, wires=("zenoh",)),
     Case(name="killed while taking over from sport mode, which stands", act=signal_control(signal.SIGKILL),

@@ -36,7 +36,12 @@ def measure() -> Iterator[Any]:
             if phase == "ending":
                 rig_type = sooner(rig_type)
             case = dataclasses.replace(case, phases=phases, within_ms=10_000.0, **changes)
-            return table.repetition(rig_type, case, wire, [7], 0, dict(TYPICAL_S))
+            for attempt in range(3):
+                row = table.repetition(rig_type, case, wire, [attempt], 0, dict(TYPICAL_S))
+                # A machine that stands still for 40 ms trips a run, whatever else happens to it.
+                if not (row["complaints"] and row["exit_code"] == 3 and "ms old" in row["operator"]):
+                    break
+            return row
 
         yield run
 
