@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.data.export_lerobot import export_lerobot
+from deal_hw.data.importing import lerobot_source
 from deal_hw.data.importing.grid import period_of, to_trajectories
 from deal_hw.data.importing.lerobot_source import read_lerobot
 from deal_hw.data.importing.load import load_tables
@@ -183,3 +184,28 @@ def test_older_layout(tmp_path: Path) -> None:
     assert second.position.tolist() == [[10, 0], [10, 1], [10, 2], [10, 3]]
     assert second.target[:, 1].tolist() == [0.5, 1.5, 2.5, 3.5]
     np.testing.assert_allclose(second.time_s, np.arange(4) / 30, atol=1e-12)
+
+
+@pytest.mark.parametrize(("limit", "refused"), [(100, True), (300, True), (100_000, False)])
+def test_a_dataset_has_so_many_numbers_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, refused: bool
+) -> None:
+    """Rows are counted before they are read, what their lists hold as they come."""
+    folder = tmp_path / "set"
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    features = {
+        name: {"dtype": "float32", "shape": [3], "names": None} for name in ("observation.state", "action")
+    }
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": 100, "features": features}))
+    rows = [[0.0, 1.0, 2.0]] * 60
+    table = pa.table(
+        {"observation.state": rows, "action": rows, "episode_index": [0] * 60, "frame_index": range(60)}
+    )
+    pq.write_table(table, folder / "data" / "chunk-000" / "file-000.parquet")
+    monkeypatch.setattr(lerobot_source, "NUMBERS", limit)
+    if refused:
+        with pytest.raises(DatasetError, match=rf"file-000\.parquet .*more than {limit} numbers"):
+            read_lerobot(folder)
+    else:
+        assert read_lerobot(folder)[0].arrays["action"].shape == (60, 3)
