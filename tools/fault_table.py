@@ -272,7 +272,7 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         "",
         "*20/20*: all twenty repetitions were as expected. Times: median / worst of those in which the robot",
         "obeyed when the fault came (*of 13*, where that were not all), from the fault (where a link was",
-        "away: from its return) to the moment from which on the robot was passive, by the log of the emulator.",
+        "away: from its return) until the robot was passive for good, by the emulator's own log.",
         "In brackets: the longest pause of the whole machine beside the worst one, by a stall monitor.",
         "",
         f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
