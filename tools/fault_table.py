@@ -87,6 +87,8 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         time.sleep(0.3)
         rig.pump()
     learn(typical_s, rig)
+    if not (rig.folder / "emulator.json").exists():
+        raise SpoiledError("the emulator died and told nothing")
     report = json.loads((rig.folder / "emulator.json").read_text())
     row = recording(rig.folder / "run" / "dataset")
     last_cycle_ns = row.pop("last_cycle_ns")
@@ -222,7 +224,11 @@ def run_cases(
                 continue
             load = [round(os.getloadavg()[0], 1)]
             with witnesses(PAUSE_NS) as account:
-                done = list(pool.map(lambda number, case=case: one(case, number), numbers))
+                try:
+                    done = list(pool.map(lambda number, case=case: one(case, number), numbers))
+                except SpoiledError as error:
+                    print(f"not measured: {error}", flush=True)
+                    continue
             for found in done:
                 from_ns = found.pop("fault_ns") + round(1e6 * case.from_ms)
                 to_ns = from_ns + round(1e6 * (found["passive_ms"] or 0.0))
