@@ -133,6 +133,7 @@ def test_the_firmware_freezes_on_request() -> None:
         bench.arm()
         assert len(bench.run(1000)) in range(52, 62)
         assert bench.run(100) == []
+        assert [what for _, _, what in bench.emulator.changes].count("frozen") == 1
     finally:
         bench.close()
 
