@@ -87,6 +87,8 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         time.sleep(0.3)
         rig.pump()
     learn(typical_s, rig)
+    if not (rig.folder / "emulator.json").exists():
+        raise SpoiledError("the emulator died and told nothing")
     report = json.loads((rig.folder / "emulator.json").read_text())
     row = recording(rig.folder / "run" / "dataset")
     last_cycle_ns = row.pop("last_cycle_ns")
@@ -222,7 +224,11 @@ def run_cases(
                 continue
             load = [round(os.getloadavg()[0], 1)]
             with witnesses(PAUSE_NS) as account:
-                done = list(pool.map(lambda number, case=case: one(case, number), numbers))
+                try:
+                    done = list(pool.map(lambda number, case=case: one(case, number), numbers))
+                except SpoiledError as error:
+                    print(f"not measured: {error}", flush=True)
+                    continue
             for found in done:
                 from_ns = found.pop("fault_ns") + round(1e6 * case.from_ms)
                 to_ns = from_ns + round(1e6 * (found["passive_ms"] or 0.0))
@@ -233,24 +239,27 @@ def run_cases(
                     ms = round(longest_ns * 1e-6)
                     found["complaints"].append(f"the whole machine stood still for {ms} ms in that run")
             load.append(round(os.getloadavg()[0], 1))
-            yield summary(case, wire, [*row["repetitions"], *done], [*row["load"], *load])
+            yield summary({
+                "fault": case.name, "wire": wire, "expected": case.expect, "from_return": case.from_ms > 0,
+                "load": [*row["load"], *load], "repetitions": [*row["repetitions"], *done],
+            })  # fmt: skip
 
 
-def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]) -> dict[str, Any]:
-    """Return a case's row from its repetitions."""
+def summary(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with what its repetitions say together."""
+    done = row["repetitions"]
     # A robot that did not obey when the fault came, and a run that was not ended by it, have no time to tell.
     went_on = [r for r in done if r["exit_code"] == 0 and r["phase"] != ENDING]
     counted = [r for r in done if r["obeyed"] and r["passive_ms"] is not None and r not in went_on]
-    times = [r["passive_ms"] for r in counted] if case.expect in ("passive", "contested") else []
+    times = [r["passive_ms"] for r in counted] if row["expected"] in ("passive", "contested") else []
     worst = max(counted, key=lambda r: r["passive_ms"]) if times else None
     return {
-        "fault": case.name, "wire": wire, "expected": case.expect,
+        **row,
         "median_ms": round(statistics.median(times), 1) if times else None,
         "worst_ms": worst["passive_ms"] if worst else None,
         "pause_beside_worst_ms": worst["pause_ms"] if worst else None,
-        "from_return": case.from_ms > 0, "count": len(done),
-        "timed": len(times), "went_on": len(went_on),
-        "as_expected": sum(not r["complaints"] for r in done), "load": load, "repetitions": done,
+        "count": len(done), "timed": len(times), "went_on": len(went_on),
+        "as_expected": sum(not r["complaints"] for r in done),
     }  # fmt: skip
 
 
@@ -259,6 +268,7 @@ def summary(case: Case, wire: str, done: list[dict[str, Any]], load: list[float]
 
 def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]]) -> str:
     """Return the tables of several wires as one page."""
+    results = [{**result, "rows": [summary(row) for row in result["rows"]]} for result in results]
     wires = [result["rows"][0]["wire"] for result in results]
     names = dict.fromkeys(row["fault"] for result in results for row in result["rows"])
     loads = [load for result in results for row in result["rows"] for load in row["load"]]
@@ -272,7 +282,7 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         "",
         "*20/20*: all twenty repetitions were as expected. Times: median / worst of those in which the robot",
         "obeyed when the fault came (*of 13*, where that were not all), from the fault (where a link was",
-        "away: from its return) to the moment from which the robot was passive, by the emulator's log.",
+        "away: from its return) until the robot was passive for good, by the emulator's own log.",
         "In brackets: the longest pause of the whole machine beside the worst one, by a stall monitor.",
         "",
         f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
@@ -287,14 +297,20 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         data = ", ".join(sorted({r["dataset"].partition(":")[0] for r in each}))
         said = next((r["operator"] for r in each if r["operator"]), "(nothing)").replace("|", "/")
         cells = " | ".join(cell(row) for row in rows)
-        lines.append(f"| {name} | {known[0]['expected']} | {cells} | {codes} | {data} | {said[:160]} |")
+        lines.append(f"| {name} | {known[0]['expected']} | {cells} | {codes} | {data} | {shortened(said)} |")
     bad = []
     for row in (row for result in results for row in result["rows"]):
         if row["as_expected"] < row["count"]:
             why = sorted({text for r in row["repetitions"] for text in r["complaints"]})
             bad.append(f"- {row['wire']}, {row['fault']}: {'; '.join(why)}")
-    lines += ["", "Not as expected: " + ("none." if not bad else ""), *(["", *bad] if bad else [])]
+    lines += ["", "Not as expected: none." if not bad else "Not as expected:", *(["", *bad] if bad else [])]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def shortened(said: str) -> str:
+    """Return what the operator reads without addresses of this machine."""
+    said = re.sub(r"/tmp/\S+|tcp/\S+", "PORT:", said)
+    return said if len(said) <= 110 else said[:107] + "..."
 
 
 def cell(row: Mapping[str, Any] | None) -> str:

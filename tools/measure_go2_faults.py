@@ -190,6 +190,9 @@ WORDS = (
     "ending) and a moment of it. *Cut* is the emulator's: nothing goes out or is heard. *Freezes* and",
     "*reset* are done to the TCP connection by a proxy.",
     "",
+    "In the row that expects *stiff* only the robot's own side could help: both processes are dead, the Go2",
+    "holds its last command. So it does for as long as a link stays away. Keep the remote in your hand.",
+    "",
 )
 
 

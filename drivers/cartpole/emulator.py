@@ -53,7 +53,7 @@ class CartpoleEmulator:
         slips: Times that this process was stalled and device time stood still.
         dropped: Writes that found no room.
         changes: What the motor and the port did, and when: device ms, host ns, and a mode of the device,
-            "cut", "gone" or "back"; the first 2000.
+            "frozen", "cut", "gone" or "back"; the first 2000.
 
     Args:
         device: The device.
@@ -80,6 +80,7 @@ class CartpoleEmulator:
         self._unsent = b""
         self._armed_ns: int | None = None
         self._cut_after_s, self._vanish_after_s = self._hazards.cut_after_s, self._hazards.vanish_after_s
+        self._freeze_after_s, self._frozen = self._hazards.freeze_after_s, False
         self._cut_end_ns, self._gone_ns = 0, -1
         self.changes: list[tuple[int, int, str]] = []
         self._mode = device.mode
@@ -140,7 +141,10 @@ class CartpoleEmulator:
         silent = self._gone_ns >= 0 or now_ns < self._cut_end_ns
         out = self._device.advance_to(now_ns - self._origin_ns)
         self._follow(now_ns)
-        if silent or _passed(self._hazards.freeze_after_s, armed_s):
+        if _passed(self._freeze_after_s, armed_s):
+            self._freeze_after_s, self._frozen = None, True
+            self._note(now_ns, "frozen")
+        if silent or self._frozen:
             return True
         self._device.receive(data)
         if self._armed_ns is None and self._device.armed:

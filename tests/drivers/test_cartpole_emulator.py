@@ -16,7 +16,7 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import (
     ConfigurationError,
@@ -133,6 +133,7 @@ def test_the_firmware_freezes_on_request() -> None:
         bench.arm()
         assert len(bench.run(1000)) in range(52, 62)
         assert bench.run(100) == []
+        assert [what for _, _, what in bench.emulator.changes].count("frozen") == 1
     finally:
         bench.close()
 
@@ -234,9 +235,12 @@ def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.Ca
     assert os.sched_getscheduler(0) == os.SCHED_OTHER
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("port /dev/")
-    assert json.loads(lines[-1]) == json.loads(revealed.read_text())
+    told = json.loads(lines[-1])
+    assert told == json.loads(revealed.read_text())
+    assert (told["changes"], told["last_mode"], told["received_bytes"]) == ([], "idle", 0)
     assert emulate(Emulate(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == lines[-1]
+    again = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert Truth.from_json(again) == Truth.from_json(told)
 
 
 def test_a_process_end_to_end(tmp_path: Path) -> None:
