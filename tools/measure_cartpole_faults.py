@@ -20,6 +20,26 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 SECONDS = 1.2
 HOMING, ARMED, IDLE, HELD = "homing", "armed", "idle", "held"
 GONE = "gone"
+DEPLOY = """
+import sys
+from pathlib import Path
+from deal_hw.cli.run_plan import RunPlan
+from deal_hw.cli.supervised import run_episodes
+from deal_hw.errors import DealHwError
+
+policy, wanted, seconds, port, dataset, *dry = sys.argv[1:]
+plan = RunPlan(
+    robot="cartpole", policy=policy, velocity=wanted, seconds=float(seconds), dry_run=bool(dry), home=not dry
+)
+try:
+    code = run_episodes(plan, port=port, dataset=Path(dataset), episodes=1, purpose="deploy").exit_code
+except KeyboardInterrupt:
+    code = 130
+except DealHwError as error:
+    print(f"deal-hw: error: {error}", file=sys.stderr)
+    code = 2
+sys.exit(code)
+"""
 
 
 class CartpoleRig(Rig):
@@ -38,11 +58,21 @@ class CartpoleRig(Rig):
         return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port")]
 
     def arguments(self) -> list[str]:
-        """Play a chirp, or what a faulty policy says."""
-        verb, what = "collect", ["--profile", "chirp"]
-        if self.case.policy or self.case.dry:
-            verb, what = "deploy", self.policy_arguments()
-        return [verb, "cartpole", *what, "--seconds", str(self._seconds)]
+        """Play a chirp."""
+        return ["collect", "cartpole", "--profile", "chirp", "--seconds", str(self._seconds)]
+
+    def command(self, out: str, port: str = "") -> list[str]:
+        """Return the command line of a run.
+
+        A faulty policy goes wrong at a wanted velocity, so that its trial does not find the fault. `deploy`
+        refuses that option for a robot without legs: a program runs the same plan.
+        """
+        if not (self.case.policy or self.case.dry):
+            return super().command(out, port)
+        _, policy, _, wanted = self.policy_arguments()
+        where = [port or self.port, str(self.folder / out / "dataset")]
+        dry = ["dry"] * self.case.dry
+        return [sys.executable, "-c", DEPLOY, policy, wanted, str(self._seconds), *where, *dry]
 
     @property
     def _seconds(self) -> float:

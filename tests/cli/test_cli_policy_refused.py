@@ -87,7 +87,9 @@ def test_a_faulty_network_never_reaches_a_robot(
     assert "no-port" not in said and not (tmp_path / "run").exists()
 
 
-def test_a_missing_policy_that_is_not_needed_is_no_matter(tmp_path: Path, deploy: Callable[..., str]) -> None:
-    """The profile `hold` runs none."""
+def test_a_policy_that_would_not_run_is_refused(tmp_path: Path, deploy: Callable[..., str]) -> None:
+    """The profile `hold` runs none: whoever gives one expects something else."""
     verb = ("collect", "cartpole", "--profile", "hold", "--out", str(tmp_path / "run"))
-    assert "no-port" in deploy(tmp_path / "nothing.onnx", *verb)
+    assert "--policy would have no effect: --profile hold runs no policy" in deploy(
+        tmp_path / "nothing.onnx", *verb
+    )

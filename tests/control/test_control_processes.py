@@ -21,7 +21,6 @@ import pytest
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.link import LegOptions
 from deal_hw.cli.replay import Replay, replay
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import InterruptedRunError, RunReport, run_episodes
@@ -458,9 +457,10 @@ def test_a_policy_that_returns_nan_trips_at_once(emulator: Emulator, tmp_path: P
     onnx_export = pytest.importorskip("deal_hw.policies.onnx_export")
     policy = tmp_path / "nan.onnx"
     onnx_export.write_policy(*faulty_policy(DESCRIPTION, "nan", rare=True), policy)
-    legs = LegOptions(velocity=f"{RARE_M_S},0,0")
-    report = deploy(
-        Deploy(robot="cartpole", port=emulator.port, policy=policy, legs=legs, out=tmp_path, quiet=True)
+    # The verb refuses a wanted velocity for a robot without legs; the plan takes it.
+    plan = RunPlan(robot="cartpole", policy=str(policy), velocity=f"{RARE_M_S},0,0")
+    report = run_episodes(
+        plan, port=emulator.port, dataset=tmp_path / "dataset", episodes=1, purpose="deploy", quiet=True
     )
     assert (report.outcome, report.exit_code) == (Outcome.TRIPPED, 3)
     assert report.episodes[0].reason == "the policy asked for a command that is not finite"
@@ -489,7 +489,7 @@ def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:
         collect(Collect(robot="cartpole", port="x", profile="hold"))
     with pytest.raises(ConfigurationError, match="--seconds"):
         collect(Collect(robot="cartpole", port="x", out=tmp_path, profile="hold", seconds=math.nan))
-    with pytest.raises(ConfigurationError, match="at least 1"):
+    with pytest.raises(ConfigurationError, match="--episodes 0: allowed are 1 to 10000"):
         collect(Collect(robot="cartpole", port="x", out=tmp_path, profile="hold", episodes=0))
 
 

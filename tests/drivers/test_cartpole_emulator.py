@@ -217,13 +217,13 @@ def test_settings_are_checked() -> None:
         Emulate(robot="spot")
     with pytest.raises(UnknownNameError, match="known: serial"):
         Emulate(transport="smoke")
-    with pytest.raises(ConfigurationError, match="vanish_after_s"):
+    with pytest.raises(ConfigurationError, match=r"--vanish-after-s -1\.0 s"):
         Emulate(vanish_after_s=-1.0)
     with pytest.raises(ConfigurationError, match="--return-after-s needs"):
         Emulate(vanish_after_s=1.0, return_after_s=1.0)
     with pytest.raises(ConfigurationError, match="exclude each other"):
         Emulate(nominal=True, truth_from=Path("truth.json"))
-    with pytest.raises(ConfigurationError, match="probability"):
+    with pytest.raises(ConfigurationError, match=r"--corrupt 1\.5: allowed are 0 to 1"):
         emulate(Emulate(nominal=True, corrupt=1.5))
 
 
