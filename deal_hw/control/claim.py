@@ -46,7 +46,8 @@ class LocalClaim:
         held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             held.bind(self._name)
-            held.listen(1)
+            # Those who ask are never taken from the queue: it must be long enough for many of them.
+            held.listen()
         except OSError as error:
             held.close()
             if error.errno != errno.EADDRINUSE:

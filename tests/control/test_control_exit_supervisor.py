@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from deal_hw.clock import VirtualClock
 from deal_hw.control import supervisor as module
 from deal_hw.control.handover import Beat
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
@@ -268,6 +269,73 @@ def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None
         "opened": True,
         "parent": os.getpid(),
     }
+
+
+def test_the_process_has_a_group_of_its_own_and_ordinary_priority() -> None:
+    """Ctrl-C in the terminal reaches the supervisor alone; the supervisor's priority is not inherited."""
+    run = Run(
+        "result(passive_confirmed=True, group=os.getpgrp() == os.getpid(), policy=os.sched_getscheduler(0))"
+    )
+    end = run.end()
+    assert end.result == {"passive_confirmed": True, "group": True, "policy": os.SCHED_OTHER}
+
+
+def test_the_supervisor_runs_first_and_stays_in_memory() -> None:
+    """While it watches, where that is granted; not before and not after."""
+    seen: list[tuple[int, bool]] = []
+
+    def locked() -> bool:
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmLck:")[2].split()[0]) > 0
+
+    def look(run: Run, beat: Beat) -> None:
+        seen.append((os.sched_getparam(0).sched_priority, locked()))
+
+    assert Run("beat('running'); result(passive_confirmed=True)", look).end().passive_confirmed
+    if os.geteuid() != 0:
+        pytest.skip("neither is granted to this user")
+    assert seen == [(module.SUPERVISOR_PRIORITY, True)]
+    assert (os.sched_getparam(0).sched_priority, locked()) == (0, False)
+
+
+def test_heartbeats_go_by_the_clock() -> None:
+    """A clock that stands still makes one, at once, however often the supervisor wakes up."""
+    do = (
+        "[(beat('running'), time.sleep(0.02)) for _ in range(10)]; channel.setblocking(False); "
+        "result(passive_confirmed=True, heard=channel.recv(64).decode()); "
+        "time.sleep(0.1); n = 0\n"
+        "try:\n    channel.recv(64); n = 1\nexcept BlockingIOError:\n    pass\n"
+        "sys.exit(n)"
+    )
+    end = Run(do, clock=VirtualClock(0)).end()
+    assert end.result == {"passive_confirmed": True, "heard": "\0"}
+    assert end.exit_code == 0
+
+
+def test_a_process_that_never_beats_has_thirty_seconds() -> None:
+    """To the nanosecond: it is let live at 30 s, and killed 1 ns later."""
+
+    class Late(VirtualClock):
+        asked = 0
+
+        def now_ns(self) -> int:
+            """Stand still while it starts, then at 30 s for a while, then 1 ns later."""
+            self.asked += 1
+            return 0 if self.asked == 1 else 30 * 10**9 + (self.asked > 30)
+
+    clock = Late()
+    end = Run("time.sleep(30); sys.exit(7)", clock=clock).end()
+    assert (end.killed, end.exit_code) == ("it gave no sign of life while starting", -9)
+    assert clock.asked > 30
+
+
+def test_what_is_killed_is_hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine a killed process takes long to be gone, and the robot is stiff meanwhile."""
+    hurried: list[int] = []
+    monkeypatch.setattr(module, "hurry", hurried.append)
+    run = Run("beat('homing', 0.02); time.sleep(600)")
+    assert run.end().exit_code == -9
+    assert run.supervisor._child is not None and hurried == [run.supervisor._child.pid]
 
 
 class Recorder:

@@ -25,7 +25,7 @@ class Rig:
     """A vigil, its supervisor's end of the channel, and a clock that moves when told."""
 
     def __init__(self) -> None:
-        self.clock = VirtualClock(5)
+        self.clock = VirtualClock(10**12)
         self._ends = socket_pair()
         self.supervisor = StatusReceiver(self._ends[1])
         self.silent = threading.Event()
@@ -81,7 +81,7 @@ def test_a_wait_that_ends_early_is_taken_up_again() -> None:
             asked.release()
             return super().now_ns()
 
-    rig.vigil._clock = Asked(5)
+    rig.vigil._clock = Asked(10**12)
     rig.vigil.start()
     for _ in range(6):
         assert asked.acquire(timeout=PATIENCE_S)
@@ -147,8 +147,17 @@ def test_a_claim_is_exclusive_and_says_who_holds_it() -> None:
 
 def test_a_claim_that_is_not_held_has_no_descriptor() -> None:
     """A mistake in the program, not in the world."""
-    with pytest.raises(RuntimeError, match="not held"):
+    with pytest.raises(RuntimeError, match=r"^the claim is not held$"):
         LocalClaim("x").fileno()
+
+
+def test_many_that_are_refused_all_hear_by_whom() -> None:
+    """Nobody takes their questions from the queue; none waits, and none is left without an answer."""
+    with LocalClaim("a robot") as claim:
+        assert claim._name.startswith(b"\0deal-hw/claim/")
+        for _ in range(20):
+            with pytest.raises(PortBusyError, match=f"in use by process {os.getpid()} "):
+                LocalClaim("a robot").acquire()
 
 
 def test_a_child_keeps_the_claim_when_its_parent_is_gone() -> None:
