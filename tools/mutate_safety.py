@@ -24,11 +24,12 @@ PAGE = ROOT / "docs" / "safety-mutation.md"
 SETS = {
     "safety": (
         ("deal_hw/control/safety*.py", "deal_hw/control/leg_checks.py"),
-        "tests/control/test_control_safety*.py",
+        ("tests/control/test_control_safety*.py",),
     ),
-    "exit": (
-        tuple(f"deal_hw/control/{name}.py" for name in ("passive", "supervisor", "vigil", "claim")),
-        "tests/control/test_control_exit*.py",
+    "passive": (("deal_hw/control/passive.py",), ("tests/control/test_control_exit_passive.py",)),
+    "processes": (
+        tuple(f"deal_hw/control/{name}.py" for name in ("supervisor", "vigil", "claim")),
+        ("tests/control/test_control_exit_[sv]*.py", "tests/control/test_control_words.py"),
     ),
 }
 """What is changed, and the tests that must notice; each set is a run of its own."""
@@ -40,8 +41,8 @@ only_mutate = {mutated!r}
 pytest_add_cli_args_test_selection = ["tests"]
 use_git_change_detection = false
 # A busy machine must not make a test look as if it had noticed a change.
-timeout_multiplier = 60.0
-timeout_constant = 20.0
+timeout_multiplier = 15.0
+timeout_constant = 10.0
 
 [tool.pytest.ini_options]
 addopts = "--import-mode=importlib -p no:cacheprovider"
@@ -49,13 +50,14 @@ filterwarnings = ["error"]
 """
 
 
-def prepare(mutated: tuple[str, ...], tests: str) -> None:
+def prepare(mutated: tuple[str, ...], tests: tuple[str, ...]) -> None:
     """Copy what mutmut needs."""
     shutil.rmtree(WORK, ignore_errors=True)
     (WORK / "tests").mkdir(parents=True)
     shutil.copytree(ROOT / "deal_hw", WORK / "deal_hw", ignore=shutil.ignore_patterns("__pycache__"))
-    for test in ROOT.glob(tests):
-        shutil.copy(test, WORK / "tests")
+    for pattern in tests:
+        for test in ROOT.glob(pattern):
+            shutil.copy(test, WORK / "tests")
     (WORK / "pyproject.toml").write_text(CONFIGURATION.format(mutated=list(mutated)))
 
 
@@ -92,7 +94,7 @@ def main() -> int:
     return max([run(*SETS[name]) for name in chosen])
 
 
-def run(mutated: tuple[str, ...], tests: str) -> int:
+def run(mutated: tuple[str, ...], tests: tuple[str, ...]) -> int:
     """Run one set; return 1 where a survivor is not argued."""
     prepare(mutated, tests)
     children = str(max((os.cpu_count() or 2) - 1, 1))
