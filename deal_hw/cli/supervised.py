@@ -130,11 +130,12 @@ class InterruptedRunError(KeyboardInterrupt):
 
     Attributes:
         report: How the runs went until then.
+        signal: Name of the signal, such as "SIGINT".
     """
 
-    def __init__(self, report: RunReport) -> None:
+    def __init__(self, report: RunReport, signal: str) -> None:
         super().__init__(report.episodes[-1].reason)
-        self.report = report
+        self.report, self.signal = report, signal
 
 
 def _ignore(beat: Beat) -> None:
@@ -197,10 +198,10 @@ def run_episodes(
     plan = dataclasses.replace(plan, port=port)
     if plan.velocity == "keyboard":
         check_terminal()
-    clock = MonotonicClock()
     robot = make_robot(
-        plan.robot, plan.transport, port, clock, plan.wire, plan.robot_settings, can_send=not plan.dry_run
-    )
+        plan.robot, plan.transport, port, MonotonicClock(), plan.wire, plan.robot_settings,
+        can_send=not plan.dry_run,
+    )  # fmt: skip
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     VigorSearch(plan.vigor, attempts)
     plan = check_plan(plan, robot.description)
@@ -210,6 +211,7 @@ def run_episodes(
     # The supervisor connects to the robot itself, so that a wrong port is known before a process is started.
     # From then on it only keeps the port, until the control process is dead.
     with (
+        _suspended_last(),
         claimed(plan) as claim,
         connected(robot),
         _open_dataset(dataset, robot.description) as store,
@@ -230,9 +232,7 @@ def run_episodes(
                     print_report(reports[-1])
                 if run.signal:
                     report = RunReport(dataset=dataset, episodes=tuple(reports))
-                    if run.signal == signal.SIGTSTP.name:
-                        suspend()
-                    raise InterruptedRunError(report)
+                    raise InterruptedRunError(report, run.signal)
                 again = _to_repeat(search, episode, reports[-1], robot.description)
                 if search.words:
                     print(f"warning: {search.words}", file=sys.stderr)
@@ -240,6 +240,17 @@ def run_episodes(
                 break
     reports[-1].raise_error()
     return RunReport(dataset=dataset, episodes=tuple(reports))
+
+
+@contextlib.contextmanager
+def _suspended_last() -> Iterator[None]:
+    """Stop for Ctrl-Z only when all is given back: a stopped program must hold neither claim nor wire."""
+    try:
+        yield
+    except InterruptedRunError as interrupted:
+        if interrupted.signal == signal.SIGTSTP.name:
+            suspend()
+        raise
 
 
 def _to_repeat(
