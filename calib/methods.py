@@ -6,19 +6,19 @@ import dataclasses
 import importlib
 from typing import cast
 
-from deal_hw.calib.problem import Problem
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import CalibrationMethod
 from deal_hw.errors import UnknownNameError
 
 METHODS: dict[str, str] = {
-    "default": "deal_hw.calib.weki:Weki",
-    "weki": "deal_hw.calib.weki:Weki",
-    "deal": "deal_hw.calib.deal:Deal",
-    "deal-paper": "deal_hw.calib.deal_paper:paper",
-    "deal-paper-literal": "deal_hw.calib.deal_paper:literal",
-    "deal-paper-fn": "deal_hw.calib.deal_paper:without_noise_adaptation",
-    "deal-paper-pn": "deal_hw.calib.deal_paper:without_normalisation",
-    "deal-paper-flat": "deal_hw.calib.deal_paper:flat",
+    "default": "deal_hw.calib.search.eki:Weki",
+    "weki": "deal_hw.calib.search.eki:Weki",
+    "deal": "deal_hw.calib.search.deal:Deal",
+    "deal-paper": "deal_hw.calib.deal_paper.algorithm1:paper",
+    "deal-paper-literal": "deal_hw.calib.deal_paper.algorithm1:literal",
+    "deal-paper-fn": "deal_hw.calib.deal_paper.algorithm1:without_noise_adaptation",
+    "deal-paper-pn": "deal_hw.calib.deal_paper.algorithm1:without_normalisation",
+    "deal-paper-flat": "deal_hw.calib.deal_paper.algorithm1:flat",
     "open-loop": "deal_hw.calib.open_loop:OpenLoop",
     "near": "deal_hw.calib.open_loop:near",
     "easi": "deal_hw.calib.baselines.easi:Easi",
@@ -68,7 +68,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
     if not polish or name in NULL_METHODS | WHOLE_METHODS:
         return search
     from deal_hw.calib.pipeline import PolishedMethod
-    from deal_hw.calib.weki import Weki
+    from deal_hw.calib.search.eki import Weki
 
     if isinstance(search, Weki):
         search = dataclasses.replace(

@@ -4,7 +4,7 @@ Three questions have no answer there that holds for every robot: how far a predi
 search that stops early or a fit that goes on predicts other motion better, and over which horizon to fit. So
 
 1. a fit from the model's own values over short windows says what residuals to expect;
-2. the ensemble search (:mod:`deal_hw.calib.weki`) is run with these;
+2. the ensemble search (:mod:`deal_hw.calib.search.eki`) is run with these;
 3. on inner folds of the recordings that are fitted, motion by motion, the search's estimate, fits over short
    and long horizons (robust or not, with a latency or none, held to the model's own values or hardly) and the
    mean of fits over all horizons predict what they have not seen;
@@ -22,17 +22,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.stats import norm
 
-from deal_hw.calib.attempts import Attempts
 from deal_hw.calib.baselines.simple import Nominal
-from deal_hw.calib.confounded import confounded
-from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.folds import Choice, fold_masks, motion_numbers, time_masks
-from deal_hw.calib.halves import FALSE_ALARMS, Halves, heed
-from deal_hw.calib.horizon import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
-from deal_hw.calib.identifiability import MISMATCH_CHI2, Uncertainty, uncertainty
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.report.inputs import HalvesRow
-from deal_hw.calib.weki import Weki
+from deal_hw.calib.data.checks import check_excitation
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
+from deal_hw.calib.search.eki import Weki
+from deal_hw.calib.search.restarts import Attempts
+from deal_hw.calib.uncertainty.correlated import confounded
+from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, uncertainty
+from deal_hw.calib.validation.cross_validation import Choice, fold_masks, motion_numbers, time_masks
+from deal_hw.calib.validation.split_half import FALSE_ALARMS, Halves, HalvesRow, heed
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,

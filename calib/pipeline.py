@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.attempts import Attempts
-from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.folds import Choice, at_estimate, choose
-from deal_hw.calib.identifiability import MISMATCH_CHI2, Z90, Uncertainty, intervals
-from deal_hw.calib.judgement import Validation, judge, unexplained
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.refine import Polished, polish
-from deal_hw.calib.robust import HEAVY_TAILS, kurtosis, robust_polish
-from deal_hw.calib.statements import statement, with_rows
+from deal_hw.calib.data.checks import check_excitation
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis, robust_polish
+from deal_hw.calib.search.restarts import Attempts
+from deal_hw.calib.uncertainty.at_fit import statement, with_rows
+from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Z90, Uncertainty, intervals
+from deal_hw.calib.validation.checks import Validation, judge, unexplained
+from deal_hw.calib.validation.cross_validation import Choice, at_estimate, choose
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,

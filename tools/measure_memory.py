@@ -28,8 +28,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
-from deal_hw.calib.problem import Problem
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.episode import align

@@ -34,12 +34,12 @@ from scipy.stats import rankdata
 from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredStepper
-from deal_hw.calib.checkpoint import State
-from deal_hw.calib.coordinates import Members
-from deal_hw.calib.fitness import FitnessSettings
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.rollouts import PopulationPolicy
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.deal_paper.fitness import FitnessSettings
+from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.checkpoint import State
+from deal_hw.calib.search.log import Run
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
@@ -273,7 +273,7 @@ def _largest_improvement(
     """
     bo = _botorch()
     torch = bo.torch
-    from deal_hw.calib.critic import torch_threads
+    from deal_hw.calib.search.critic import torch_threads
 
     x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
     # BoTorch draws its starts from torch's global generator; the fork gives the caller's back.

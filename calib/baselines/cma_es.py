@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredStepper
-from deal_hw.calib.checkpoint import State
-from deal_hw.calib.fitness import FitnessSettings
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.rollouts import PopulationPolicy
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.deal_paper.fitness import FitnessSettings
+from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.checkpoint import State
+from deal_hw.calib.search.log import Run
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray

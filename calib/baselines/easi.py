@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredStepper
-from deal_hw.calib.checkpoint import State
-from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.critic import CriticSettings
-from deal_hw.calib.fitness import FitnessSettings
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.rollouts import PopulationPolicy
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.deal_paper.fitness import FitnessSettings
+from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.checkpoint import State
+from deal_hw.calib.search.critic import CriticSettings
+from deal_hw.calib.search.log import Run
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray

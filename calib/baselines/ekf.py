@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.identifiability import Z90, intervals
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import WindowData
-from deal_hw.calib.refine import value_bounds
-from deal_hw.calib.residuals import LATENCY_STEP_S, PARAMETER_STEP, POSITION_STEP, VELOCITY_STEP
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.fit.refinement import value_bounds
+from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, POSITION_STEP, VELOCITY_STEP
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.log import Run
+from deal_hw.calib.uncertainty.intervals import Z90, intervals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

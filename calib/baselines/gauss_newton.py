@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.identifiability import uncertainty
-from deal_hw.calib.innovations import cut, is_noisy, whitened_residual
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem, WindowData
-from deal_hw.calib.refine import DAMPINGS as ALL_DAMPINGS
-from deal_hw.calib.refine import damped_step, value_bounds
-from deal_hw.calib.residuals import LATENCY_STEP_S, PARAMETER_STEP
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
+from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.fit.refinement import DAMPINGS as ALL_DAMPINGS
+from deal_hw.calib.fit.refinement import damped_step, value_bounds
+from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.log import Run
+from deal_hw.calib.uncertainty.intervals import uncertainty
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.horizon import HorizonFit, Recipe, fit_horizon
-from deal_hw.calib.identifiability import intervals
-from deal_hw.calib.innovations import explained, samples_per_tick
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem, WindowData
-from deal_hw.calib.residuals import PARAMETER_STEP
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import explained, samples_per_tick
+from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
+from deal_hw.calib.fit.residual import PARAMETER_STEP
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.log import Run
+from deal_hw.calib.uncertainty.intervals import intervals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.fitness import FitnessSettings, make_fitness
-from deal_hw.calib.innovations import explained
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.rollouts import PopulationPolicy
-from deal_hw.calib.search import Stepper
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import explained
+from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
+from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
+from deal_hw.calib.search.base import Stepper
+from deal_hw.calib.search.log import Run
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.checkpoint import State
-from deal_hw.calib.coordinates import Coordinates, Members
-from deal_hw.calib.innovations import cut, explained, whitened_residual
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import cut, explained, whitened_residual
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.checkpoint import State
+from deal_hw.calib.search.log import Run
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.baselines.least_squares import Found, OneShot, textbook_covariance
-from deal_hw.calib.coordinates import Coordinates
-from deal_hw.calib.innovations import cut
-from deal_hw.calib.outcome import Run
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.search import Search, Stepper
+from deal_hw.calib.data.coordinates import Coordinates
+from deal_hw.calib.data.innovations import cut
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.log import Run
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.sysid_adapter import Recording, check_space, identify, require_sysid
 

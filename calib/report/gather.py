@@ -6,13 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.calib.coordinates import Members
-from deal_hw.calib.halves import halves_rows
-from deal_hw.calib.innovations import whitened_residual
-from deal_hw.calib.problem import Problem, WindowData
-from deal_hw.calib.refine import samples_in
-from deal_hw.calib.report.inputs import HalvesRow, Overlay, ReportInputs, Residuals
-from deal_hw.calib.validate import HELDOUT_WINDOW_S
+from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import whitened_residual
+from deal_hw.calib.data.problem import Problem, WindowData, samples_in
+from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
+from deal_hw.calib.validation.normalised_error import HELDOUT_WINDOW_S
+from deal_hw.calib.validation.split_half import HalvesRow, halves_rows
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.episode import Episode

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from deal_hw.calib.validation.split_half import HalvesRow
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -50,26 +51,6 @@ class Residuals:
     names: tuple[str, ...]
     time_s: FloatArray
     whitened: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HalvesRow:
-    """What two halves of the data say of one parameter when each is calibrated alone.
-
-    Attributes:
-        name: The parameter.
-        first: Estimate and 90 % interval (low, high) of one half.
-        second: The same of the other half.
-    """
-
-    name: str
-    first: tuple[float, float, float]
-    second: tuple[float, float, float]
-
-    @property
-    def agree(self) -> bool:
-        """Whether the intervals overlap."""
-        return self.first[1] <= self.second[2] and self.second[1] <= self.first[2]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
-from deal_hw.calib.identifiability import MISMATCH_CHI2
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.inputs import ReportInputs
+from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2
 from deal_hw.calibration import CalibrationResult
 
 REPORT = "report.html"

@@ -43,8 +43,8 @@ def calibration_row(
     Returns:
         The row's part that concerns calibration, and the result.
     """
-    from deal_hw.calib.metrics import error_percent, log_error_x100
-    from deal_hw.calib.validate import heldout_nrmse
+    from deal_hw.calib.validation.metrics import error_percent, log_error_x100
+    from deal_hw.calib.validation.normalised_error import heldout_nrmse
 
     d = case
     result = calibrate_episodes(
@@ -96,9 +96,8 @@ def calibration_row(
 
 def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tuple[float, float | None]:
     """Return coverage90 and width90; without noise there is no bound to compare a width with."""
-    from deal_hw.calib.metrics import fisher_std, interval_score
-    from deal_hw.calib.problem import Problem
-    from deal_hw.calib.refine import samples_in
+    from deal_hw.calib.data.problem import Problem, samples_in
+    from deal_hw.calib.validation.metrics import fisher_std, interval_score
 
     if case.channel_std is None:
         inside = (result.interval[:, 0] <= case.theta) & (case.theta <= result.interval[:, 1])

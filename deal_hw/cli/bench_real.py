@@ -69,8 +69,8 @@ def split_name(recordings: Recordings, holdout: Sequence[Path]) -> str:
 
 def expected_std(work: Work, words: Sequence[str], threads: int | None) -> Callable[[str], FloatArray | None]:
     """Return what tells a method what a prediction may be off, (2 C,): as it is given, or a first fit's."""
-    from deal_hw.calib.horizon import expected_residual
-    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.data.problem import Problem
+    from deal_hw.calib.fit.output_error import expected_residual
 
     given = residual_std(words, work.robot)
     # Fitted once, before the first cell that needs it.

@@ -17,8 +17,8 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.calib.checkpoint import Checkpoint
-    from deal_hw.calib.problem import Problem
+    from deal_hw.calib.data.problem import Problem
+    from deal_hw.calib.search.checkpoint import Checkpoint
     from deal_hw.sim.overlay import Overlay
 
 CHECKPOINT = "checkpoint.npz"
@@ -43,8 +43,8 @@ def open_checkpoint(
         budget: How much it may use.
         rng: The run's generator, before it has drawn anything.
     """
-    from deal_hw.calib.checkpoint import Checkpoint
-    from deal_hw.calib.identity import run_identity
+    from deal_hw.calib.search.checkpoint import Checkpoint
+    from deal_hw.calib.search.identity import run_identity
 
     return Checkpoint(path, run_identity(problem, method, budget, rng), fresh=not resume)
 

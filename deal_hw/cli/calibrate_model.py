@@ -118,7 +118,7 @@ def prepare_model(
         config: Model and recordings.
         holdout: Recordings that only judge the result.
         narrowing: What the command line changes about the parameters.
-        std: What a prediction may be off, as in :class:`deal_hw.calib.problem.Problem`.
+        std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
         threads: Simulation threads.
         quiet: Say nothing of what was guessed and warned of.
 

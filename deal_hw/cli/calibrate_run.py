@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 TABLE_WIDTH = 100
 HELDOUT_WINDOW_S = 0.2
-"""The same as in :mod:`deal_hw.calib.validate`, which is not loaded before it is needed."""
+"""The same as in :mod:`deal_hw.calib.validation.normalised_error`, which is loaded on need."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,11 +148,11 @@ def calibrate_episodes(
     try:
         from threadpoolctl import threadpool_limits
 
-        from deal_hw.calib.excitation import check_delays
-        from deal_hw.calib.heldout import heldout_rmse
+        from deal_hw.calib.data.checks import check_delays
+        from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.methods import make_method
-        from deal_hw.calib.problem import Problem
-        from deal_hw.calib.validate import heldout_nrmse
+        from deal_hw.calib.validation.heldout import heldout_rmse
+        from deal_hw.calib.validation.normalised_error import heldout_nrmse
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
@@ -279,7 +279,7 @@ def finish(
     Raises:
         KeyboardInterrupt: Ctrl-C. It is said whether there are results; where there are, they are whole.
     """
-    from deal_hw.calib.folder import write_result
+    from deal_hw.calib.report.folder import write_result
     from deal_hw.data.files import interrupts_deferred
 
     with saying_how_to_resume(checkpoint):
@@ -309,7 +309,7 @@ def _judged(
 ) -> tuple[CalibrationResult, ReportInputs | None]:
     """Return the result with advice and provenance, and what its report shows."""
     if advise:
-        from deal_hw.calib.next_recording import next_recordings
+        from deal_hw.calib.design.next_recording import next_recordings
 
         found = next_recordings(work.robot, result, work.episodes, balance=work.balance, threads=threads)
         result = dataclasses.replace(result, advice=tuple(one.to_json() for one in found))

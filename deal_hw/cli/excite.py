@@ -27,7 +27,7 @@ from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameErr
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 
 if TYPE_CHECKING:
-    from deal_hw.calib.excitation_search import Optimum
+    from deal_hw.calib.design.excitation_search import Optimum
 
 BALANCE_S = 0.6
 GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
@@ -219,8 +219,8 @@ def _search(
     config: Excite, description: RobotDescription, balance: Callable[[], Behaviour] | None
 ) -> Optimum:
     try:
-        from deal_hw.calib.excitation_search import SearchSettings, search_excitation
-        from deal_hw.calib.experiment_design import Experiment
+        from deal_hw.calib.design.excitation_search import SearchSettings, search_excitation
+        from deal_hw.calib.design.experiment_design import Experiment
         from deal_hw.sim.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
@@ -281,7 +281,7 @@ def _plain_designs(config: Excite, balances: bool) -> dict[str, ExcitationDesign
 
 
 def _knowledge(config: Excite) -> ParameterDistribution:
-    from deal_hw.calib.experiment_design import default_knowledge
+    from deal_hw.calib.design.experiment_design import default_knowledge
 
     if config.calibration is not None:
         from deal_hw.cli.train import read_distribution

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.problem import Problem
+from deal_hw.calib.data.problem import Problem
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.episode import Episode, align

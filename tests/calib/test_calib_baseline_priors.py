@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings
 from deal_hw.calib.baselines.least_squares import LeastSquares
-from deal_hw.calib.problem import Problem
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace

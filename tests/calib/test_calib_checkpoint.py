@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from deal_hw.calib.checkpoint import Checkpoint, generator_state, pack, restore_generator, unpack
-from deal_hw.calib.identity import digest
+from deal_hw.calib.search.checkpoint import Checkpoint, generator_state, pack, restore_generator, unpack
+from deal_hw.calib.search.identity import digest
 from deal_hw.errors import ConfigurationError, DatasetError
 
 KEYS = st.text(max_size=8).filter(lambda key: key != "__array__")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.excitation import check_delays
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.refine import polish
+from deal_hw.calib.data.checks import check_delays
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import polish
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from deal_hw.calib.critic import ClippedCritic, Critic, CriticSettings, PenaltyCritic, Samples, torch_threads
+from deal_hw.calib.search.critic import (
+    ClippedCritic,
+    Critic,
+    CriticSettings,
+    PenaltyCritic,
+    Samples,
+    torch_threads,
+)
 
 
 def cloud(seed: int, mean: float, count: int = 400) -> Samples:

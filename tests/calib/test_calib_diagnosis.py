@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.diagnosis import Finding, Motion, diagnose, held_direction
-from deal_hw.calib.residuals import WindowRows
+from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.validation.diagnosis import Finding, Motion, diagnose, held_direction
 from deal_hw.types import FloatArray
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 12, 80, 0.005, 1e-4

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from numpy.linalg import inv
 
-from deal_hw.calib.advice import advise, excitation_menu, predict_menu, sentences
-from deal_hw.calib.excitation_search import SearchSettings, score, search_excitation
-from deal_hw.calib.experiment_design import (
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.design.advice import advise, excitation_menu, predict_menu, sentences
+from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
+from deal_hw.calib.design.excitation_search import SearchSettings, score, search_excitation
+from deal_hw.calib.design.experiment_design import (
     Experiment,
     MakeBehaviour,
     Prediction,
@@ -21,9 +23,7 @@ from deal_hw.calib.experiment_design import (
     default_knowledge,
     information,
 )
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.residuals import Shooting
-from deal_hw.calib.trials import Scenario, TrialRunner
+from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan

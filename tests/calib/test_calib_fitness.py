@@ -7,11 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calib.coordinates import Members
-from deal_hw.calib.critic import CriticSettings
-from deal_hw.calib.deal_paper import DealPaper, PaperSettings
-from deal_hw.calib.fitness import FITNESSES, FitnessSettings, energy_distance, make_fitness, squared_mmd
-from deal_hw.calib.problem import Problem
+from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings
+from deal_hw.calib.deal_paper.fitness import (
+    FITNESSES,
+    FitnessSettings,
+    energy_distance,
+    make_fitness,
+    squared_mmd,
+)
+from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
@@ -66,7 +72,7 @@ def test_truth_scores_best_and_far_worst(problem: Problem, name: str) -> None:
 
 def test_trajectory_is_the_logarithm_of_the_mean_square(problem: Problem) -> None:
     """Scores are minus ln of the mean squared whitened innovation, whatever generation asks."""
-    from deal_hw.calib.innovations import cut, whitened_residual
+    from deal_hw.calib.data.innovations import cut, whitened_residual
 
     fitness = make_fitness("trajectory", problem, np.random.default_rng(0), FitnessSettings(horizon_ticks=5))
     centre = Members(problem.space.center[None], np.zeros(1))
@@ -89,7 +95,7 @@ def test_flat_sees_nothing(problem: Problem) -> None:
 @pytest.mark.parametrize("name", FITNESSES)
 def test_saved_fitness_goes_on_exactly(problem: Problem, name: str) -> None:
     """After save and load into a new one, later scores are the same to the last bit."""
-    from deal_hw.calib.checkpoint import pack, unpack
+    from deal_hw.calib.search.checkpoint import pack, unpack
 
     settings = dataclasses.replace(SETTINGS, replay_generations=3)
     first = make_fitness(name, problem, np.random.default_rng(1), settings)

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.refine import polish
-from deal_hw.calib.residuals import Shooting
-from deal_hw.calib.validate import heldout_nrmse, signal_range
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.validation.normalised_error import heldout_nrmse, signal_range
 from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace

@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calib.folds import at_estimate, choose, fold_masks, prediction_error
-from deal_hw.calib.judgement import Validation, unexplained
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Polished, polish, polish_windows
+from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.fit.robust import huber_weights, kurtosis, robust_polish
 from deal_hw.calib.pipeline import PolishedMethod
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.refine import Polished, polish, polish_windows
-from deal_hw.calib.residuals import Shooting
-from deal_hw.calib.robust import huber_weights, kurtosis, robust_polish
-from deal_hw.calib.statements import with_rows
+from deal_hw.calib.uncertainty.at_fit import with_rows
+from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.validation.cross_validation import at_estimate, choose, fold_masks, prediction_error
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,

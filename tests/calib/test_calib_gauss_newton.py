@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings, Innovations, costs
-from deal_hw.calib.checkpoint import Checkpoint
-from deal_hw.calib.problem import Problem
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace

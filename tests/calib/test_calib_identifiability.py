@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.identifiability import Z90, Uncertainty, uncertainty
-from deal_hw.calib.null_space import null_space, sparse_basis
+from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, uncertainty
+from deal_hw.calib.uncertainty.null_space import null_space, sparse_basis
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
 

@@ -8,12 +8,12 @@ import functools
 import numpy as np
 import pytest
 
-from deal_hw.calib.checkpoint import Checkpoint
-from deal_hw.calib.deal import Deal
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import METHODS, NULL_METHODS, WHOLE_METHODS, check_method, make_method
 from deal_hw.calib.pipeline import PolishedMethod
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.weki import Weki
+from deal_hw.calib.search.checkpoint import Checkpoint
+from deal_hw.calib.search.deal import Deal
+from deal_hw.calib.search.eki import Weki
 from deal_hw.calibration import Budget
 from deal_hw.cli.bench_loop import demonstrate
 from deal_hw.cli.bench_tasks import Case as Demonstration

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calib.next_recording import next_recordings
+from deal_hw.calib.design.next_recording import next_recordings
 from deal_hw.calib.report.inputs import ReportInputs
 from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult

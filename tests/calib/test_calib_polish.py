@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.identifiability import correlation_time, intervals, uncertainty
-from deal_hw.calib.metrics import error_percent, interval_score, log_error_x100
-from deal_hw.calib.noise import noise_model, white_noise_std
-from deal_hw.calib.null_space import null_directions, null_space
+from deal_hw.calib.data.checks import check_excitation
+from deal_hw.calib.data.noise import noise_model, white_noise_std
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline import LatencyScan, PolishedMethod
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.refine import polish
-from deal_hw.calib.residuals import Shooting
-from deal_hw.calib.statements import NEAR
-from deal_hw.calib.validate import heldout_nrmse
+from deal_hw.calib.uncertainty.at_fit import NEAR
+from deal_hw.calib.uncertainty.intervals import correlation_time, intervals, uncertainty
+from deal_hw.calib.uncertainty.null_space import null_directions, null_space
+from deal_hw.calib.validation.metrics import error_percent, interval_score, log_error_x100
+from deal_hw.calib.validation.normalised_error import heldout_nrmse
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.bench_loop import demonstrate
 from deal_hw.cli.bench_tasks import Case as Demonstration

@@ -13,12 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.calib.folder import write_result
 from deal_hw.calib.report.charts import autocorrelation
 from deal_hw.calib.report.figure import envelope
+from deal_hw.calib.report.folder import write_result
 from deal_hw.calib.report.gather import gather
-from deal_hw.calib.report.inputs import HalvesRow, Overlay, ReportInputs, Residuals
+from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
 from deal_hw.calib.report.page import parameter_rows, render, verdict, write_report
+from deal_hw.calib.validation.split_half import HalvesRow
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError

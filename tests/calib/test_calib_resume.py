@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.calib.checkpoint import Checkpoint
-from deal_hw.calib.deal import Deal, DealSettings
-from deal_hw.calib.identity import run_identity
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
 from deal_hw.calib.pipeline import PolishedMethod
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.weki import Weki, WekiSettings
+from deal_hw.calib.search.checkpoint import Checkpoint
+from deal_hw.calib.search.deal import Deal, DealSettings
+from deal_hw.calib.search.eki import Weki, WekiSettings
+from deal_hw.calib.search.identity import run_identity
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.episode import align

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calib.coordinates import Coordinates, Members, logistic, logit
-from deal_hw.calib.innovations import explained, linearise, predict
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.rollouts import (
+from deal_hw.calib.data.coordinates import Coordinates, Members, logistic, logit
+from deal_hw.calib.data.innovations import explained, linearise, predict
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.deal_paper.rollouts import (
     TransitionScale,
     control_ticks,
     demonstration,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.identifiability import uncertainty
-from deal_hw.calib.residuals import WindowRows
-from deal_hw.calib.sandwich import clustered, eliminated
+from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.uncertainty.cluster_robust import clustered, eliminated
+from deal_hw.calib.uncertainty.intervals import uncertainty
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.calib.heldout import heldout_rmse
-from deal_hw.calib.problem import Problem
-from deal_hw.calib.visible import jumps, look, require_visible
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
+from deal_hw.calib.validation.heldout import heldout_rmse
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.compiling import load_mjcf

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.calib.excitation import check_excitation
-from deal_hw.calib.problem import Problem
+from deal_hw.calib.data.checks import check_excitation
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Verdict
 from deal_hw.cli import bench_loop
 from deal_hw.cli.bench_tasks import make_case

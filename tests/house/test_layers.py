@@ -24,6 +24,18 @@ LAYER = {
 }
 """Layer of each part; a part may import parts of lower layers and itself."""
 
+ROOMS = {
+    "calib": (
+        {"data"},
+        {"search", "fit"},
+        {"deal_paper", "uncertainty"},
+        {"validation", "design", "baselines"},
+        {"pipeline", "open_loop"},
+        {"methods", "report"},
+    ),
+}
+"""Rooms of a part, the lowest first: a room may import rooms of the sets before its own, and itself."""
+
 CONFINED = {
     "torch": {"calib", "policies"},
     "botorch": {"calib"},
@@ -110,6 +122,11 @@ def complaint(importer: str, target: str) -> str | None:
     other = part_of(target)
     if me not in LAYER or other not in LAYER:
         return f"{importer if me not in LAYER else target} stands in no layer"
+    if me == other and me in ROOMS:
+        level = {room: number for number, rooms in enumerate(ROOMS[me]) for room in rooms}
+        here, there = (name.split(".")[2] if name.count(".") > 1 else "" for name in (importer, target))
+        if here and there and here != there and not level[there] < level[here]:
+            return f"{me}/{here} imports {me}/{there}"
     same_layer = LAYER[me] == LAYER[other] and (me == other or LAYER[me] < 3)
     return None if LAYER[other] < LAYER[me] or same_layer else f"{me} imports {other}"
 

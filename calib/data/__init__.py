@@ -1,0 +1,1 @@
+"""The calibration problem: recordings, noise, smoothed states, windows."""

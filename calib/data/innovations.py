@@ -1,0 +1,205 @@
+"""Window innovations: recording minus prediction, whitened for sensor noise and for start-state error.
+
+A window restarts the simulation at a smoothed state. The error of that state enters the prediction, so each
+window's innovation has the covariance Sigma = sensor variance + J P0 J', with J the derivative of the
+prediction by the start state and P0 the uncertainty of that state. Multiplying by the inverse Cholesky factor
+of Sigma leaves unit variance where the model is right, and takes out what a wrong start state explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.problem import NOISE_FREE_STD, SMOOTHING_S, Prediction, Problem, WindowData
+from deal_hw.sim.windows import setpoints
+from deal_hw.types import FloatArray
+
+ADVANCE_S = 0.008
+"""Set-points are computed late by so much and moved back: latencies down to minus this are possible."""
+
+
+def is_noisy(problem: Problem) -> bool:
+    """Return whether what was measured carries sensor noise."""
+    return not problem.exact and bool(np.any(problem.noise_std[problem.channels] >= NOISE_FREE_STD))
+
+
+def samples_per_tick(problem: Problem) -> int:
+    """Return how many state samples one control period has."""
+    description = problem.robot.description
+    return max(round(description.state_rate_hz / description.control_rate_hz), 1)
+
+
+def cut(problem: Problem, ticks: int) -> list[WindowData]:
+    """Cut the recordings into windows of so many control periods.
+
+    Noisy recordings are used from half a smoothing width on: before that the smoother sees one side only, and
+    a start state that is off by more than it admits costs more than the window tells.
+    """
+    per_tick = samples_per_tick(problem)
+    if not is_noisy(problem):
+        return problem.windows(ticks * per_tick)
+    margin = round(0.5 * SMOOTHING_S * problem.robot.description.state_rate_hz)
+    return problem.windows(ticks * per_tick, offset=margin)
+
+
+def predict(
+    problem: Problem,
+    members: Members,
+    data: WindowData,
+    position: FloatArray | None = None,
+    velocity: FloatArray | None = None,
+) -> Prediction:
+    """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative."""
+    episode = problem.episodes[data.episode]
+    batch = problem.batch(len(members.theta))
+    batch.set_parameters(members.theta)
+    ahead = round(ADVANCE_S / episode.step_s)
+    path = setpoints(batch, episode, members.latency_s + ahead * episode.step_s)
+    path = np.concatenate([path[:, ahead:], np.repeat(path[:, -1:], ahead, axis=1)], axis=1)
+    return problem.predict_along(batch, path, data, position, velocity)
+
+
+@dataclass(frozen=True, slots=True)
+class Whitening:
+    """What whitens the windows of one episode.
+
+    Attributes:
+        reference: Prediction of the simulator around which was linearised, (W, H, M).
+        factor: Inverse Cholesky factors of Sigma, (W, H M, H M).
+        root: J sqrt(P0): what one standard deviation of each start coordinate does, (W, H M, 2 C).
+        std: Standard deviations of a start state, (2 C,).
+        offset: Start states relative to the smoothed ones around which was linearised, in units of ``std``,
+            (W, 2 C).
+    """
+
+    reference: FloatArray
+    factor: FloatArray
+    root: FloatArray
+    std: FloatArray
+    offset: FloatArray
+
+    def apply(self, difference: FloatArray) -> FloatArray:
+        """Whiten differences of channels, (N, W, H, M); returns (N, W, H M)."""
+        flat = difference.reshape(*difference.shape[:2], -1)
+        return np.asarray(np.einsum("wij,nwj->nwi", self.factor, flat, optimize=True))
+
+    def innovation(self, measured: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Whiten recording minus prediction, the latter moved to the smoothed start states, (N, W, H M).
+
+        Args:
+            measured: (W, H, M).
+            predicted: From the start states that :meth:`starts` gives, (N, W, H, M).
+        """
+        moved = np.einsum("wis,ws->wi", self.root, self.offset).reshape(measured.shape)
+        return self.apply(measured + moved - predicted)
+
+    def starts(self, data: WindowData) -> tuple[FloatArray, FloatArray]:
+        """Return the start positions and velocities around which was linearised, (W, C) each."""
+        C = data.start_position.shape[1]
+        moved = self.offset * self.std
+        return data.start_position + moved[:, :C], data.start_velocity + moved[:, C:]
+
+    def next_offset(self, measured: FloatArray) -> FloatArray:
+        """Return the most probable start states under the linearisation's simulator: the next ``offset``."""
+        whitened = self.innovation(measured, self.reference[None])[0]
+        response = np.einsum("wij,wjs->wis", self.factor, self.root)
+        found = np.einsum("wis,wi->ws", response, whitened)
+        return np.asarray(np.clip(found, -OFFSET_LIMIT, OFFSET_LIMIT))
+
+
+OFFSET_LIMIT = 3.0
+"""Start states move by so many standard deviations at most, or a wrong simulator would explain itself."""
+
+
+def linearise(
+    problem: Problem, centre: Members, data: WindowData, offset: FloatArray | None = None
+) -> Whitening:
+    """Linearise the prediction by the start states around one simulator.
+
+    Args:
+        problem: Data and simulator.
+        centre: One member, the mean of the population.
+        data: The windows.
+        offset: Start states to linearise around, in standard deviations from the smoothed ones, (W, 2 C).
+    """
+    states = problem.starts[data.episode]
+    W, C = data.start_position.shape
+    std = np.concatenate([states.position_std, states.velocity_std])
+    around = np.zeros((W, 2 * C)) if offset is None else offset
+    # Central differences at half the uncertainty: friction makes predictions kinked, and a secant of the size
+    # of the error itself says more about them than a derivative.
+    count = 1 + 4 * C
+    position = np.repeat(data.start_position[None] + around[:, :C] * std[:C], count, axis=0)
+    velocity = np.repeat(data.start_velocity[None] + around[:, C:] * std[C:], count, axis=0)
+    for s in range(2 * C):
+        state, c = (position, s) if s < C else (velocity, s - C)
+        state[1 + 2 * s, :, c] += 0.5 * std[s]
+        state[2 + 2 * s, :, c] -= 0.5 * std[s]
+    members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
+    predicted = predict(problem, members, data, position, velocity).observed
+    predicted = np.where(np.isfinite(predicted), predicted, predicted[:1])
+    flat = predicted.reshape(count, W, -1)
+    root = np.moveaxis(flat[1::2] - flat[2::2], 0, -1)
+    sigma = root @ np.swapaxes(root, 1, 2)
+    noise = data.std.reshape(W, -1) ** 2
+    diagonal = np.arange(noise.shape[1])
+    sigma[:, diagonal, diagonal] += noise
+    factor = np.linalg.inv(np.linalg.cholesky(sigma))
+    return Whitening(predicted[0], factor, root, std, around)
+
+
+def whitened_residual(
+    problem: Problem,
+    members: Members,
+    centre: Members,
+    windows: list[WindowData],
+    offsets: list[FloatArray] | None = None,
+    whitenings: Sequence[Whitening] | None = None,
+) -> FloatArray:
+    """Return recording minus prediction of every window, whitened around one simulator.
+
+    Args:
+        problem: Data and simulator.
+        members: The N simulators.
+        centre: The simulator to linearise around, such as the population's mean.
+        windows: The windows.
+        offsets: Start states to linearise around, one array for each of ``windows``; replaced by the next
+            ones to use. None for the smoothed states.
+        whitenings: Made before around the same simulator and start states, one for each of ``windows``.
+
+    Returns:
+        (N, M); not finite in rows of members that diverged.
+    """
+    parts = []
+    for i, data in enumerate(windows):
+        if problem.exact:
+            whitened = (data.measured - predict(problem, members, data).observed) / data.std
+            parts.append(whitened.reshape(len(whitened), -1))
+            continue
+        if whitenings is not None:
+            whitening = whitenings[i]
+        else:
+            whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
+        predicted = predict(problem, members, data, *whitening.starts(data)).observed
+        whitened = whitening.innovation(data.measured, predicted)
+        parts.append(whitened.reshape(len(whitened), -1))
+        if offsets is not None:
+            offsets[i] = whitening.next_offset(data.measured)
+    return np.concatenate(parts, axis=1)
+
+
+def explained(problem: Problem, centre: Members, ticks: int) -> float:
+    """Return the mean squared whitened residual of one simulator; 1 is a perfect model.
+
+    Args:
+        problem: Data and simulator.
+        centre: One member.
+        ticks: Window length in control periods.
+    """
+    windows = cut(problem, ticks)
+    chi2 = float(np.mean(whitened_residual(problem, centre, centre, windows) ** 2))
+    return chi2 if np.isfinite(chi2) else float("inf")

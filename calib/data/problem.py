@@ -1,0 +1,351 @@
+"""A calibration problem: recordings on the device's time grid, a batched simulator, and what is searched.
+
+Every method sees the data through this class, so that all of them use the same simulator, the same start
+states and the same count of simulated steps. States have C chart coordinates and as many velocities; what was
+measured of them are the M channels that predictions are compared with.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.calib.data.noise import NoiseModel, noise_model, white_noise_std
+from deal_hw.calib.data.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
+from deal_hw.calibration import LATENCY_RANGE_S
+from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.batch import BatchPool, ServoBatch
+from deal_hw.sim.episode import Episode, fill_gaps
+from deal_hw.sim.model import RobotModel
+from deal_hw.sim.parameters import SENSOR_NOISE
+from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
+from deal_hw.types import FloatArray, IntArray
+
+__all__ = [
+    "LATENCY_RANGE_S", "NOISE_FREE_STD", "SMOOTHING_S", "Prediction", "Problem", "StartStates", "WindowData",
+    "smooth_states",
+]  # fmt: skip
+
+WIRE_RESOLUTION = 1e-6
+"""Positions travel as whole micrometres and microradians."""
+
+VELOCITY_PRIOR_STD = {"m": 3.0, "rad": 30.0}
+"""Weak prior on start velocities, in m/s and rad/s: keeps windows of few samples solvable."""
+
+EXACT_STD = 1e-5
+"""What residuals are measured by where nothing is noisy [m or rad]: far above rounding, far below sensors."""
+
+SLOWEST_JITTER_S = 0.01
+"""Sampling periods above this are too long to tell a jitter of the samples' time [s]."""
+
+UNSEEN_STD = 1e-6
+"""Prior on a base's place on the floor where nobody measured it: no trajectory depends on it."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowData:
+    """Windows of one episode with their measured samples.
+
+    Attributes:
+        episode: Index of the episode.
+        windows: W windows of H samples.
+        measured: Measured channels at the predicted samples, (W, H, M).
+        std: Standard deviation of the measured channels, (W, H, M); infinite where none was reported.
+        start_position: Smoothed positions at the starts, (W, C).
+        start_velocity: Smoothed velocities at the starts, (W, C).
+        prior_mean: What is known of the start states beside what the window predicts: the measurement at the
+            start, or an estimate, or a weak guess, (W, 2 C).
+        prior_std: Standard deviation of ``prior_mean``, (W, 2 C).
+        prior_counts: Which entries of ``prior_mean`` are as good as a measurement, (2 C,).
+    """
+
+    episode: int
+    windows: Windows
+    measured: FloatArray
+    std: FloatArray
+    start_position: FloatArray
+    start_velocity: FloatArray
+    prior_mean: FloatArray
+    prior_std: FloatArray
+    prior_counts: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What N members predict of W windows of H samples; NaN where a member diverged.
+
+    Attributes:
+        observed: The measured channels, (N, W, H, M).
+        position: Chart coordinates, (N, W, H, C).
+        velocity: (N, W, H, C).
+    """
+
+    observed: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+
+
+@dataclass(slots=True)
+class Problem:
+    """Recordings, simulator and parameters.
+
+    Attributes:
+        robot: The nominal model.
+        space: What is searched.
+        episodes: The recordings to fit; short gaps are filled in and not fitted to. All measure the same
+            channels.
+        threads: Simulation threads; None for all CPUs.
+        latency_range_s: Total latencies that are searched [s].
+        fixed_latency_s: A latency that is given; None to search it.
+        known_std: Standard deviation of every entry of (position, velocity), (2 C,), where it is known or
+            chosen; None to estimate it from the recordings.
+        channels: Indices of the measured channels into (position, velocity), (M,).
+        noise_std: Noise of (position, velocity) over all speeds, (2 C,); only measured entries mean anything.
+        noise: Noise at rest and jitter of the samples' time.
+        starts: Smoothed states of each episode.
+    """
+
+    robot: RobotModel
+    space: ParameterSpace
+    episodes: Sequence[Episode]
+    threads: int | None = None
+    latency_range_s: tuple[float, float] = LATENCY_RANGE_S
+    fixed_latency_s: float | None = None
+    known_std: FloatArray | None = None
+    channels: IntArray = field(init=False)
+    noise_std: FloatArray = field(init=False)
+    noise: NoiseModel = field(init=False)
+    starts: list[StartStates] = field(init=False)
+    _batches: BatchPool = field(init=False)
+
+    def __post_init__(self) -> None:
+        robot, space, threads = self.robot, self.space, self.threads
+        self._batches = BatchPool(lambda count: ServoBatch(robot, space, count, threads))
+        low, high = (1e3 * v for v in self.latency_range_s)
+        if self.fixed_latency_s is not None and not low <= 1e3 * self.fixed_latency_s <= high:
+            raise ConfigurationError(
+                f"a latency of {1e3 * self.fixed_latency_s:g} ms: the simulator has {low:g} to {high:g} ms"
+            )
+        if not self.episodes:
+            raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
+        self.episodes = [fill_gaps(e) for e in self.episodes]
+        self.channels = self.episodes[0].channels
+        if any(not np.array_equal(e.channels, self.channels) for e in self.episodes):
+            raise ConfigurationError("the recordings measure different channels; calibrate them one by one")
+        floor = float(WIRE_RESOLUTION / np.sqrt(12.0))
+        self.noise_std = self._white_noise(floor)
+        rotation = self.robot.rotation
+        self.starts = [smooth_states(e, self.noise_std, rotation) for e in self.episodes]
+        self.noise = self._noise_model(floor)
+
+    def _white_noise(self, floor: float) -> FloatArray:
+        if self.known_std is not None:
+            if self.known_std.shape != (2 * self.coordinates,):
+                raise ConfigurationError(
+                    f"known_std has shape {self.known_std.shape}, expected ({2 * self.coordinates},): "
+                    "positions, then velocities"
+                )
+            return np.maximum(self.known_std, floor)
+        if self.exact:
+            return np.full(2 * self.coordinates, EXACT_STD)
+        found = np.full(2 * self.coordinates, floor)
+        for e in self.episodes:
+            values = np.concatenate([e.position, e.velocity], axis=1)[:, self.channels]
+            found[self.channels] = np.maximum(found[self.channels], white_noise_std(values, floor))
+        return self._with_given_noise(found, np.arange(2 * self.coordinates))
+
+    def _noise_model(self, floor: float) -> NoiseModel:
+        # At a low sample rate what is left of the motion itself grows with speed like a jitter's noise does.
+        slow = self.episodes[0].period_s > SLOWEST_JITTER_S
+        if self.known_std is not None or self.exact or slow:
+            return NoiseModel(self.noise_std[self.channels], 0.0)
+        C, rotation = self.coordinates, self.robot.rotation
+        # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.
+        timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
+        columns = self.channels[timed]
+        positions = [e.position[:, columns] for e in self.episodes]
+        moved = noise_model(positions, [s.velocity[:, columns] for s in self.starts], floor)
+        std = self.noise_std[self.channels]
+        std[timed] = moved.position_std
+        return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
+
+    def _with_given_noise(self, std: FloatArray, channels: IntArray) -> FloatArray:
+        """Return standard deviations, (M,), with the known ones of sensors in their place."""
+        joints = self.robot.description.joint_names
+        first = self.coordinates - len(joints)
+        given = {
+            first + joints.index(name): p.nominal
+            for p in self.space.parameters
+            if p.kind == SENSOR_NOISE
+            for name in p.elements
+        }
+        return np.array([given.get(int(c), s) for c, s in zip(channels, std, strict=True)])
+
+    @property
+    def steps(self) -> int:
+        """Physics steps simulated so far."""
+        return self._batches.steps
+
+    def part(self, chosen: Sequence[npt.NDArray[np.bool_]]) -> Problem:
+        """Return the problem with only these samples of each recording usable.
+
+        Noise, smoothed states and simulators are shared, so nothing is estimated anew.
+
+        Args:
+            chosen: One mask a recording, (T,).
+        """
+        other = copy.copy(self)
+        other.episodes = [
+            dataclasses.replace(e, usable=e.usable & mask)
+            for e, mask in zip(self.episodes, chosen, strict=True)
+        ]
+        return other
+
+    @property
+    def exact(self) -> bool:
+        """Whether all states are known without error, so that windows need not fit where they start."""
+        return all(e.exact for e in self.episodes)
+
+    @property
+    def coordinates(self) -> int:
+        """Chart coordinates C of a state."""
+        return int(self.episodes[0].position.shape[1])
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the measured channels, (M,)."""
+        names = self.robot.coordinates
+        every = (*names, *(f"{name}.velocity" for name in names))
+        return tuple(every[c] for c in self.channels)
+
+    def batch(self, count: int) -> ServoBatch:
+        """Return the simulator of ``count`` members, kept while it is among the last used sizes."""
+        return self._batches.get(count)
+
+    def measured(self, index: int) -> FloatArray:
+        """Return the measured channels of an episode, (T, M)."""
+        episode = self.episodes[index]
+        return np.concatenate([episode.position, episode.velocity], axis=1)[:, self.channels]
+
+    def channel_speed(self, index: int) -> FloatArray:
+        """Return how fast each measured channel changes, (T, M); 0 for velocities."""
+        moved = self.starts[index].velocity
+        return np.concatenate([moved, np.zeros_like(moved)], axis=1)[:, self.channels]
+
+    def windows(self, length: int, hop: int | None = None, offset: int = 0) -> list[WindowData]:
+        """Cut all episodes into windows of ``length`` samples.
+
+        Args:
+            length: Samples predicted in each window, H.
+            hop: Samples from start to start; H by default.
+            offset: First sample that may start a window.
+
+        Raises:
+            InsufficientDataError: No episode holds a window.
+        """
+        found: list[WindowData] = []
+        problem = ""
+        for index, episode in enumerate(self.episodes):
+            try:
+                windows = cut_windows(episode, length, hop, offset)
+            except InsufficientDataError as err:
+                problem = str(err)
+                continue
+            starts = self.starts[index]
+            std = self.noise.std(self.channel_speed(index))
+            if episode.reported is not None:
+                std = np.where(episode.reported[:, None], std, np.inf)
+            mean, spread, counts = self._prior(index, std)
+            found.append(
+                WindowData(
+                    episode=index,
+                    windows=windows,
+                    measured=self.measured(index)[windows.samples()],
+                    std=std[windows.samples()],
+                    start_position=starts.position[windows.start],
+                    start_velocity=starts.velocity[windows.start],
+                    prior_mean=mean[windows.start],
+                    prior_std=spread[windows.start],
+                    prior_counts=counts,
+                )
+            )
+        if not found:
+            raise InsufficientDataError(problem)
+        return found
+
+    def _prior(
+        self, index: int, std: FloatArray
+    ) -> tuple[FloatArray, FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+        """Return what is known of each state without prediction: mean and std, (T, 2 C), and what counts."""
+        episode, C = self.episodes[index], self.coordinates
+        T = len(episode.sample)
+        weak = np.array([VELOCITY_PRIOR_STD[unit] for unit in self.robot.coordinate_units])
+        # The weak prior on velocities is centred on zero; it only guards the inverse.
+        mean = np.concatenate([episode.position, np.zeros((T, C))], axis=1)
+        spread = np.concatenate([np.full((T, C), UNSEEN_STD), np.repeat(weak[None], T, axis=0)], axis=1)
+        counts = np.concatenate([np.ones(C, dtype=bool), np.zeros(C, dtype=bool)])
+        if episode.estimate_std is not None:
+            estimate = np.broadcast_to(episode.estimate_std, (T, 2 * C))
+            known = np.isfinite(estimate).all(axis=0)
+            states = np.concatenate([episode.position, episode.velocity], axis=1)
+            mean[:, known], spread[:, known] = states[:, known], estimate[:, known]
+            counts |= known
+        mean[:, self.channels], spread[:, self.channels] = self.measured(index), std
+        counts[self.channels] = True
+        return mean, spread, counts
+
+    def predict(
+        self,
+        theta: FloatArray,
+        latency_s: FloatArray,
+        data: WindowData,
+        position: FloatArray | None = None,
+        velocity: FloatArray | None = None,
+    ) -> Prediction:
+        """Predict windows with N parameter vectors.
+
+        Args:
+            theta: Physical values, (N, K).
+            latency_s: Total latency of each member, (N,) [s].
+            data: The windows.
+            position: Start positions, (W, C) or (N, W, C); the smoothed ones by default.
+            velocity: Start velocities, likewise.
+        """
+        batch = self.batch(len(theta))
+        batch.set_parameters(theta)
+        path = setpoints(batch, self.episodes[data.episode], latency_s)
+        return self.predict_along(batch, path, data, position, velocity)
+
+    def predict_along(
+        self,
+        batch: ServoBatch,
+        path: FloatArray,
+        data: WindowData,
+        position: FloatArray | None = None,
+        velocity: FloatArray | None = None,
+    ) -> Prediction:
+        """Predict windows with members whose parameters are set, along given set-points, (N, S, A)."""
+        x, v = predict_windows(
+            batch,
+            self.episodes[data.episode],
+            data.windows,
+            data.start_position if position is None else position,
+            data.start_velocity if velocity is None else velocity,
+            path,
+        )
+        C, channels = x.shape[-1], self.channels
+        if np.array_equal(channels, np.arange(C)):
+            return Prediction(x, x, v)
+        positions, velocities = x[..., channels[channels < C]], v[..., channels[channels >= C] - C]
+        return Prediction(np.concatenate([positions, velocities], axis=-1), x, v)
+
+
+def samples_in(problem: Problem, seconds: float) -> int:
+    """Return how many samples a time holds, at least 4 and at most the longest usable episode."""
+    return max(round(seconds / problem.episodes[0].period_s), 4)

@@ -1,0 +1,1 @@
+"""DEAL as published, line by line."""

@@ -1,0 +1,288 @@
+"""Fitness: one number a member, higher is better, for the searches that take no more than that.
+
+A search asks a table for a fitness by name and does not know what it measures. Numbers of different
+generations compare for all but the critic, which goes on learning.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.distance import cdist, pdist
+
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import Whitening, cut, linearise, whitened_residual
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.deal_paper.rollouts import (
+    PopulationPolicy,
+    TransitionScale,
+    control_ticks,
+    demonstration,
+    rollout_population,
+    transitions,
+)
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.search.critic import CriticSettings
+
+Samples = npt.NDArray[np.float32]
+
+FITNESSES: dict[str, str] = {
+    "critic": "deal_hw.calib.deal_paper.critic_fitness:CriticFitness",
+    "trajectory": "deal_hw.calib.deal_paper.fitness:TrajectoryFitness",
+    "energy": "deal_hw.calib.deal_paper.fitness:EnergyFitness",
+    "mmd": "deal_hw.calib.deal_paper.fitness:KernelFitness",
+    "flat": "deal_hw.calib.deal_paper.fitness:FlatFitness",
+}
+"""Name -> ``module:class``, imported on use: only the critic needs torch. ``flat`` is the null row."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitnessSettings:
+    """Settings of a fitness; each kind reads its own.
+
+    Attributes:
+        horizon_ticks: Window length of `trajectory` in control periods.
+        ticks: Most transitions of a rollout (the DEAL paper's Table 4: 200); `critic`, `energy`, `mmd`.
+        bandwidth: Width of `mmd`'s kernel in standardised units; None for the median distance between the
+            recording's transitions.
+        critic: Size and training of the critic; None for the paper's.
+        replay_generations: How many generations' rollouts the critic is trained against, None for all.
+        torch_threads: Threads of the critic's arithmetic.
+    """
+
+    horizon_ticks: int = 10
+    ticks: int = 200
+    bandwidth: float | None = None
+    critic: CriticSettings | None = None
+    replay_generations: int | None = 1
+    torch_threads: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("horizon_ticks", "ticks", "torch_threads"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.replay_generations is not None and self.replay_generations < 1:
+            raise ConfigurationError(
+                f"replay_generations must be at least 1 or None, got {self.replay_generations}"
+            )
+        if self.bandwidth is not None and not self.bandwidth > 0:
+            raise ConfigurationError(f"the bandwidth must be above 0 or None, got {self.bandwidth:g}")
+
+
+class Fitness(Protocol):
+    """What a search is told of its members.
+
+    Attributes:
+        values: What the last call of `score` found besides, for the trace.
+    """
+
+    values: dict[str, float]
+
+    def score(self, members: Members) -> FloatArray:
+        """Return one number a member, (N,): higher is better, -inf where the simulation diverged."""
+
+    def save(self) -> dict[str, Any]:
+        """Return what later scores depend on: arrays and plain values."""
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`save` returned."""
+
+
+def make_fitness(
+    name: str,
+    problem: Problem,
+    rng: np.random.Generator,
+    settings: FitnessSettings | None = None,
+    policy: PopulationPolicy | None = None,
+) -> Fitness:
+    """Return a new fitness.
+
+    Args:
+        name: A name in `FITNESSES`.
+        problem: Data and simulator.
+        rng: Seeds the critic; the others draw nothing from it.
+        settings: How to score.
+        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
+
+    Raises:
+        UnknownNameError: The name is not in the table.
+        InsufficientDataError: The recording is too short for it.
+    """
+    if name not in FITNESSES:
+        raise UnknownNameError("fitness", name, FITNESSES)
+    module, _, attribute = FITNESSES[name].partition(":")
+    made: Fitness = getattr(importlib.import_module(module), attribute)(
+        problem, settings or FitnessSettings(), policy, rng
+    )
+    return made
+
+
+class Stateless:
+    """A fitness that learns nothing, so there is nothing to save.
+
+    Args:
+        problem: Data and simulator.
+        settings: How to score.
+        policy: pi_0 to run in the loop.
+        rng: Not drawn from.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        settings: FitnessSettings,
+        policy: PopulationPolicy | None,
+        rng: np.random.Generator,
+    ) -> None:
+        self._problem, self._settings = problem, settings
+        self.values: dict[str, float] = {}
+        self._prepare(policy, rng)
+
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        """Make what scoring needs."""
+
+    def save(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Do nothing."""
+
+
+class FlatFitness(Stateless):
+    """The same number for every member: a search that cannot see the data."""
+
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        # The critic's seed, which nobody reads: search and null row then see the same random numbers.
+        rng.integers(2**62)
+
+    def score(self, members: Members) -> FloatArray:
+        """See :meth:`Fitness.score`."""
+        return np.zeros(len(members.theta))
+
+
+class TrajectoryFitness(Stateless):
+    """Prediction error at a horizon: minus the logarithm of the mean squared whitened window innovation.
+
+    The logarithm, because errors of far members span many decades: a softmax of the errors themselves would
+    see nothing among the good ones. The metric is that of the range's centre for all members and
+    generations, or scores would not compare.
+    """
+
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        self._windows = cut(self._problem, self._settings.horizon_ticks)
+        coordinates = Coordinates(self._problem)
+        self._centre = coordinates.members(np.full((1, coordinates.count), 0.5))
+        # Made on first use and kept: a small population's call costs less than its metric.
+        self._whitenings: list[Whitening] | None = None
+
+    def score(self, members: Members) -> FloatArray:
+        """See :meth:`Fitness.score`."""
+        if self._whitenings is None:
+            self._whitenings = [linearise(self._problem, self._centre, data) for data in self._windows]
+        residual = whitened_residual(
+            self._problem, members, self._centre, self._windows, whitenings=self._whitenings
+        )
+        with np.errstate(over="ignore"):
+            error = np.mean(residual**2, axis=1)
+        return np.where(np.isfinite(error), -np.log(np.maximum(error, 1e-300)), -np.inf)
+
+
+class RolloutView:
+    """Transitions (s, a, s' - s) of the recording and of rollouts, standardised by the recording's.
+
+    Args:
+        problem: Data and simulator.
+        ticks: Most transitions of a rollout of one episode.
+        policy: pi_0 to run in the loop; None replays its recorded actions.
+    """
+
+    def __init__(self, problem: Problem, ticks: int, policy: PopulationPolicy | None) -> None:
+        self._problem, self._policy = problem, policy
+        self._ticks = [control_ticks(problem, index, ticks) for index in range(len(problem.episodes))]
+        raw = np.concatenate([demonstration(problem, i, ticks) for i, ticks in enumerate(self._ticks)])
+        self._scale = TransitionScale.of(raw.astype(np.float64))
+        self.real: Samples = self._scale.apply(raw)
+        """The recording's transitions, (n, inputs)."""
+
+    def rollouts(self, members: Members) -> tuple[Samples, npt.NDArray[np.bool_]]:
+        """Return each member's transitions, (N, n, inputs), and which members did not diverge, (N,)."""
+        blocks = []
+        for index, ticks in enumerate(self._ticks):
+            moved = rollout_population(self._problem, members, index, ticks, self._policy)
+            blocks.append(transitions(*moved))
+        raw = blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
+        usable = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
+        return self._scale.apply(raw), usable
+
+
+class EnergyFitness(Stateless):
+    """Minus the energy distance between the recording's transitions and the member's own."""
+
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        self._view = RolloutView(self._problem, self._settings.ticks, policy)
+        self._real = self._view.real.astype(np.float64)
+
+    def score(self, members: Members) -> FloatArray:
+        """See :meth:`Fitness.score`."""
+        rollouts, usable = self._view.rollouts(members)
+        found = np.full(len(rollouts), -np.inf)
+        for i in np.flatnonzero(usable):
+            found[i] = -self._distance(rollouts[i].astype(np.float64))
+        return found
+
+    def _distance(self, samples: FloatArray) -> float:
+        return energy_distance(self._real, samples)
+
+
+class KernelFitness(EnergyFitness):
+    """Minus the squared maximum mean discrepancy (Gaussian kernel) between the same transitions."""
+
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        super()._prepare(policy, rng)
+        self._bandwidth = self._settings.bandwidth or float(np.median(pdist(self._real)))
+
+    def _distance(self, samples: FloatArray) -> float:
+        return squared_mmd(self._real, samples, self._bandwidth)
+
+
+def energy_distance(x: FloatArray, y: FloatArray) -> float:
+    """Return the energy distance 2 E|x - y| - E|x - x'| - E|y - y'| of two samples (Szekely and Rizzo 2013).
+
+    Args:
+        x: (n, d).
+        y: (m, d).
+
+    Returns:
+        At least 0; expectations run over all pairs, a sample with itself included.
+    """
+    between = float(cdist(x, y).mean())
+    # pdist holds each pair once and not the zeros on the diagonal.
+    within = sum(2.0 * float(pdist(z).sum()) / len(z) ** 2 for z in (x, y))
+    return max(2.0 * between - within, 0.0)
+
+
+def squared_mmd(x: FloatArray, y: FloatArray, bandwidth: float) -> float:
+    """Return the squared maximum mean discrepancy of two samples (Gretton et al. 2012, eq. 5).
+
+    Args:
+        x: (n, d).
+        y: (m, d).
+        bandwidth: h of the kernel exp(-|x - y|^2 / (2 h^2)).
+
+    Returns:
+        At least 0; the biased estimate, over all pairs.
+    """
+
+    def mean(a: FloatArray, b: FloatArray) -> float:
+        return float(np.exp(cdist(a, b, "sqeuclidean") / (-2.0 * bandwidth**2)).mean())
+
+    return max(mean(x, x) + mean(y, y) - 2.0 * mean(x, y), 0.0)

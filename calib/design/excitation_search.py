@@ -1,0 +1,276 @@
+"""The most telling excitation inside the limits: random designs, then one coordinate at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from deal_hw.calib.design.experiment_design import Experiment, MakeBehaviour, Prediction
+from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.excitation_plan import (
+    FAMILIES,
+    ExcitationBehaviour,
+    ExcitationDesign,
+    ExcitationPlan,
+    Family,
+    largest_factor,
+    make_plan,
+)
+from deal_hw.description import RobotDescription
+from deal_hw.errors import CalibrationError, ConfigurationError
+
+Criterion = Literal["determinant", "mean"]
+LOWEST_EFFORT = 0.08
+"""Least factor on the effort limit that is tried: below it joints hardly move against their friction."""
+
+TOP_HZ = 8.0
+TICKS_A_CYCLE = 6.0
+"""The greatest frequency has at least so many commands a cycle."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchSettings:
+    """How thoroughly excitations are searched."""
+
+    candidates: int = 40
+    """Random designs."""
+    finalists: int = 4
+    """Designs that are kept; one that is worse than all of these is given up as soon as that is sure."""
+    rounds: int = 24
+    """Changes of one coordinate that are tried on the best."""
+    confirmed: int = 6
+    """Designs that are tried again on the members of the confirmation, where there is one."""
+    criterion: Criterion = "determinant"
+    """determinant: most information in all (D-optimal); mean: least mean standard deviation (A-optimal)."""
+
+    def __post_init__(self) -> None:
+        if self.candidates < 1 or self.finalists < 1 or self.rounds < 0 or self.confirmed < 1:
+            raise ConfigurationError(f"not a usable search for an excitation: {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """What the search found.
+
+    Attributes:
+        design: The best design.
+        plan: Its plan, with the predicted standard deviations in it.
+        prediction: What it tells, on all members.
+        references: What other excitations tell, on the same members, by name.
+        tried: Designs tried.
+        tripped: Those that were discarded, by reason.
+        trace: The best score, at first and after each change of a coordinate.
+    """
+
+    design: ExcitationDesign
+    plan: ExcitationPlan
+    prediction: Prediction
+    references: Mapping[str, Prediction]
+    tried: int
+    tripped: Mapping[str, int]
+    trace: tuple[float, ...]
+
+
+@dataclass(slots=True)
+class _Count:
+    tried: int = 0
+    tripped: dict[str, int] = field(default_factory=dict)
+
+    def note(self, prediction: Prediction) -> None:
+        self.tried += 1
+        if prediction.tripped:
+            self.tripped[prediction.tripped] = self.tripped.get(prediction.tripped, 0) + 1
+
+
+def search_excitation(
+    experiment: Experiment,
+    rng: np.random.Generator,
+    settings: SearchSettings | None = None,
+    *,
+    balance: Callable[[], Behaviour] | None = None,
+    references: Mapping[str, MakeBehaviour] | None = None,
+    confirmation: Experiment | None = None,
+    notify: Callable[[int, int, str], None] | None = None,
+) -> Optimum:
+    """Search the most telling excitation that keeps every member inside the limits.
+
+    Args:
+        experiment: Predicts what a candidate tells.
+        rng: Draws the candidates.
+        settings: How thoroughly.
+        balance: Makes what balances at first; None for robots that stand by themselves.
+        references: Other excitations to compare with.
+        confirmation: The same experiment on other members, and more of them: the best designs are tried on
+            these, too, the one that is best there is returned, with what it tells there. Without it a search
+            on few members finds what suits those few.
+        notify: Called with candidates done, candidates expected and a short line.
+
+    Raises:
+        CalibrationError: No candidate keeps the limits.
+    """
+    wanted = settings or SearchSettings()
+    description = experiment.robot.description
+    count = _Count()
+    designs = usual_designs(description, experiment.seconds, balance is not None)
+    designs += [
+        _draw(description, experiment.seconds, balance is not None, rng) for _ in range(wanted.candidates)
+    ]
+    total = len(designs) + wanted.rounds + (wanted.confirmed if confirmation is not None else 0)
+
+    def predict(design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment) -> Prediction:
+        plan = make_plan(description, design)
+        found = on.predict(
+            lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None),
+            lambda bound: score(bound, wanted) > bar,
+        )
+        count.note(found)
+        if notify is not None:
+            outcome = "less than others" if found.beaten else found.tripped or f"{found.gain:.1f} nats"
+            notify(count.tried, total, f"{design.family}: {outcome}")
+        return found
+
+    finals: list[tuple[Prediction, ExcitationDesign]] = []
+    for design in designs:
+        full = len(finals) >= wanted.finalists
+        found = predict(design, score(finals[-1][0], wanted) if full else -np.inf)
+        if found.usable:
+            finals = sorted([*finals, (found, design)], key=lambda pair: -score(pair[0], wanted))
+            finals = finals[: wanted.finalists]
+    if not finals:
+        reasons = ", ".join(f"{n} x {why}" for why, n in count.tripped.items())
+        raise CalibrationError(
+            f"none of {count.tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
+            "draw from narrower ranges (--xi, --calibration), or try more (--candidates)"
+        )
+    best, design = finals[0]
+    trace = [score(best, wanted)]
+    steps = [(best, design)]
+    for k in range(wanted.rounds):
+        moved = _moved(description, design, k, balance is not None, rng)
+        found = predict(moved, score(best, wanted))
+        if score(found, wanted) > score(best, wanted):
+            best, design = found, moved
+            steps.append((best, design))
+        trace.append(score(best, wanted))
+    if confirmation is not None:
+        # Half of them along the way that the best came, half the other finalists.
+        chosen = steps[::-1][: (wanted.confirmed + 1) // 2]
+        there = [d for _, d in chosen]
+        chosen += [pair for pair in finals if pair[1] not in there][: wanted.confirmed - len(chosen)]
+        again = [(predict(d, on=confirmation), d) for _, d in chosen]
+        best, design = max(again, key=lambda pair: score(pair[0], wanted))
+        if not best.usable:
+            raise CalibrationError(
+                f"what suits {len(experiment.scenario)} draws of {description.name!r} trips on one of "
+                f"{len(confirmation.scenario)} others ({best.tripped}); give narrower ranges (--xi, "
+                "--calibration) or more draws (--draws)"
+            )
+    judge = experiment if confirmation is None else confirmation
+    plan = make_plan(description, design)
+    predicted = dict(zip(experiment.space.names, map(float, best.std), strict=True))
+    return Optimum(
+        design=design,
+        plan=dataclasses.replace(plan, predicted=predicted),
+        prediction=best,
+        references={name: judge.predict(make) for name, make in (references or {}).items()},
+        tried=count.tried,
+        tripped=count.tripped,
+        trace=tuple(trace),
+    )
+
+
+def score(prediction: Prediction, settings: SearchSettings) -> float:
+    """Return what the search maximises; minus infinity for what is not usable."""
+    if not prediction.usable:
+        return -np.inf
+    return prediction.gain if settings.criterion == "determinant" else -float(np.mean(prediction.std))
+
+
+def usual_designs(description: RobotDescription, seconds: float, balances: bool) -> list[ExcitationDesign]:
+    """Return designs that are known to be fair, such as the profile `rich`: the search starts from these."""
+    effort, speed = _factor_ranges(description)
+    low, fast = max(0.15, effort[0]), min(2.5, speed[1])
+    top = _top_hz(description)
+    fair: tuple[tuple[Family, float], ...] = (("steps", 0.5), ("multisine", 1.0), ("chirp", 1.0))
+    return [
+        ExcitationDesign(
+            family=family, seconds=seconds, amplitude=amplitude, high_hz=min(4.0, top), low_hz=0.3,
+            balance_s=min(0.6, 0.25 * seconds) if balances else 0.0, effort=(1.0, low), speed=(1.0, fast),
+        )
+        for family, amplitude in fair
+    ]  # fmt: skip
+
+
+def _top_hz(description: RobotDescription) -> float:
+    return min(TOP_HZ, description.control_rate_hz / TICKS_A_CYCLE)
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(max(high, low)))))
+
+
+def _draw(
+    description: RobotDescription, seconds: float, balances: bool, rng: np.random.Generator
+) -> ExcitationDesign:
+    shortest = _log_uniform(rng, 0.06, 0.25)
+    top = _top_hz(description)
+    effort, speed = _factor_ranges(description)
+    return ExcitationDesign(
+        family=FAMILIES[int(rng.integers(len(FAMILIES)))],
+        seconds=seconds,
+        amplitude=float(rng.uniform(0.25, 1.0)),
+        low_hz=_log_uniform(rng, 0.2, 1.0),
+        high_hz=_log_uniform(rng, 0.25 * top, top),
+        tilt=float(rng.choice((0.0, 0.5, 1.0))),
+        law="log" if rng.random() < 0.5 else "linear",
+        arrangement="staggered" if rng.random() < 0.5 else "one-by-one",
+        hold_s=(shortest, shortest * float(rng.uniform(1.2, 4.0))),
+        balance_s=float(rng.choice((0.2, 0.4, 0.6))) if balances else 0.0,
+        split=float(rng.choice((0.35, 0.5, 0.65))),
+        effort=(1.0, _log_uniform(rng, *effort) if rng.random() < 0.75 else 1.0),
+        speed=(1.0, _log_uniform(rng, *speed) if rng.random() < 0.75 else 1.0),
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def _factor_ranges(description: RobotDescription) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of factors on effort and speed limits; 1 to 1 where there is no such limit."""
+    limits = description.limits
+    effort, speed = (LOWEST_EFFORT, 1.0), (1.0, 1.0)
+    if description.actuation != "position" or not np.isfinite(description.effort_limit).all():
+        effort = (1.0, 1.0)
+    if np.isfinite(description.speed_limit).all():
+        speed = (0.4, largest_factor(description.speed_limit, limits.speed))
+    return effort, speed
+
+
+def _moved(
+    description: RobotDescription, design: ExcitationDesign, k: int, balances: bool, rng: np.random.Generator
+) -> ExcitationDesign:
+    """Return the design with one coordinate changed: the k-th, round and round."""
+    top = _top_hz(description)
+    factor = float(np.exp(rng.choice((-1.0, 1.0)) * rng.uniform(0.15, 0.6)))
+    effort, speed = _factor_ranges(description)
+    high = float(np.clip(design.high_hz * factor, 0.5, top))
+    other = _draw(description, design.seconds, balances, rng)
+    band = {"high_hz": high, "low_hz": float(np.clip(design.low_hz * factor, 0.1, 0.8 * design.high_hz))}
+    own: dict[str, list[dict[str, object]]] = {
+        "steps": [{"hold_s": tuple(s * factor for s in design.hold_s)}, {"hold_s": other.hold_s}],
+        "chirp": [{"high_hz": high}, {"low_hz": band["low_hz"]}, {"law": other.law}],
+        "multisine": [{"high_hz": high}, {"low_hz": band["low_hz"]}, {"tilt": other.tilt}],
+    }
+    moves: list[dict[str, object]] = [
+        {"amplitude": float(np.clip(design.amplitude * factor, 0.05, 1.0))},
+        {"seed": other.seed},
+        {"effort": (1.0, float(np.clip(design.effort[1] * factor, *effort)))},
+        own[design.family][int(rng.integers(len(own[design.family])))],
+        {"speed": (1.0, float(np.clip(design.speed[1] * factor, *speed)))},
+        {"split": float(np.clip(design.split + rng.uniform(-0.2, 0.2), 0.2, 0.8))},
+        {"seed": other.seed},
+        {"balance_s": other.balance_s},
+    ]
+    return dataclasses.replace(design, **moves[k % len(moves)])  # type: ignore[arg-type]

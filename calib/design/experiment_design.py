@@ -1,0 +1,275 @@
+"""How much a recording will tell before it is made: Fisher information of an excitation, and the best one.
+
+A candidate is run on simulated members drawn from what is known of the parameters, and the normal equations
+of multiple shooting (:class:`~deal_hw.calib.fit.residual.Shooting`) at the members' own parameters are its
+information: the same windows, sensor noise, unknown start states and latency as the calibration itself has.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.data.problem import LATENCY_RANGE_S, Problem, samples_in
+from deal_hw.calib.design.closed_loop import Scenario, Trial, TrialRunner
+from deal_hw.calib.fit.residual import Shooting
+from deal_hw.control.behaviours import Behaviour
+from deal_hw.description import RobotDescription
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.sim.model import RobotModel
+from deal_hw.types import FloatArray
+
+MakeBehaviour = Callable[[], Behaviour]
+"""Makes one behaviour; every member has its own."""
+
+WINDOW_S = 0.8
+"""Window length of the information: the longest that the polish uses."""
+
+START_STD = 5.0
+"""Start positions vary by so many standard deviations of the sensor."""
+
+INNER = (0.1, 0.9)
+"""Without a calibration members are drawn from this part of each range: its corners are no real robots."""
+
+DRAWS_PER_MEMBER = 8
+"""So many draws are tried for each member that can be run at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What an excitation is predicted to tell.
+
+    Attributes:
+        std: Standard deviation of each parameter in its own scale, root mean square over members, (K,).
+        gain: Information over what is known before [nats], from the members' mean covariance.
+        tripped: Why a member would have been stopped, or why nothing can be predicted; "" where all is well.
+        clipped: Commands that the safety filter changed, over all members.
+        beaten: Whether it was given up because others tell more.
+    """
+
+    std: FloatArray
+    gain: float
+    tripped: str = ""
+    clipped: int = 0
+    beaten: bool = False
+
+    @property
+    def usable(self) -> bool:
+        """Whether all members ran to the end, and were all looked at."""
+        return not self.tripped and not self.beaten
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is known before the recording.
+
+    Attributes:
+        information: Of parameters in their own scale and latency [s], (K + 1, K + 1).
+    """
+
+    information: FloatArray
+
+    @classmethod
+    def of(cls, known: ParameterDistribution) -> Prior:
+        """Return a distribution's: Gaussian, or as wide as the ranges."""
+        space, K = known.space, len(known.space)
+        information = np.zeros((K + 1, K + 1))
+        flat = np.diag(12.0 / space.width**2)
+        if known.covariance is None:
+            information[:K, :K] = flat
+        else:
+            # The range bounds what the covariance leaves open, and keeps an exact one invertible.
+            information[:K, :K] = np.linalg.inv(known.covariance + 1e-12 * np.eye(K))
+        low, high = known.latency_s
+        information[K, K] = 12.0 / max(high - low, 1e-4) ** 2
+        return cls(information)
+
+    def posterior(self, hessian: FloatArray) -> FloatArray:
+        """Return the covariance of the parameters after data of this information, (K, K).
+
+        Args:
+            hessian: Information of parameters and latency, (K + 1, K + 1).
+        """
+        return np.asarray(np.linalg.inv(self.information + hessian)[:-1, :-1])
+
+    def gain(self, covariance: FloatArray) -> float:
+        """Return half the log ratio of determinants before and after [nats], for a covariance after, (K, K).
+
+        The D-optimal criterion. Directions that the data cannot see add nothing to it, so it needs no choice
+        of an identifiable subspace.
+        """
+        before = np.linalg.inv(self.information)[:-1, :-1]
+        return float(0.5 * (np.linalg.slogdet(before)[1] - np.linalg.slogdet(covariance)[1]))
+
+
+def information(
+    robot: RobotModel,
+    space: ParameterSpace,
+    trial: Trial,
+    theta: FloatArray,
+    latency_s: float,
+    *,
+    window_s: float = WINDOW_S,
+    threads: int | None = None,
+) -> FloatArray:
+    """Return the Fisher information of a recording with the nominal sensor's noise, start states eliminated.
+
+    Args:
+        robot: The nominal model.
+        space: The parameters.
+        trial: The recording without noise.
+        theta: The parameters that made it, (K,).
+        latency_s: The latency that made it [s].
+        window_s: Length of the windows [s].
+        threads: Simulation threads.
+
+    Returns:
+        Of parameters in their own scale and latency [s], (K + 1, K + 1).
+    """
+    J = len(robot.description.joint_names)
+    std = np.concatenate([robot.description.sensor.position_std, np.ones(J)])
+    problem = Problem(robot, space, [trial.episode], threads=threads, known_std=std)
+    shooting = Shooting(problem, samples_in(problem, window_s))
+    states = [(trial.episode.position, trial.episode.velocity)]
+    return shooting.normal(shooting.start(theta, latency_s, states)).hessian
+
+
+class Experiment:
+    """Predicts what candidates tell, all on the same members, so that differences are the candidates'.
+
+    Args:
+        robot: The nominal model.
+        known: What is known of the parameters and the latency.
+        seconds: Length of a run [s].
+        draws: Members D.
+        rng: Draws them.
+        rest: Behaviour that hardly moves the robot; members that it cannot keep inside the limits are drawn
+            again, for no excitation could. None to take the first draws.
+        threads: Simulation threads.
+
+    Raises:
+        CalibrationError: Hardly any draw can be run.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        known: ParameterDistribution,
+        seconds: float,
+        draws: int,
+        rng: np.random.Generator,
+        rest: MakeBehaviour | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.robot, self.space, self.known = robot, known.space, known
+        self.seconds, self.threads = seconds, threads
+        self.prior = Prior.of(known)
+        self.refused = 0
+        """Draws that could not be run."""
+        self._runner: TrialRunner | None = None
+        self._order = list(range(draws))
+        self._rest = rest
+        drawn = _draw(robot.description, known, rng, draws)
+        self.scenario = self._runnable(drawn, draws, rest)
+
+    def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour | None) -> Scenario:
+        if rest is None:
+            return drawn.part(range(draws))
+        trials = TrialRunner(self.robot, self.space, drawn, self.seconds, self.threads).run(
+            [rest() for _ in range(len(drawn))]
+        )
+        kept = [n for n, trial in enumerate(trials) if not trial.tripped][:draws]
+        if len(kept) < draws:
+            raise CalibrationError(
+                f"only {len(kept)} of {len(drawn)} draws from the parameters' ranges keep the limits of "
+                f"{self.robot.description.name!r} when nothing is asked of it; give narrower ranges (--xi), "
+                "a calibration, or a policy that balances"
+            )
+        self.refused = (kept[-1] + 1) - draws
+        return drawn.part(kept)
+
+    def afresh(self, draws: int, rng: np.random.Generator) -> Experiment:
+        """Return the same experiment on other members: what was chosen on some is judged on others."""
+        return Experiment(self.robot, self.known, self.seconds, draws, rng, self._rest, self.threads)
+
+    def assume(self, covariance: FloatArray) -> None:
+        """Take this covariance, (K, K), as what is known before, instead of the distribution's."""
+        self.prior = Prior.of(
+            ParameterDistribution(
+                space=self.space, mean=self.known.mean, covariance=covariance, latency_s=self.known.latency_s
+            )
+        )
+
+    def predict(self, make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
+        """Predict what a behaviour tells.
+
+        Args:
+            make: Makes the behaviour.
+            bar: Asked after each member whether to go on, with what the behaviour would tell if the members
+                left were known exactly: no prediction ends above that. Members that left the last finished
+                behaviour most in the dark come first, so most others end after one or two.
+        """
+        D, K = len(self.scenario), len(self.space)
+        if self._runner is None:
+            self._runner = TrialRunner(self.robot, self.space, self.scenario, self.seconds, self.threads)
+        trials = self._runner.run([make() for _ in range(D)], until_trip=True)
+        clipped = sum(trial.clipped for trial in trials)
+        nothing = Prediction(np.full(K, np.nan), -np.inf, clipped=clipped)
+        tripped = next((trial.tripped for trial in trials if trial.tripped), "")
+        if tripped:
+            return dataclasses.replace(nothing, tripped=tripped)
+        covariances = np.zeros((D, K, K))
+        found = nothing
+        for n in self._order:
+            try:
+                covariances[n] = self.prior.posterior(self.information(trials[n], n))
+            except InsufficientDataError as err:
+                return dataclasses.replace(nothing, tripped=str(err))
+            if not np.isfinite(covariances[n]).all():
+                return dataclasses.replace(nothing, tripped="a member diverged in its windows")
+            # Covariances are averaged, not gains: what leaves no trace on one robot in eight must not be made
+            # up for by what is a little sharper on the other seven.
+            mean = np.mean(covariances, axis=0)
+            found = Prediction(np.sqrt(np.diag(mean)), self.prior.gain(mean), clipped=clipped)
+            if bar is not None and not bar(found):
+                return dataclasses.replace(nothing, beaten=True)
+        dark = np.einsum("nkk,kk->n", covariances, self.prior.information[:K, :K])
+        self._order = np.argsort(-dark).tolist()
+        return found
+
+    def information(self, trial: Trial, n: int) -> FloatArray:
+        """Return the information of member ``n``'s trial, (K + 1, K + 1)."""
+        theta, latency_s = self.scenario.theta[n], float(self.scenario.latency_s[n])
+        return information(self.robot, self.space, trial, theta, latency_s, threads=self.threads)
+
+
+def default_knowledge(
+    space: ParameterSpace, latency_s: tuple[float, float] = LATENCY_RANGE_S
+) -> ParameterDistribution:
+    """Return what is known before any calibration: the ranges."""
+    return ParameterDistribution.uniform(space, latency_s)
+
+
+def _draw(
+    description: RobotDescription, known: ParameterDistribution, rng: np.random.Generator, draws: int
+) -> Scenario:
+    count = draws * DRAWS_PER_MEMBER
+    if known.covariance is None:
+        # Latin hypercubes: each parameter is at its low and at its high end on some member, for it is at the
+        # ends that something leaves no trace, as a high effort limit does.
+        K = len(known.space)
+        cubes = [rng.permuted(np.tile(np.arange(draws), (K, 1)), axis=1).T for _ in range(DRAWS_PER_MEMBER)]
+        unit = (np.concatenate(cubes) + rng.random((count, K))) / draws
+        theta = known.space.unnormalize(INNER[0] + (INNER[1] - INNER[0]) * unit)
+    else:
+        theta = known.sample(rng, count)
+    low, high = known.latency_s
+    # Half of the searched range: hardly any robot has a delay at its end.
+    latency = rng.uniform(low, 0.5 * (low + high) if known.covariance is None else high, count)
+    default = np.array(description.default_position)
+    spread = START_STD * description.sensor.position_std
+    return Scenario(theta, latency, default + rng.standard_normal((count, len(default))) * spread)

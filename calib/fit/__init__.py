@@ -1,0 +1,1 @@
+"""Fits that follow derivatives."""

@@ -1,0 +1,139 @@
+"""What the searches hand back: estimate, spread of the last population, trace and provenance."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.types import FloatArray
+
+Z90 = 1.6448536269514722
+"""A standard normal lies within +- this with 90 % probability."""
+
+
+class Run:
+    """Book-keeping of one search.
+
+    Args:
+        method: Name of the method.
+        problem: What is searched.
+        budget: What may be used.
+        progress: Called after each generation.
+    """
+
+    def __init__(
+        self, method: str, problem: Problem, budget: Budget, progress: ProgressCallback | None
+    ) -> None:
+        self.method = method
+        self.problem = problem
+        self.budget = budget
+        self.trace: list[dict[str, float]] = []
+        self._progress = progress
+        self._steps = problem.steps
+        self._start = time.perf_counter()
+        self._earlier_steps, self._earlier_seconds = 0, 0.0
+
+    def note(
+        self,
+        message: str,
+        population: FloatArray,
+        values: Mapping[str, float],
+        latency_s: FloatArray | None = None,
+    ) -> None:
+        """Write one generation into the trace and call the callback, which may raise to stop the run.
+
+        Args:
+            message: One short line.
+            population: What was simulated, (N, K) physical values.
+            values: For the trace.
+            latency_s: Total latency of each member, (N,) [s], where it is searched.
+        """
+        self.trace.append({"generation": float(len(self.trace)), **values})
+        if self._progress is not None:
+            total = max(self.budget.generations, len(self.trace))
+            mean = None if latency_s is None else float(np.mean(latency_s))
+            self._progress(Progress("search", len(self.trace), total, message, population, mean, values))
+
+    @property
+    def steps(self) -> int:
+        """Physics steps simulated so far, before a resume too."""
+        return self._earlier_steps + self.problem.steps - self._steps
+
+    @property
+    def seconds(self) -> float:
+        """Wall clock so far, before a resume too [s]."""
+        return self._earlier_seconds + time.perf_counter() - self._start
+
+    def save(self) -> dict[str, Any]:
+        """Return the state of the book-keeping as plain values."""
+        return {"trace": self.trace, "steps": self.steps, "seconds": self.seconds}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state."""
+        self.trace[:] = state["trace"]
+        self._earlier_steps, self._earlier_seconds = state["steps"], state["seconds"]
+        self._steps, self._start = self.problem.steps, time.perf_counter()
+
+    def result(
+        self,
+        coordinates: Coordinates,
+        centre: Members,
+        population: Members,
+        *,
+        settings: Any,
+        chi2: float = float("nan"),
+        alarms: Sequence[str] = (),
+        extra: Mapping[str, Any] | None = None,
+    ) -> CalibrationResult:
+        """Return the result.
+
+        The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
+        calibrated: a searcher's population shrinks as its step rule says, too far where the ensemble is
+            small, and to nothing
+        for diffusion evolution. The polish computes intervals from the data.
+
+        Args:
+            coordinates: The search's coordinates.
+            centre: The estimate, one member.
+            population: The last population.
+            settings: The method's settings, a dataclass.
+            chi2: Mean squared whitened residual at the estimate.
+            alarms: Reasons to distrust the result.
+            extra: Further provenance.
+        """
+        space = self.problem.space
+        scaled = space.to_scale(population.theta)
+        covariance = np.atleast_2d(np.cov(scaled, rowvar=False)) if len(scaled) > 1 else None
+        std = np.zeros(len(space)) if covariance is None else np.sqrt(np.diag(covariance))
+        middle = space.to_scale(centre.theta[0])
+        interval = np.stack(
+            [space.from_scale(middle - Z90 * std), space.from_scale(middle + Z90 * std)], axis=1
+        )
+        latency = coordinates.clip_latency(float(centre.latency_s[0]))
+        spread = float(population.latency_s.std(ddof=1)) if len(scaled) > 1 else 0.0
+        return CalibrationResult(
+            method=self.method,
+            space=space,
+            estimate=np.array(centre.theta[0]),
+            interval=np.clip(interval, space.low[:, None], space.high[:, None]),
+            covariance=covariance,
+            population=population.theta,
+            latency_s=latency,
+            latency_interval_s=(
+                coordinates.clip_latency(latency - Z90 * spread),
+                coordinates.clip_latency(latency + Z90 * spread),
+            ),
+            chi2=chi2,
+            alarms=tuple(alarms),
+            trace=tuple(self.trace),
+            steps=self.steps,
+            seconds=self.seconds,
+            provenance={"settings": asdict(settings), "budget": asdict(self.budget), **(extra or {})},
+        )

@@ -1,0 +1,172 @@
+"""Variances clustered by blocks of time: what holds where residuals are neither white nor of one size.
+
+The usual covariance H^-1 believes in independent residuals of known variance. The sandwich
+H^-1 (sum_b s_b s_b^T) H^-1 only believes that blocks of residuals are independent of each other: s_b is the
+score of block b (what it adds to half the cost's gradient), start states eliminated. Handed back is the ratio
+of both variances, coordinate by coordinate.
+
+Small samples: a sum over few blocks is too small even where the model is right, because the fit follows the
+noise of each block. With P the projection on parameters and start states, a block's score has under white
+noise the covariance J_b^T (I - P_bb) J_b, so the ratio is taken to the sum of those: it is 1 on average
+however few blocks there are. This is the bias reduction of Bell and McCaffrey (2002), applied to the sum
+instead of to each block, which stays finite where one block alone tells a parameter; their effective number
+of blocks comes along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.types import FloatArray
+
+FEWEST_BLOCKS = 8
+"""With fewer blocks nothing can be said of how residuals hang together."""
+
+ENOUGH_BLOCKS = 24
+"""Blocks are made as long as so many of them allow."""
+
+_PARTS = (8, 4, 2)
+_SHORTEST = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Clustered:
+    """How much more (or less) uncertain coordinates are than independent residuals of unit variance say.
+
+    Attributes:
+        ratio: Variance over that of independent residuals, (P,).
+        degrees: Effective number of blocks that tell each coordinate, (P,).
+        blocks: Blocks.
+        block_samples: Samples of a block.
+    """
+
+    ratio: FloatArray
+    degrees: FloatArray
+    blocks: int
+    block_samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Level:
+    """Blocks of one length.
+
+    Attributes:
+        shift: What each block's score moves the estimate by, (B, P).
+        expected: Variance of that under independent residuals of unit variance, (B, P).
+        follows: Blocks that come right after the one before them, (B - 1,).
+    """
+
+    shift: FloatArray
+    expected: FloatArray
+    follows: npt.NDArray[np.bool_]
+
+    @property
+    def hang_together(self) -> bool:
+        """Whether neighbouring blocks are correlated."""
+        power = np.sum(self.shift**2, axis=0)
+        product = np.sum((self.shift[1:] * self.shift[:-1])[self.follows], axis=0)
+        correlation = float(np.mean(product / np.maximum(power, 1e-300)))
+        return bool(correlation > 2.0 / np.sqrt(len(self.shift)))
+
+
+def clustered(
+    rows: Sequence[WindowRows], bread: FloatArray, samples: int, correlation_samples: float = 1.0
+) -> Clustered | None:
+    """Compare the sandwich with the covariance of independent residuals.
+
+    Args:
+        rows: Linearised residuals at the estimate.
+        bread: Covariance under independent residuals of unit variance, (P, P); zero rows and columns for
+            coordinates that are fixed.
+        samples: Samples H of a window.
+        correlation_samples: How long residuals hang together; blocks are at least twice as long.
+
+    Returns:
+        None where the recordings do not hold enough blocks.
+    """
+    if not rows:
+        return None
+    found: Clustered | None = None
+    hanging = True
+    for parts, group in _levels(rows, samples):
+        length = group * samples // parts
+        if length < max(_SHORTEST, 2 * correlation_samples) and parts > 1:
+            continue
+        level = _level(rows, bread, samples, parts, group)
+        blocks = len(level.shift)
+        if blocks < FEWEST_BLOCKS or (found is not None and blocks < ENOUGH_BLOCKS and not hanging):
+            break
+        found, hanging = _clustered(level, length), level.hang_together
+    return found
+
+
+def _levels(rows: Sequence[WindowRows], samples: int) -> list[tuple[int, int]]:
+    """Return (parts of a window, windows in a group) from the shortest block to the longest."""
+    longest = max((len(r.residual) for r in rows), default=0)
+    levels = [(parts, 1) for parts in (*_PARTS, 1) if samples // parts >= 1]
+    group = 2
+    while group <= longest:
+        levels.append((1, group))
+        group *= 2
+    return levels
+
+
+def _clustered(level: _Level, length: int) -> Clustered:
+    power, expected = np.sum(level.shift**2, axis=0), np.sum(level.expected, axis=0)
+    seen = expected > 0
+    safe = np.where(seen, expected, 1.0)
+    spread = np.sum(level.expected**2, axis=0)
+    degrees = np.where(seen, safe**2 / np.where(seen & (spread > 0), spread, 1.0), 1.0)
+    return Clustered(np.where(seen, power / safe, 1.0), degrees, len(level.shift), length)
+
+
+def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
+    """Eliminate the start states.
+
+    Returns:
+        The rows' derivatives by the parameters while start states follow, (W, R, P), and the start states'
+        normal matrices, (W, S, S).
+    """
+    js = rows.start
+    if js.shape[2] == 0:
+        return rows.parameter, np.zeros((len(js), 0, 0))
+    normal = np.einsum("wri,wrj->wij", js, js)
+    gain = np.linalg.solve(normal, np.einsum("wri,wrj->wij", js, rows.parameter))
+    return rows.parameter - np.einsum("wrs,wsp->wrp", js, gain), normal
+
+
+def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> _Level:
+    shifts, expected, follows = [], [], []
+    for of_episode in rows:
+        J, normal = eliminated(of_episode)
+        W, R, P = J.shape
+        S = of_episode.start.shape[2]
+        channels = (R - S) // samples
+        sample_part = np.minimum(np.arange(samples) * parts // samples, parts - 1)
+        # What is known of the start state goes with the first part.
+        part = np.concatenate([np.repeat(sample_part, channels), np.zeros(S, dtype=np.int64)])
+        score, information, start = (np.zeros((W, parts, *s)) for s in ((P,), (P, P), (P, P)))
+        for p in range(parts):
+            mine = part == p
+            Jp, jsp = J[:, mine], of_episode.start[:, mine]
+            score[:, p] = np.einsum("wrp,wr->wp", Jp, of_episode.residual[:, mine])
+            information[:, p] = np.einsum("wrp,wrq->wpq", Jp, Jp)
+            if S and parts > 1:
+                cross = np.einsum("wrs,wrp->wsp", jsp, Jp)
+                start[:, p] = np.einsum("wsp,wsq->wpq", cross, np.linalg.solve(normal, cross))
+        blocks = [np.concatenate(list(x)) for x in (score, information, start)]
+        if group > 1:
+            edges = np.arange(0, max(W - group + 1, 1), group)
+            blocks = [np.add.reduceat(x, edges, axis=0) for x in blocks]
+        g, H, F = blocks
+        # Score of a block under white noise: J_b^T (I - P_bb) J_b, P on start states and on parameters.
+        spread = H - F - H @ bread @ H
+        shifts.append(g @ bread)
+        expected.append(np.maximum(np.einsum("pi,bij,jp->bp", bread, spread, bread), 0.0))
+        follows.append(np.concatenate([[False], np.ones(len(g) - 1, dtype=bool)]))
+    return _Level(np.concatenate(shifts), np.concatenate(expected), np.concatenate(follows)[1:])

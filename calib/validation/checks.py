@@ -1,0 +1,98 @@
+"""What is checked once the polish has ended: agreement of halves, the look of an unexplained residual."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Polished
+from deal_hw.calib.uncertainty.intervals import (
+    MISMATCH_CHI2,
+    MISMATCH_TIME,
+    NEGLIGIBLE_CHI2,
+    Uncertainty,
+    correlation_time,
+)
+from deal_hw.calib.validation.diagnosis import Finding, diagnose, motions
+from deal_hw.calib.validation.split_half import compare_halves, heed
+
+MOST_CAUSES = 2
+"""So many causes are worded in alarms; all are in the provenance."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Validation:
+    """Which checks follow a polish."""
+
+    folds: bool = True
+    """Where the residual is unexplained, keep the polish only if it predicts better on inner folds."""
+
+    robust: bool = False
+    """Try Huber's loss on those folds, too, where the residual has heavy tails."""
+
+    halves: bool = True
+    """Polish two halves of the data alone and compare."""
+
+    diagnosis: bool = True
+    """Say what an unexplained residual looks like."""
+
+
+def unexplained(polished: Polished) -> bool:
+    """Return whether the residual is larger, or hangs together longer, than noise does."""
+    if polished.chi2 <= NEGLIGIBLE_CHI2:
+        return False
+    return polished.chi2 > MISMATCH_CHI2 or correlation_time(polished.normal.residual) > MISMATCH_TIME
+
+
+def judge(
+    problem: Problem, polished: Polished, known: Uncertainty, settings: Validation
+) -> tuple[Uncertainty, dict[str, Any]]:
+    """Check and return what is then known, and facts for the provenance.
+
+    Args:
+        problem: The problem.
+        polished: Where the polish ended, with linearised residuals.
+        known: What is known there.
+        settings: Which checks.
+    """
+    facts: dict[str, Any] = {"inflation": known.inflation}
+    facts["at_bound"] = [
+        n for n, side in zip(problem.space.names, known.shape.bound, strict=True) if side != 0
+    ]
+    if known.clustered is not None:
+        cluster = known.clustered
+        facts["clustered"] = {
+            "blocks": cluster.blocks,
+            "block_s": cluster.block_samples * problem.episodes[0].period_s,
+            "variance_ratio": dict(zip(problem.space.names, map(float, cluster.ratio), strict=False)),
+            "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
+        }
+    if settings.halves:
+        halves = compare_halves(problem, polished, known)
+        known = heed(problem, known, polished.theta, halves)
+        facts["halves"] = halves.to_json()
+    if settings.diagnosis and unexplained(polished):
+        found = diagnosed(problem, polished, known)
+        facts["diagnosis"] = [dataclasses.asdict(f) for f in found]
+        known = dataclasses.replace(known, alarms=(*known.alarms, *(_words(f) for f in found[:MOST_CAUSES])))
+    return known, facts
+
+
+def diagnosed(problem: Problem, polished: Polished, known: Uncertainty) -> tuple[Finding, ...]:
+    """Return what the residual looks like."""
+    free = np.append(known.shape.bound == 0, known.latency_interval_s[0] != known.latency_interval_s[1])
+    hessian = polished.normal.hessian * np.outer(free, free)
+    return diagnose(
+        motions(problem, polished),
+        hessian,
+        problem.robot.description.joint_names,
+        correlation_time(polished.normal.residual),
+    )
+
+
+def _words(found: Finding) -> str:
+    return f"what is unexplained looks like this ({100 * found.share:.0f} % of it): {found.words}"

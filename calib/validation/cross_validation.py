@@ -1,0 +1,235 @@
+"""Search alone, or search and polish? Decided on inner folds of the data that are fitted, on nothing else.
+
+Where the model is right the polish is nearer the truth. Where it is wrong the polish fits what the model
+lacks with parameters that have no part in it, and a search that stopped early may predict other motion
+better. So each fold's part is left out, both are fitted to the rest, and what predicts the left-out part
+better is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.residual import Shooting, States
+from deal_hw.calib.fit.robust import robust_polish
+from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.sim.episode import Episode
+from deal_hw.types import FloatArray
+
+FOLDS = 2
+"""Each costs a search and a polish."""
+
+BLOCKS = 2
+"""Stretches of each recording that a fold leaves out."""
+
+MOST_STEPS = 3e9
+"""More physics steps than this are not spent on folds."""
+
+SETTLING = 5
+
+Fit = Callable[[Problem, CalibrationResult], tuple[FloatArray, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What the folds say.
+
+    Attributes:
+        chosen: Name of the candidate.
+        errors: Error of each candidate in each fold: root mean squared prediction error in units of the
+            sensor's noise.
+        window_s: Predictions restart this often [s].
+        steps: Physics steps it cost.
+        note: Why nothing was compared.
+    """
+
+    chosen: str
+    errors: Mapping[str, tuple[float, ...]]
+    window_s: float
+    steps: int = 0
+    note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        if self.note:
+            return {"chosen": self.chosen, "note": self.note}
+        return {
+            "chosen": self.chosen,
+            "errors": {name: list(values) for name, values in self.errors.items()},
+            "window_s": self.window_s,
+            "steps": self.steps,
+        }
+
+
+def choose(
+    problem: Problem,
+    search: CalibrationMethod[Problem],
+    budget: Budget,
+    seed: int,
+    length: int,
+    search_steps: int,
+    robust: bool = False,
+) -> Choice:
+    """Fit every candidate to the data without each fold and compare what they predict of it.
+
+    Args:
+        problem: The problem, with the data to fit; held-out recordings are not among them.
+        search: The search.
+        budget: What it may use in each fold.
+        seed: Seeds the folds' searches.
+        length: Samples that are predicted at a time.
+        search_steps: What the search of all data cost [physics steps].
+        robust: Try the robust polish, too.
+    """
+    window_s = length * problem.episodes[0].period_s
+    if FOLDS * search_steps > MOST_STEPS:
+        note = f"left out: {FOLDS} searches would take {FOLDS * search_steps:.1g} physics steps"
+        return Choice("polish", {}, window_s, note=note)
+    before = problem.steps
+    candidates: dict[str, Fit] = {"search": _searched, "polish": _polished}
+    if robust:
+        candidates["robust polish"] = _robust
+    errors: dict[str, list[float]] = {name: [] for name in candidates}
+    for fold, left_out in enumerate(fold_masks(problem)):
+        train = problem.part([~mask for mask in left_out])
+        try:
+            searched = search.run(train, budget, np.random.default_rng([seed, fold]))
+            fits = [fit(train, searched) for fit in candidates.values()]
+            error = prediction_error(problem.part(left_out), fits, length)
+        except (InsufficientDataError, CalibrationError) as err:
+            return Choice("polish", {}, window_s, note=f"a fold's data cannot be fitted: {err}")
+        for name, value in zip(candidates, error, strict=True):
+            errors[name].append(float(value))
+    means = {name: float(np.mean(np.log(values))) for name, values in errors.items()}
+    # The polish stays where nothing is better than it.
+    chosen = min(means, key=lambda name: (means[name], name != "polish"))
+    return Choice(chosen, {n: tuple(v) for n, v in errors.items()}, window_s, problem.steps - before)
+
+
+def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
+    """Return for each fold which samples of each recording it leaves out, (T,) each.
+
+    Where there are as many motions as folds, whole motions are left out, every other one: other motion is
+    what a calibration is for. The stretches of a single motion are left out likewise. A single recording is
+    divided into blocks, so that all phases of the motion are on both sides.
+
+    Args:
+        problem: The problem.
+        count: Folds.
+    """
+    episodes = problem.episodes
+    unit = motion_numbers(episodes)
+    if unit[-1] + 1 < count:
+        unit = list(range(len(episodes)))
+    found: list[list[npt.NDArray[np.bool_]]] = [[] for _ in range(count)]
+    for number, episode in zip(unit, episodes, strict=True):
+        T = len(episode.sample)
+        block = np.arange(T) * count * BLOCKS // T if len(episodes) < count else np.full(T, number)
+        for fold in range(count):
+            found[fold].append(block % count == fold)
+    return found
+
+
+def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]]:
+    """Return for each fold which samples of each recording it leaves out, (T,) each: one stretch of time.
+
+    Blocks of both sides that take turns share whatever drifts (a gear that warms up), and a fit that follows
+    the drift predicts them well. What a calibration is for comes later.
+
+    Args:
+        problem: The problem.
+        count: Folds.
+    """
+    lengths = [len(episode.sample) for episode in problem.episodes]
+    fold = np.arange(sum(lengths)) * count // sum(lengths)
+    parts = np.split(fold, np.cumsum(lengths)[:-1])
+    return [[part == number for part in parts] for number in range(count)]
+
+
+def motion_numbers(episodes: Sequence[Episode]) -> list[int]:
+    """Return which motion each episode is of, counted from 0: stretches of one follow each other."""
+    number, found = -1, []
+    last: tuple[int, int] | None = None
+    for episode in episodes:
+        at = episode.first_row, episode.origin
+        if last is None or at <= last:
+            number += 1
+        found.append(number)
+        last = at
+    return found
+
+
+def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]], length: int) -> FloatArray:
+    """Return the root mean squared prediction error of each candidate in units of the sensor's noise, (N,).
+
+    Args:
+        problem: Recordings to predict from their smoothed states.
+        fits: Parameters, (K,), and latency [s] of each candidate.
+        length: Samples that are predicted at a time; fewer where no stretch is so long.
+    """
+    theta, latency = np.stack([f[0] for f in fits]), np.array([f[1] for f in fits])
+    total, count = np.zeros(len(fits)), 0
+    while True:
+        try:
+            windows = problem.windows(length)
+            break
+        except InsufficientDataError:
+            if length <= 4:
+                raise
+            length = max(length // 2, 4)
+    for data in windows:
+        observed = problem.predict(theta, np.maximum(latency, 0.0), data).observed
+        error = (observed - data.measured) / data.std
+        # A diverged member is as wrong as the whole range.
+        span = np.ptp(data.measured, axis=(0, 1)) / data.std
+        total += np.sum(np.where(np.isfinite(error), error, span) ** 2, axis=(1, 2, 3))
+        count += int(np.count_nonzero(np.isfinite(data.std)))
+    return np.asarray(np.sqrt(total / max(count, 1)))
+
+
+def at_estimate(problem: Problem, searched: CalibrationResult, length: int, states: States) -> Polished:
+    """Return a search's estimate with start states fitted to it, as if the polish had ended there.
+
+    Args:
+        problem: The problem.
+        searched: What the search found.
+        length: Samples of a window.
+        states: Where start states begin.
+    """
+    shooting = Shooting(problem, length)
+    point = shooting.start(searched.estimate, searched.latency_s, states)
+    normal = shooting.normal(point)
+    still = np.zeros(len(point.value))
+    for _ in range(SETTLING):
+        point = shooting.moved(point, shooting.settled(point, normal), still)
+        normal = shooting.normal(point)
+    free = len(problem.space) + (problem.fixed_latency_s is None)
+    chi2 = normal.cost / max(normal.count - free, 1)
+    return Polished(searched.estimate, searched.latency_s, chi2, normal, point, shooting, 0)
+
+
+def _searched(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
+    return searched.estimate, searched.latency_s
+
+
+def _polished(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
+    found = _polish(problem, searched)
+    return found.theta, found.latency_s
+
+
+def _robust(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
+    found = robust_polish(problem, _polish(problem, searched), problem.fixed_latency_s is not None)
+    return found.theta, found.latency_s
+
+
+def _polish(problem: Problem, searched: CalibrationResult) -> Polished:
+    fixed = problem.fixed_latency_s is not None
+    return polish(problem, searched.estimate, searched.latency_s, fixed_latency=fixed)

@@ -1,0 +1,214 @@
+"""Do two halves of the data agree? Each is polished alone from the whole's estimate.
+
+The halves are alternating blocks of the polish's own windows, so no sample is predicted in both and both hold
+every phase of the motion. It costs some iterations over each half, less than one stage of the polish.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import norm
+
+from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.fit.refinement import Polished, polish_windows
+from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.uncertainty.at_fit import statement, widened_to, with_rows
+from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
+from deal_hw.sim.windows import Windows
+from deal_hw.types import FloatArray
+
+ITERATIONS = 6
+MOST_STEPS = 3e8
+"""More physics steps than this are not spent on the comparison."""
+
+FEWEST_WINDOWS = 4
+
+FALSE_ALARMS = 0.05
+"""How often any parameter of a right model may be flagged: with many parameters some intervals of halves
+always miss each other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HalvesRow:
+    """What two halves of the data say of one parameter when each is calibrated alone.
+
+    Attributes:
+        name: The parameter.
+        first: Estimate and 90 % interval (low, high) of one half.
+        second: The same of the other half.
+    """
+
+    name: str
+    first: tuple[float, float, float]
+    second: tuple[float, float, float]
+
+    @property
+    def agree(self) -> bool:
+        """Whether the intervals overlap."""
+        return self.first[1] <= self.second[2] and self.second[1] <= self.first[2]
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """What two halves of the data say.
+
+    Attributes:
+        rows: One a parameter; none where the comparison was not made.
+        flagged: Parameters that differ by more than chance.
+        reach: How far the halves' estimates lie from the whole's, in each parameter's own scale, (K,).
+        steps: Physics steps it cost.
+        note: Why it was not made.
+    """
+
+    rows: tuple[HalvesRow, ...]
+    flagged: tuple[str, ...]
+    reach: FloatArray
+    steps: int = 0
+    note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        if not self.rows:
+            return {"note": self.note}
+        return {
+            "parameters": {
+                r.name: {"first": list(r.first), "second": list(r.second), "agree": r.agree}
+                for r in self.rows
+            },
+            "flagged": list(self.flagged),
+            "steps": self.steps,
+        }
+
+    @property
+    def alarm(self) -> str:
+        """In words; empty where nothing is flagged."""
+        if not self.flagged:
+            return ""
+        return (
+            f"two halves of the data disagree about {', '.join(self.flagged)}: the value depends on what is "
+            "fitted, so the model lacks something; their intervals were widened to hold both"
+        )
+
+
+def halves_rows(provenance: Mapping[str, Any]) -> tuple[HalvesRow, ...]:
+    """Return the rows that a result's provenance holds; none where the comparison was not made."""
+    found = provenance.get("halves", {}).get("parameters", {})
+    return tuple(
+        HalvesRow(name=name, first=_three(row["first"]), second=_three(row["second"]))
+        for name, row in found.items()
+    )
+
+
+def _three(values: Sequence[float]) -> tuple[float, float, float]:
+    estimate, low, high = map(float, values)
+    return estimate, low, high
+
+
+def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> Halves:
+    """Polish two halves of the windows alone and compare; the latency stays what it is.
+
+    Args:
+        problem: The problem.
+        polished: Where the polish of all windows ended.
+        known: What is known there; what the data cannot tell is not compared.
+    """
+    shooting, K = polished.shooting, len(problem.space)
+    nothing = np.zeros(K)
+    windows = sum(len(d.windows) for d in shooting.data)
+    if windows < FEWEST_WINDOWS:
+        return Halves((), (), nothing, note=f"{windows} windows are too few to halve: record longer")
+    cost = _steps(problem, shooting)
+    if cost > MOST_STEPS:
+        return Halves((), (), nothing, note=f"left out: it would take {cost:.1g} physics steps")
+    before = problem.steps
+    block = 1
+    if known.clustered is not None:
+        # Blocks as long as residuals hang together, but at least two blocks in each half.
+        block = max(1, min(round(known.clustered.block_samples / shooting.length), windows // FEWEST_WINDOWS))
+    estimates, stds, intervals = [], [], []
+    for half in range(2):
+        found = polish_windows(
+            *half_of(shooting, polished.point, half, block), ITERATIONS, fixed_latency=True
+        )
+        told = statement(problem, with_rows(found), fixed_latency=True)
+        # A half holds few blocks: what all of them say of clustering holds for it, too.
+        std = np.sqrt(np.diag(told.covariance)) * np.maximum(known.widened / told.widened, 1.0)
+        told = widened_to(problem, told, found.theta, std)
+        estimates.append(found.theta)
+        stds.append(np.sqrt(np.diag(told.covariance)))
+        intervals.append(told.interval)
+    scaled = problem.space.to_scale(np.stack(estimates))
+    rows = tuple(
+        HalvesRow(
+            name=name,
+            first=_three([estimates[0][k], *intervals[0][k]]),
+            second=_three([estimates[1][k], *intervals[1][k]]),
+        )
+        for k, name in enumerate(problem.space.names)
+    )
+    compared = ~known.shape.blind
+    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(compared.sum()), 1)))
+    far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
+    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and compared[k] and not r.agree)
+    reach = np.max(np.abs(scaled - problem.space.to_scale(polished.theta)), axis=0)
+    return Halves(rows, flagged, reach, problem.steps - before)
+
+
+def heed(problem: Problem, known: Uncertainty, theta: FloatArray, halves: Halves) -> Uncertainty:
+    """Return what is known, flagged parameters' intervals holding the estimates of both halves."""
+    if not halves.flagged:
+        return known
+    flagged = np.array([name in halves.flagged for name in problem.space.names])
+    wider = widened_to(problem, known, theta, np.where(flagged, halves.reach / Z90, 0.0))
+    return dataclasses.replace(wider, alarms=(*wider.alarms, halves.alarm))
+
+
+def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
+    """Return every other block of the windows and the point in them.
+
+    Args:
+        shooting: All windows.
+        point: The point in all of them.
+        half: 0 or 1.
+        block: Windows in a block; blocks are counted on from recording to recording.
+    """
+    data, position, velocity, first = [], [], [], 0
+    for e, of_episode in enumerate(shooting.data):
+        number = (first + np.arange(len(of_episode.windows))) // block
+        first += len(of_episode.windows)
+        mine = number % 2 == half
+        if mine.any():
+            data.append(take(of_episode, mine))
+            position.append(point.position[e][mine])
+            velocity.append(point.velocity[e][mine])
+    part = Shooting(shooting.problem, shooting.length, data=data)
+    return part, Point(point.value, tuple(position), tuple(velocity))
+
+
+def take(data: WindowData, chosen: npt.NDArray[np.bool_]) -> WindowData:
+    """Return some of the windows, chosen by a mask (W,)."""
+    return dataclasses.replace(
+        data,
+        windows=Windows(data.windows.start[chosen], data.windows.length, data.windows.stride),
+        measured=data.measured[chosen],
+        std=data.std[chosen],
+        start_position=data.start_position[chosen],
+        start_velocity=data.start_velocity[chosen],
+        prior_mean=data.prior_mean[chosen],
+        prior_std=data.prior_std[chosen],
+    )
+
+
+def _steps(problem: Problem, shooting: Shooting) -> float:
+    """Return how many physics steps the comparison takes at most."""
+    substeps = problem.episodes[0].step_s / problem.robot.step_s
+    samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
+    # One normal matrix and one line of damped steps an iteration.
+    members = 2 + len(problem.space) + 2 * problem.coordinates + 10
+    return float(ITERATIONS * members * samples * substeps)
