@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pytest
+from import_graph import imports, module_name, package_folders
 
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
@@ -64,15 +64,7 @@ CONFINED = {
 """Which parts may load a package; packages that are not named here are free."""
 
 MAX_LINES = 600
-MODULE_TEXT = re.compile(r"deal_hw\.(\w+)(?:\.\w+)*(?::\w+)?")
-
-
-def module_of(path: str) -> str:
-    """Return the module name under which a source file of the repository is installed."""
-    parts = list(Path(path).with_suffix("").parts)
-    if parts[0] in LEAVES:
-        parts.insert(0, "deal_hw")
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+PACKAGES = package_folders(ROOT)
 
 
 def part_of(module: str) -> str:
@@ -80,29 +72,19 @@ def part_of(module: str) -> str:
     return module.split(".")[1] if "." in module else module
 
 
-def imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield line and name of all that is imported, at the top or inside functions, also by name as text."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            source = "." * node.level + (node.module or "")
-            # `from deal_hw import drivers` imports a part, not a name of `deal_hw`.
-            whole = [alias.name for alias in node.names if source == "deal_hw" and alias.name in LAYER]
-            yield from ((node.lineno, f"deal_hw.{name}") for name in whole)
-            if len(whole) < len(node.names):
-                yield node.lineno, source
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {
-            "import_module", "importlib.import_module", "__import__",
-        }:  # fmt: skip
-            first = node.args[0] if node.args else None
-            if isinstance(first, ast.Constant) and not str(first.value).startswith("deal_hw."):
-                yield node.lineno, str(first.value)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+    for found in imports(tree):
+        # `from deal_hw import drivers` imports a part, not a name of `deal_hw`.
+        whole = [name for name in found.names if found.source == "deal_hw" and name in LAYER]
+        yield from ((found.line, f"deal_hw.{name}") for name in whole)
+        named_as_text = found.when == "text" or found.by_call
+        if named_as_text and found.source.startswith("deal_hw."):
             # A module named as text (a table, `python -m`) is a dependency like any other.
-            named = MODULE_TEXT.fullmatch(node.value)
-            if named and named[1] in LAYER:
-                yield node.lineno, node.value.partition(":")[0]
+            if part_of(found.source) in LAYER:
+                yield found.line, found.source
+        elif found.when != "text" and (not whole or len(whole) < len(found.names)):
+            yield found.line, found.source
 
 
 def complaint(importer: str, target: str) -> str | None:
@@ -137,8 +119,8 @@ def violations(sources: Mapping[str, str]) -> list[str]:
     edges: dict[str, set[str]] = {}
     for path, text in sources.items():
         tree = ast.parse(text, path)
-        importer = module_of(path)
-        for line, target in imports(tree):
+        importer = module_name(PurePosixPath(path), PACKAGES)
+        for line, target in imported(tree):
             if reason := complaint(importer, target):
                 found.append(f"{path}:{line}: {reason}")
             inside = importer.startswith("deal_hw") and target.startswith("deal_hw.")

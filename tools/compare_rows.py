@@ -1,0 +1,363 @@
+"""Compare two files of `deal-hw bench ... --out FILE.json`, cell by cell; exit 1 where the new one is worse.
+
+    python tools/compare_rows.py docs/measured/base_cartpole_sensor.json new.json
+    python tools/compare_rows.py old.json new.json --map open-loop=default
+
+A cell is a bench, task, parameter set (space), profile, way of demonstrating, split, ratio of the range,
+method, and whether the refinement followed; over its seeds. Old and new words are mapped by the tables in
+this file (`weki` is `eki`, `near` is `local`, `open-loop` is `output-error`, field `xi` is `range_ratio`,
+...), so each file may have either; ``--map OLD=NEW`` compares a method of OLD with another one of NEW. For
+methods that decide themselves what follows their search (default, local, output-error, and those that ignore
+the data) it does not matter what a row says of the refinement. Cells that only NEW has are named and not
+judged.
+
+A cell is a loss where one of these holds. Figures are of the seeds that both files have without an error.
+
+    missing     NEW lacks the cell, or a seed of it that OLD has without an error, or has an error there, or
+                lacks a figure that OLD has.
+    error       The median over seeds of `error_percent` or of `log_error_x100` is above 1.1 times the old one
+                (--error-limit), and above the floor of 1e-3 (--error-floor): in percent, so 1e-5 of a value.
+    held-out    The median over seeds of `heldout_nrmse_calibrated` is above 1.02 times the old one
+                (--heldout-limit), and above the floor of 1e-5 (--heldout-floor), in shares of the signal's
+                range. Real recordings: also `heldout_rmse_calibrated` and `heldout_pooled_calibrated`, in rad
+                or m.
+    coverage    The mean over seeds of `coverage90`, the share of parameters whose 90 % interval holds the
+                truth, is below the old one (though never where it reaches --coverage-enough, by default 1),
+                or below 0.85 (--coverage-least) where the model is right and the method claims intervals. The
+                model is right but for profiles `realistic` and `real` and bench `mismatch`. Methods that
+                claim intervals are `default`, `local`, `output-error` and those that the refinement followed:
+                searches alone, baselines and null rows are compared with OLD only. Without a truth there is
+                no coverage.
+
+Alarms (seeds with one) and seconds (median) are shown. Seconds are judged with ``--seconds-limit`` alone, as
+only runs that were timed in turn on one machine can be compared. Where a seed is much worse than it was
+(twice, above the floor) it is named: a median hides one bad seed. Exit codes: 0 no loss, 1 a loss, 2 a file
+cannot be compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+FIELDS: Mapping[str, str] = {"polish": "refined", "xi": "range_ratio"}
+"""Old name of a row's field -> new name."""
+
+METHODS = {
+    "weki": "eki",
+    "near": "local",
+    "open-loop": "output-error",
+    "centre": "midpoint",
+}
+"""Old name of a method -> new name; others keep theirs."""
+
+BENCHES = {"honest": "fixed-range"}
+"""Old name of a bench -> new name; others keep theirs."""
+
+WHOLE = frozenset({"default", "local", "output-error"})
+"""Methods, by their new names, that decide themselves what follows their search."""
+
+NULL = frozenset({"midpoint", "nominal", "deal-paper-flat"})
+"""Methods, by their new names, that ignore the data and are never refined."""
+
+KEY = (
+    "bench", "task", "space", "profile", "demonstration", "split", "range_ratio", "method", "refined",
+)  # fmt: skip
+MISSPECIFIED = frozenset({"realistic", "real"})
+"""Profiles of robots that do what no model here does."""
+
+ERRORS = ("error_percent", "log_error_x100")
+HELDOUT = ("heldout_nrmse_calibrated", "heldout_rmse_calibrated", "heldout_pooled_calibrated")
+MUCH_WORSE = 2.0
+
+Key = tuple[str, ...]
+Row = Mapping[str, Any]
+Cells = dict[Key, dict[int, Row]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What counts as a loss; ratios are new over old."""
+
+    error: float = 1.1
+    error_floor: float = 1e-3
+    heldout: float = 1.02
+    heldout_floor: float = 1e-5
+    coverage_least: float = 0.85
+    coverage_enough: float = 1.0
+    seconds: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """One cell of both files.
+
+    Attributes:
+        key: What names it, by new names.
+        seeds: How many seeds were compared.
+        figures: Name of a figure -> (old, new), each None where there is none.
+        losses: Why it is worse; empty where it is not.
+        notes: What a reader should know besides.
+    """
+
+    key: Key
+    seeds: int
+    figures: Mapping[str, tuple[float | None, float | None]]
+    losses: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare two files, print the table and return the exit code."""
+    given = _parser().parse_args(arguments)
+    limits = Limits(
+        error=given.error_limit,
+        error_floor=given.error_floor,
+        heldout=given.heldout_limit,
+        heldout_floor=given.heldout_floor,
+        coverage_least=given.coverage_least,
+        coverage_enough=given.coverage_enough,
+        seconds=given.seconds_limit,
+    )
+    try:
+        renamed = METHODS | dict(_pair(text) for text in given.map)
+        old, new = read_cells(given.old, renamed), read_cells(given.new, METHODS)
+    except (OSError, ValueError) as err:
+        print(f"compare_rows: {err}", file=sys.stderr)
+        return 2
+    compared = compare(old, new, limits)
+    print_table(compared)
+    for key in sorted(set(new) - set(old)):
+        print(f"only in {given.new.name}: {cell_name(key)}")
+    worse = [cell for cell in compared if cell.losses]
+    print(f"\n{len(compared)} cells, {len(worse)} worse")
+    return 1 if worse else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    default = Limits()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("old", type=Path, metavar="OLD", help="rows before")
+    parser.add_argument("new", type=Path, metavar="NEW", help="rows after")
+    parser.add_argument(
+        "--map", action="append", default=[], metavar="OLD=NEW",
+        help="compare this method of OLD with that one of NEW; may be given again",
+    )  # fmt: skip
+    for name, value, text in (
+        ("error-limit", default.error, "most a median parameter error may grow, new over old"),
+        ("error-floor", default.error_floor, "a median parameter error up to this is no loss [percent]"),
+        ("heldout-limit", default.heldout, "most a median held-out error may grow, new over old"),
+        (
+            "heldout-floor",
+            default.heldout_floor,
+            "a median held-out error up to this is no loss [nrmse, rad or m]",
+        ),
+        (
+            "coverage-least",
+            default.coverage_least,
+            "least coverage of 90 %% intervals where the model is right",
+        ),
+        (
+            "coverage-enough",
+            default.coverage_enough,
+            "a coverage from this on is no loss, whatever the old one was",
+        ),
+        ("seconds-limit", default.seconds, "most the median seconds may grow, new over old"),
+    ):
+        shown = "not judged" if value is None else "%(default)s"
+        parser.add_argument(f"--{name}", type=float, default=value, help=f"{text} (default: {shown})")
+    return parser
+
+
+def _pair(text: str) -> tuple[str, str]:
+    old, equals, new = text.partition("=")
+    if not (old and equals and new):
+        raise ValueError(f"--map {text!r}: give a method of OLD and one of NEW, such as open-loop=default")
+    return old, METHODS.get(new, new)
+
+
+def read_cells(path: Path, methods: Mapping[str, str]) -> Cells:
+    """Return the rows of a file by cell and seed, under new names.
+
+    Args:
+        path: A file of `deal-hw bench`.
+        methods: Old name of a method -> new name.
+
+    Raises:
+        ValueError: It is no such file, a row is no calibration's, or two rows have the same cell and seed.
+    """
+    values = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(values, dict) or not isinstance(values.get("rows"), list):
+        raise ValueError(f"{path} has no rows; name a file that `deal-hw bench ... --out` wrote")
+    cells: Cells = {}
+    for number, given in enumerate(values["rows"]):
+        if not isinstance(given, dict):
+            raise ValueError(f"{path}: row {number} is no object")
+        row: Row = {FIELDS.get(name, name): value for name, value in given.items()}
+        if lacking := [name for name in ("bench", "task", "method", "seed") if name not in row]:
+            raise ValueError(
+                f"{path}: row {number} has no {lacking[0]!r}, so it is not of a calibration bench"
+            )
+        seeds = cells.setdefault(cell_key(row, methods), {})
+        if row["seed"] in seeds:
+            name = cell_name(cell_key(row, methods))
+            raise ValueError(
+                f"{path} has two rows for seed {row['seed']} of {name}; keep one, or put methods "
+                "that are mapped to one name into files of their own"
+            )
+        seeds[row["seed"]] = row
+    return cells
+
+
+def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
+    """Return what names a row's cell, as texts in the order of `KEY`; "" where it does not apply."""
+    bench, method = str(row["bench"]), str(row["method"])
+    method = methods.get(method, method)
+    known = {
+        **{name: str(row.get(name, "")) for name in KEY},
+        "bench": BENCHES.get(bench, bench),
+        "demonstration": str(row.get("demonstration", "excite")),
+        "range_ratio": f"{float(row['range_ratio']):g}" if row.get("range_ratio") is not None else "",
+        "method": method,
+        "refined": "refined" if row.get("refined") and method not in WHOLE | NULL else "",
+    }
+    return tuple(known[name] for name in KEY)
+
+
+def cell_name(key: Key) -> str:
+    """Return a cell's name for people: what is not the rule, in one line."""
+    known = dict(zip(KEY, key, strict=True))
+    known["demonstration"] = "" if known["demonstration"] == "excite" else known["demonstration"]
+    known["range_ratio"] = f"ratio {known['range_ratio']}" if known["range_ratio"] else ""
+    return " ".join(text for text in known.values() if text)
+
+
+def compare(old: Cells, new: Cells, limits: Limits) -> list[Comparison]:
+    """Return the comparison of every cell of OLD, in the order of their names."""
+    return [compare_cell(key, old[key], new.get(key), limits) for key in sorted(old)]
+
+
+def compare_cell(
+    key: Key, old: Mapping[int, Row], new: Mapping[int, Row] | None, limits: Limits
+) -> Comparison:
+    """Compare one cell; `new` is None where there is none."""
+    done = [seed for seed in sorted(old) if not old[seed].get("error")]
+    notes = [f"seed {seed} had an error in OLD: not compared" for seed in sorted(old) if seed not in done]
+    if new is None:
+        return Comparison(key=key, seeds=0, figures={}, losses=("missing in NEW",), notes=tuple(notes))
+    losses = [f"seed {seed} is missing in NEW" for seed in done if seed not in new]
+    losses += [
+        f"seed {seed}: {new[seed]['error']}" for seed in done if seed in new and new[seed].get("error")
+    ]
+    shared = [seed for seed in done if seed in new and not new[seed].get("error")]
+    before, after = [old[seed] for seed in shared], [new[seed] for seed in shared]
+
+    for name in (*ERRORS, *HELDOUT, "coverage90"):
+        lacking = [s for s in shared if old[s].get(name) is not None and new[s].get(name) is None]
+        losses += [f"{name} is missing in NEW for seed {seed}" for seed in lacking]
+    figures = {name: (_median(before, name), _median(after, name)) for name in (*ERRORS, *HELDOUT, "seconds")}
+    figures["coverage90"] = (_mean(before, "coverage90"), _mean(after, "coverage90"))
+    figures["flagged"] = (_flagged(before), _flagged(after))
+
+    for names, limit, floor in (
+        (ERRORS, limits.error, limits.error_floor),
+        (HELDOUT, limits.heldout, limits.heldout_floor),
+    ):
+        for name in names:
+            was, now = figures[name]
+            if was is not None and now is not None and not now <= max(limit * was, floor):
+                losses.append(f"median {name} {was:.4g} -> {now:.4g}, more than {limit:g} times")
+        notes += _bad_seeds(names[0], shared, old, new, floor)
+    losses += _coverage_losses(key, *figures["coverage90"], limits)
+    was, now = figures["seconds"]
+    if limits.seconds is not None and was is not None and now is not None and now > limits.seconds * was:
+        losses.append(f"median seconds {was:.1f} -> {now:.1f}, more than {limits.seconds:g} times")
+    return Comparison(key=key, seeds=len(shared), figures=figures, losses=tuple(losses), notes=tuple(notes))
+
+
+def _coverage_losses(key: Key, was: float | None, now: float | None, limits: Limits) -> Iterator[str]:
+    known = dict(zip(KEY, key, strict=True))
+    if now is None:
+        return
+    # Means of the same shares in another order differ in their last digits.
+    if was is not None and not now >= min(was, limits.coverage_enough) - 1e-9:
+        yield f"coverage {was:.3f} -> {now:.3f}"
+    right = known["profile"] not in MISSPECIFIED and known["bench"] != "mismatch"
+    claims = known["method"] in WHOLE or bool(known["refined"])
+    if right and claims and not now >= limits.coverage_least - 1e-9:
+        yield f"coverage {now:.3f} is below {limits.coverage_least:g} though the model is right"
+
+
+def _bad_seeds(
+    name: str, shared: Sequence[int], old: Mapping[int, Row], new: Mapping[int, Row], floor: float
+) -> Iterator[str]:
+    for seed in shared:
+        was, now = old[seed].get(name), new[seed].get(name)
+        if was is not None and now is not None and not now <= max(MUCH_WORSE * was, floor):
+            yield f"seed {seed}: {name} {was:.4g} -> {now:.4g}"
+
+
+def _values(rows: Sequence[Row], name: str) -> list[float]:
+    return [float(row[name]) for row in rows if row.get(name) is not None]
+
+
+def _median(rows: Sequence[Row], name: str) -> float | None:
+    values = _values(rows, name)
+    # What is no number is as bad as can be, and a median knows no order for it.
+    return statistics.median(math.inf if math.isnan(value) else value for value in values) if values else None
+
+
+def _mean(rows: Sequence[Row], name: str) -> float | None:
+    values = _values(rows, name)
+    return statistics.fmean(values) if values else None
+
+
+def _flagged(rows: Sequence[Row]) -> float | None:
+    return float(sum(bool(row.get("alarms")) for row in rows))
+
+
+def print_table(compared: Sequence[Comparison]) -> None:
+    """Print one line a cell, then what is worse and what should be known of it."""
+    width = max((len(cell_name(cell.key)) for cell in compared), default=4)
+    print(
+        f"{'':5s} {'cell':{width}s} seeds  {'error [%]: old, new, ratio':26s}  "
+        f"{'held-out: old, new, ratio':26s}  {'coverage':11s}  {'alarms':6s}  seconds"
+    )
+    for cell in compared:
+        coverage = "/".join(_number(value, ".3f") for value in cell.figures.get("coverage90", (None, None)))
+        alarms = "/".join(_number(value, ".0f") for value in cell.figures.get("flagged", (None, None)))
+        seconds = "/".join(_number(value, ".1f") for value in cell.figures.get("seconds", (None, None)))
+        print(
+            f"{'WORSE' if cell.losses else '':5s} {cell_name(cell.key):{width}s} {cell.seeds:5d}  "
+            f"{_ratio(cell, 'error_percent'):26s}  {_ratio(cell, 'heldout_nrmse_calibrated'):26s}  "
+            f"{coverage:11s}  {alarms:6s}  {seconds}"
+        )
+    for cell in compared:
+        if cell.losses or cell.notes:
+            print(f"\n{cell_name(cell.key)}")
+            print(
+                "\n".join([f"  worse: {text}" for text in cell.losses] + [f"  {text}" for text in cell.notes])
+            )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _ratio(cell: Comparison, name: str) -> str:
+    was, now = cell.figures.get(name, (None, None))
+    ratio = now / was if was and now is not None else None
+    return f"{_number(was, '.3g'):>9s} {_number(now, '.3g'):>9s} {_number(ratio, '.2f'):>6s}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
