@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from dataclasses import dataclass
 
@@ -36,6 +37,10 @@ SCAN_TICKS = 2
 SCAN_ITERATIONS = 10
 CONTACT_ITERATIONS = 2
 """Where feet touch the floor a tick's polish starts from fitted states and costs ten times as much."""
+
+SCAN_HOPELESS = 100.0
+"""A tick whose cost would be so many times the noise's above the least is not fitted: ten standard
+deviations, as far as a kink is known to shift the least."""
 
 SCAN_WORSE = 9.0
 """Whole ticks that all cost this much more than the free latency did not converge: the free one is kept."""
@@ -102,9 +107,41 @@ class PolishedMethod(CalibrationMethod[Problem]):
         """
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
-        attempts = Attempts(self.search, problem, rng, checkpoint)
-        searched, polished, restarts = _until_explained(attempts, problem, budget, progress)
-        choice = self._choose(problem, budget, rng, searched, polished, progress)
+        local = local_fit(problem, progress) if self.settings.local_first else None
+        earlier_steps, earlier_seconds = 0, 0.0
+        if local is not None and conclusive(problem, local):
+            result = self.concluded(problem, without_search(problem, budget, local), local, progress=progress)
+        else:
+            attempts = Attempts(self.search, problem, rng, checkpoint)
+            searched, polished, restarts = _until_explained(attempts, problem, budget, progress)
+            choice = self._choose(problem, budget, rng, searched, polished, progress)
+            result = self.concluded(problem, searched, polished, choice, restarts, progress)
+            earlier_steps, earlier_seconds = attempts.earlier_steps, attempts.earlier_seconds
+        return dataclasses.replace(
+            result,
+            steps=problem.steps - steps + earlier_steps,
+            seconds=time.perf_counter() - began + earlier_seconds,
+        )
+
+    def concluded(
+        self,
+        problem: Problem,
+        searched: CalibrationResult,
+        polished: Polished,
+        choice: Choice | None = None,
+        restarts: int = 0,
+        progress: ProgressCallback | None = None,
+    ) -> CalibrationResult:
+        """Scan the latency, say what is known, check it.
+
+        Args:
+            problem: Recordings and simulator.
+            searched: What the search found, or what stands for it.
+            polished: Where the fit ended.
+            choice: What cross-validation said.
+            restarts: Searches after the first.
+            progress: Called while the latency is scanned.
+        """
         scan = None
         if choice is not None and choice.chosen == "search":
             length, states = polished.shooting.length, polished.shooting.states(polished.point)
@@ -121,7 +158,7 @@ class PolishedMethod(CalibrationMethod[Problem]):
         known = statement(problem, polished, fixed_latency=decided)
         if scan is not None and whole:
             known = _average(problem, scan, known)
-        known, facts = judge(problem, polished, known, self.settings)
+        known, checked = judge(problem, polished, known, self.settings)
         # What the search says of its own interval does not hold for these.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
             "search": searched.method,
@@ -133,7 +170,7 @@ class PolishedMethod(CalibrationMethod[Problem]):
             "noise_std": problem.noise.position_std.tolist(),
             "timing_std_s": problem.noise.timing_std_s,
             "polish_iterations": polished.iterations,
-            **facts,
+            **checked,
         }
         if choice is not None:
             provenance["folds"] = choice.to_json()
@@ -156,8 +193,6 @@ class PolishedMethod(CalibrationMethod[Problem]):
             latency_interval_s=known.latency_interval_s,
             chi2=polished.chi2,
             alarms=known.alarms,
-            steps=problem.steps - steps + attempts.earlier_steps,
-            seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
         )
 
@@ -171,11 +206,8 @@ class PolishedMethod(CalibrationMethod[Problem]):
         progress: ProgressCallback | None,
     ) -> Choice | None:
         """Return what inner folds say of the polish; None where it explains the recording to its noise."""
-        # A residual that was chosen explains itself: only what no fit has seen can judge then.
-        if not self.settings.folds or not (unexplained(polished) or problem.known_std is not None):
-            return None
-        if problem.robot.base is not None:
-            # A fold is a search and a polish; with contacts these take a minute each.
+        # A fold is a search and a polish; with contacts these take a minute each.
+        if not self.settings.folds or problem.robot.base is not None or conclusive(problem, polished):
             return None
         if progress is not None:
             progress(Progress("folds", 0, 1, "does the polish help on what it has not seen?"))
@@ -186,6 +218,47 @@ class PolishedMethod(CalibrationMethod[Problem]):
         # A fold needs no more generations than the whole did.
         less = dataclasses.replace(budget, generations=max(len(searched.trace), FEWEST_GENERATIONS))
         return choose(problem, self.search, less, seed, length, searched.steps, robust)
+
+
+def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished | None:
+    """Refine the model's own values; return None where they are too far to be refined.
+
+    Costs a small part of a search. Where its residual is explained by the sensors' noise nothing is left to
+    search for.
+    """
+    fixed = problem.fixed_latency_s is not None
+    latency_s = problem.fixed_latency_s or 0.0
+
+    def notify(done: int, chi2: float) -> None:
+        if progress is not None:
+            words = f"from the model's own values: chi2 {chi2:.3g}"
+            progress(Progress("local fit", done, done, words, values={"chi2": chi2}))
+
+    found = polish(problem, problem.space.nominal, latency_s, fixed_latency=fixed, notify=notify)
+    return found if np.isfinite(found.chi2) else None
+
+
+def conclusive(problem: Problem, polished: Polished) -> bool:
+    """Return whether a fit needs no other judge: what it leaves has the size of the sensors' noise.
+
+    A residual that was chosen explains itself: only what no fit has seen can judge then.
+    """
+    chosen = problem.known_std is not None and problem.robot.base is None
+    return not chosen and not unexplained(polished)
+
+
+def without_search(problem: Problem, budget: Budget, local: Polished) -> CalibrationResult:
+    """Return what stands for a search's result where none was needed."""
+    space = problem.space
+    return CalibrationResult(
+        method="local fit",
+        space=space,
+        estimate=local.theta,
+        interval=np.stack([space.low, space.high], axis=1),
+        latency_s=local.latency_s,
+        trace=({"generation": 0.0, "chi2": local.chi2},),
+        provenance={"budget": dataclasses.asdict(budget)},
+    )
 
 
 def _until_explained(
@@ -250,6 +323,11 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
     states = polished.shooting.states(polished.point)
     contacts = problem.robot.base is not None
     reach, iterations = (1, CONTACT_ITERATIONS) if contacts else (SCAN_TICKS, SCAN_ITERATIONS)
+    if not contacts:
+        # In a smooth problem the curvature says how far off a tick is worth a fit.
+        worth_s = np.sqrt(SCAN_HOPELESS * max(1.0, polished.chi2) * _latency_variance(polished))
+        low = max(low, min(math.ceil((polished.latency_s - worth_s) / tick), centre))
+        high = min(high, max(math.floor((polished.latency_s + worth_s) / tick), centre))
     found: dict[int, Polished] = {}
     if problem.exact:
         # That polish was at a whole tick, with more iterations than are spent on its neighbours.
@@ -279,6 +357,12 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
             waiting = [t for t in (best - 1, best + 1) if low <= t <= high and t not in found]
     ticks = tuple(sorted(found))
     return LatencyScan(ticks, tuple(found[t] for t in ticks))
+
+
+def _latency_variance(polished: Polished) -> float:
+    """Return the latency's variance under the sensors' noise, all parameters free [s^2]."""
+    prior = np.append(1.0 / polished.shooting.problem.space.width**2, 0.0)
+    return float(np.linalg.inv(polished.normal.hessian + np.diag(prior))[-1, -1])
 
 
 def _average(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:

@@ -207,6 +207,13 @@ class Problem:
         ]
         return other
 
+    def with_robot(self, robot: RobotModel) -> Problem:
+        """Return the problem with another model of the same robot; all else is shared."""
+        other = copy.copy(self)
+        other.robot = robot
+        other._batches = BatchPool(lambda count: ServoBatch(robot, self.space, count, self.threads))
+        return other
+
     @property
     def exact(self) -> bool:
         """Whether all states are known without error, so that windows need not fit where they start."""

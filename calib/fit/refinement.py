@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.contacts import solve_contacts
+from deal_hw.calib.fit.contacts import START_ITERATIONS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
@@ -272,6 +272,34 @@ def polish_windows(
     free = len(shooting.problem.space) + (0 if fixed_latency else 1)
     chi2 = normal.cost / max(normal.count - free, 1)
     return Polished(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
+
+
+def mismatch(problem: Problem, theta: FloatArray, latency_s: float, seconds: float) -> Normal:
+    """Return the residuals that fitted start states leave, all parameters fixed.
+
+    A prediction from smoothed start states errs by what smoothing errs, which says nothing of the model.
+
+    Args:
+        problem: Recordings and simulator.
+        theta: Physical parameters, (K,).
+        latency_s: Total latency [s].
+        seconds: Length of the windows [s].
+
+    Raises:
+        InsufficientDataError: No recording holds a window.
+    """
+    shooting = Shooting(problem, samples_in(problem, seconds))
+    point = shooting.start(theta, latency_s)
+    if problem.robot.base is not None:
+        return shooting.normal(settle(shooting, point, START_ITERATIONS)[0])
+    still = np.zeros_like(point.value)
+    normal = shooting.normal(point)
+    for _ in range(START_ITERATIONS):
+        moved = shooting.moved(point, shooting.settled(point, normal), still)
+        if not shooting.costs([moved])[0] < normal.cost * (1 - CONVERGED):
+            break
+        point, normal = moved, shooting.normal(moved)
+    return normal
 
 
 def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:

@@ -309,6 +309,15 @@ class Shooting:
             cost = cost + np.sum(self._start_information[e] * start**2, axis=2)
         return np.where(np.isfinite(cost), cost, np.inf)
 
+    def residuals(self, point: Point) -> list[FloatArray]:
+        """Return the whitened residuals at a point, (W, H, M) an episode."""
+        found = []
+        for e, data in enumerate(self.data):
+            x, v = point.position[e][None], point.velocity[e][None]
+            predicted = self._predict(point.value[None], data, x, v).observed[0]
+            found.append((predicted - data.measured) / data.std)
+        return found
+
     def shaken(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
         """Return the point with, window by window, the best of several drawn start states.
 

@@ -15,7 +15,7 @@ from jinja2 import Environment, StrictUndefined
 
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.inputs import ReportInputs
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2
+from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import CalibrationResult
 
 REPORT = "report.html"
@@ -97,7 +97,7 @@ def render(inputs: ReportInputs) -> str:
         inputs=inputs,
         result=result,
         rows=parameter_rows(result),
-        verdict=verdict(result),
+        trust=trust(result),
         counts=[
             (word, result.verdicts.count(word))
             for word in ("identifiable", "weak", "not identifiable")
@@ -122,20 +122,6 @@ def render(inputs: ReportInputs) -> str:
             for key, value in _mapping(provenance.get(group)).items()
         ],
     )
-
-
-def verdict(result: CalibrationResult) -> tuple[str, str]:
-    """Return in one word how it went, as a style, and in one sentence."""
-    if result.alarms:
-        return "bad", "Not to be trusted as it stands: see the alarms."
-    if math.isnan(result.chi2):
-        return "open", "Nothing says whether the model explains the recording: no residual test was made."
-    if result.chi2 > MISMATCH_CHI2:
-        factor = short(math.sqrt(result.chi2))
-        return "bad", f"The model does not explain the recording: residuals are {factor} times the noise."
-    if result.null_directions or "not identifiable" in result.verdicts:
-        return "open", "The model explains the recording, but the recording does not tell all parameters."
-    return "good", "The model explains the recording: what is left has the size of the sensor's noise."
 
 
 def parameter_rows(result: CalibrationResult) -> list[Row]:

@@ -17,6 +17,7 @@ from deal_hw.calib.uncertainty.intervals import (
     Uncertainty,
     correlation_time,
 )
+from deal_hw.calib.uncertainty.physics_step import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import Finding, diagnose, motions
 from deal_hw.calib.validation.split_half import compare_halves, heed
 
@@ -28,6 +29,9 @@ MOST_CAUSES = 2
 class Validation:
     """Which checks follow a polish."""
 
+    local_first: bool = True
+    """Refine the model's own values first; where that explains the recordings there is no search."""
+
     folds: bool = True
     """Where the residual is unexplained, keep the polish only if it predicts better on inner folds."""
 
@@ -36,6 +40,9 @@ class Validation:
 
     halves: bool = True
     """Polish two halves of the data alone and compare."""
+
+    physics_step: bool = True
+    """Predict with half the physics step; intervals count what the step moves."""
 
     diagnosis: bool = True
     """Say what an unexplained residual looks like."""
@@ -71,6 +78,12 @@ def judge(
             "variance_ratio": dict(zip(problem.space.names, map(float, cluster.ratio), strict=False)),
             "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
         }
+    if settings.physics_step:
+        step = check_step(problem, polished)
+        facts["physics_step"] = step.to_json()
+        alarm = step_alarm(problem, known, step)
+        known = counted(problem, known, polished.theta, step)
+        known = dataclasses.replace(known, alarms=(*known.alarms, *filter(None, [alarm])))
     if settings.halves:
         halves = compare_halves(problem, polished, known)
         known = heed(problem, known, polished.theta, halves)

@@ -371,6 +371,8 @@ def print_result(result: CalibrationResult, advice: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from deal_hw.calib.validation.verdict import trust
+
     table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
     for name, align in (
         ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"),
@@ -394,6 +396,8 @@ def print_result(result: CalibrationResult, advice: str) -> None:
     if console.width < TABLE_WIDTH:
         console = Console(width=TABLE_WIDTH)
     console.print(table)
+    told = trust(result)
+    console.print(f"[bold]{told.colour}:[/bold] {told.sentence}")
     for words in result.null_directions:
         console.print(f"the data cannot tell: {words}")
     for row in result.advice:

@@ -124,7 +124,16 @@ def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
 @pytest.fixture(scope="module")
 def result(problem: Problem) -> CalibrationResult:
     """Return what the whole method finds."""
-    return OpenLoop().run(problem, BUDGET, np.random.default_rng(0))
+    return OpenLoop(local_first=False).run(problem, BUDGET, np.random.default_rng(0))
+
+
+def test_a_right_model_needs_no_search(problem: Problem) -> None:
+    """The refined nominal values explain the recordings: no search, no alarm, the truth in the intervals."""
+    found = OpenLoop().run(problem, BUDGET, np.random.default_rng(0))
+    assert found.provenance["search"] == "local fit" and "folds" not in found.provenance
+    assert found.alarms == () and 0.5 < found.chi2 < 1.3
+    assert np.all(found.interval[:, 0] <= TRUTH) and np.all(found.interval[:, 1] >= TRUTH)
+    assert found.estimate == pytest.approx(TRUTH, rel=0.02)
 
 
 def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationResult) -> None:
@@ -154,7 +163,7 @@ class StoppedError(Exception):
 
 def test_a_stopped_run_is_resumed_to_the_same_numbers(problem: Problem, tmp_path: Path) -> None:
     """Stopped in the search, the checkpoint holds its generations; the rest is done again."""
-    method = OpenLoop(folds=False)
+    method = OpenLoop(folds=False, local_first=False)
 
     def stop(progress: Progress) -> None:
         if progress.stage == "search" and progress.done == 4:

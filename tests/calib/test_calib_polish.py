@@ -93,7 +93,7 @@ def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) ->
     inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
     assert inside.sum() >= 7
     assert result.alarms == ()
-    assert set(stages) == {"polish", "latency"}
+    assert set(stages) == {"local fit", "polish", "latency"}
     assert result.provenance["latency_scan"]["ticks"]
 
 

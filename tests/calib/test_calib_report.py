@@ -18,8 +18,9 @@ from deal_hw.calib.report.figure import envelope
 from deal_hw.calib.report.folder import write_result
 from deal_hw.calib.report.gather import gather
 from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
-from deal_hw.calib.report.page import parameter_rows, render, verdict, write_report
+from deal_hw.calib.report.page import parameter_rows, render, write_report
 from deal_hw.calib.validation.split_half import HalvesRow
+from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
@@ -136,25 +137,36 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
 
 
 def test_alarms_come_first() -> None:
-    """The first thing under the title is that the result is not to be trusted, and why."""
+    """The first thing under the title is whether the result can be used, and why not."""
     text = render(inputs(result(space(), alarms=("the rail is bent",))))
-    assert text.index("Not to be trusted") < text.index("the rail is bent") < text.index('id="parameters"')
+    assert text.index("read them before you use it") < text.index("the rail is bent")
+    assert text.index("the rail is bent") < text.index('id="parameters"')
+
+
+HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
 
 
 @pytest.mark.parametrize(
-    ("changes", "style", "words"),
+    ("changes", "colour", "words"),
     [
-        ({}, "good", "explains the recording"),
-        ({"chi2": 4.0}, "bad", "residuals are 2 times the noise"),
-        ({"chi2": float("nan")}, "open", "no residual test"),
-        ({"null_directions": ("a and b",)}, "open", "does not tell all parameters"),
-        ({"alarms": ("x",)}, "bad", "Not to be trusted"),
+        ({}, "green", "6.0 times smaller"),
+        # 2 % worse than nominal is chance, more is not; what is not a number is worse, too.
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.0611}}, "green", "1.0 times smaller"),
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.0613}}, "red", "6.1 % of the signal's range"),
+        ({"heldout_nrmse": {**HELD, "calibrated": float("nan")}}, "red", "it is worse"),
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.07}, "chi2": 4.0}, "red", "it is worse"),
+        ({"chi2": 4.0}, "amber", "2.0 times the sensor's noise"),
+        ({"chi2": 4.0, "heldout_nrmse": {}}, "red", "no held-out recording"),
+        ({"chi2": float("nan")}, "amber", "No test"),
+        ({"null_directions": ("a and b",)}, "amber", "do not tell all parameters"),
+        ({"alarms": ("x",)}, "amber", "alarms"),
+        ({"heldout_nrmse": {}}, "amber", "no held-out recording"),
     ],
 )
-def test_verdict_says_in_words_how_it_went(changes: dict[str, Any], style: str, words: str) -> None:
-    """Explained or not, with the factor over the noise: chi2 4 is twice the noise."""
-    found = verdict(result(space(), **changes))
-    assert found[0] == style and words in found[1]
+def test_verdict_asks_held_out_motion_first(changes: dict[str, Any], colour: str, words: str) -> None:
+    """Worse than the user's own model is red whatever else; chi2 4 is twice the noise."""
+    found = trust(result(space(), **{"heldout_nrmse": HELD, **changes}))
+    assert found.colour == colour and words in found.sentence
 
 
 def test_bars_lie_where_the_search_scale_puts_them() -> None:

@@ -16,6 +16,7 @@ from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Weki, WekiSettings
 from deal_hw.calib.search.identity import run_identity
+from deal_hw.calib.validation.checks import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.episode import align
@@ -99,7 +100,8 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(pipeline, "MISMATCH_CHI2", 0.0)
     monkeypatch.setattr(pipeline, "SAME_CHI2", 0.0)
     monkeypatch.setattr(pipeline, "FEWEST_GENERATIONS", 1)
-    method = PolishedMethod(Weki(WekiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9)))
+    search = Weki(WekiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
+    method = PolishedMethod(search, settings=Validation(local_first=False))
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
     stages: list[str] = []
 

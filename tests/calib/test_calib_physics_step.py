@@ -1,0 +1,115 @@
+"""Half the physics step says whether the model's step is too coarse: a light hinge, truths of two steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.pipeline import local_fit
+from deal_hw.calib.uncertainty.at_fit import statement, with_rows
+from deal_hw.calib.uncertainty.intervals import Uncertainty
+from deal_hw.calib.uncertainty.physics_step import StepCheck, check_step, counted, halved, step_alarm
+from deal_hw.cli.calibrate_model import Recordings, prepare_model
+from deal_hw.cli.calibrate_run import Narrowing
+from deal_hw.types import FloatArray
+
+HINGE = """
+<mujoco model="hinge">
+  <compiler angle="radian"/>
+  <option timestep="{step}" integrator="implicitfast"/>
+  <worldbody><body name="arm">
+    <joint name="hinge" axis="0 1 0" armature="{armature}" damping="{damping}"/>
+    <geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.01" mass="0.05"/>
+  </body></worldbody>
+  <actuator><position name="hinge" joint="hinge" kp="8" kv="0"/></actuator>
+</mujoco>
+"""
+PARAMETERS = """
+parameters:
+  - {kind: dof_damping, elements: hinge}
+  - {kind: dof_armature, elements: hinge}
+"""
+TRUTH = np.array([0.1, 0.002])
+STEP_S = 0.0025
+NOISE = 3e-4
+
+
+def recording(step_s: float) -> str:
+    """Return a CSV of steps of the set-point, simulated with a physics step."""
+    xml = HINGE.format(step=step_s, damping=TRUTH[0], armature=TRUTH[1])
+    model = mujoco.MjModel.from_xml_string(xml)
+    data, rng = mujoco.MjData(model), np.random.default_rng(4)
+    rows, wanted = ["time,hinge_pos,hinge_cmd"], 0.0
+    for k in range(600):
+        wanted = rng.uniform(-0.8, 0.8) if k % 20 == 5 else wanted
+        rows.append(f"{0.01 * k:.3f},{data.qpos[0] + NOISE * rng.standard_normal():.7f},{wanted:.7f}")
+        data.ctrl[0] = wanted
+        mujoco.mj_step(model, data, round(0.01 / step_s))
+    return "\n".join(rows) + "\n"
+
+
+def checked(folder: Path, step_s: float) -> tuple[Problem, FloatArray, Uncertainty, StepCheck]:
+    """Return problem, estimate, what is known and what half the step says, of data with a step."""
+    (folder / "hinge.xml").write_text(HINGE.format(step=STEP_S, damping="0.07", armature="0.003"))
+    (folder / "params.yaml").write_text(PARAMETERS)
+    (folder / "data.csv").write_text(recording(step_s))
+    source = Recordings(
+        model=folder / "hinge.xml",
+        data=(folder / "data.csv",),
+        parameters=folder / "params.yaml",
+        holdout_part=0.0,
+    )
+    narrowing = Narrowing(free=(), known={}, ranges=(), xi=None)
+    work = prepare_model(source, (), narrowing, std=lambda robot: None, threads=1, quiet=True)
+    problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
+    fit = local_fit(problem, None)
+    assert fit is not None
+    fit = with_rows(fit)
+    return problem, fit.theta, statement(problem, fit, fixed_latency=True), check_step(problem, fit)
+
+
+def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
+    """Truth with a step of 0.1 ms, model with 2.5: the interval misses it, the counted one holds it."""
+    problem, theta, known, found = checked(tmp_path, 1e-4)
+    inside = (known.interval[:, 0] <= TRUTH) & (known.interval[:, 1] >= TRUTH)
+    assert not inside.all()
+    wider = counted(problem, known, theta, found).interval
+    assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
+    assert found.preferred
+    alarm = step_alarm(problem, known, found)
+    assert "2.5 ms is too coarse" in alarm and "--physics-step 0.00125" in alarm
+    assert "hinge.armature" in alarm or "hinge.damping" in alarm
+    # Half the error is removed by half the step: corrected, the estimate is nearer the truth.
+    corrected = problem.space.from_scale(problem.space.to_scale(theta) + found.bias[:-1])
+    off, was = (np.abs(np.log(value / TRUTH)).max() for value in (corrected, theta))
+    assert off < 0.5 * was
+
+
+def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
+    """The finer step explains them worse: nothing is said, no interval is widened."""
+    problem, theta, known, found = checked(tmp_path, STEP_S)
+    assert found.rejected and step_alarm(problem, known, found) == ""
+    assert counted(problem, known, theta, found) is known
+    assert np.all(known.interval[:, 0] <= TRUTH) and np.all(known.interval[:, 1] >= TRUTH)
+
+
+def test_a_check_that_would_take_too_long_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is compared, nothing is widened, and the provenance says why."""
+    from deal_hw.calib.uncertainty import physics_step
+
+    monkeypatch.setattr(physics_step, "MOST_STEPS", 10.0)
+    problem, theta, known, found = checked(tmp_path, STEP_S)
+    assert "it would take" in found.to_json()["note"]
+    assert counted(problem, known, theta, found) is known and step_alarm(problem, known, found) == ""
+
+
+def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:
+    """The model itself is not touched; steps are counted apart."""
+    problem, *_ = checked(tmp_path, STEP_S)
+    finer = halved(problem)
+    assert finer.robot.step_s == STEP_S / 2 and problem.robot.step_s == STEP_S
+    assert finer.starts is problem.starts and finer.steps == 0
