@@ -32,8 +32,8 @@ from deal_hw.control.waveforms import (
 )
 from deal_hw.data.files import read_json
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
-from deal_hw.schema import STRICT, short
+from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError, shown
+from deal_hw.schema import STRICT
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
 FORMAT = "deal_hw.excitation/1"
@@ -146,7 +146,7 @@ class ExcitationPlan:
         """
         if self.robot != description.name or self.digest != description.digest():
             raise ConfigurationError(
-                f"the excitation was made for robot {short(self.robot)} (description {short(self.digest)}), "
+                f"the excitation was made for robot {shown(self.robot)} (description {shown(self.digest)}), "
                 f"this is {description.name!r} ({description.digest()}); make another with `deal-hw excite`"
             )
         with np.errstate(all="ignore"):
@@ -187,10 +187,10 @@ class ExcitationPlan:
         """
         given = dict(values)
         if (found := given.pop("format", None)) != FORMAT:
-            raise ConfigurationError(f"not an excitation: format is {short(found)}, not {FORMAT!r}")
+            raise ConfigurationError(f"not an excitation: format is {shown(found)}, not {FORMAT!r}")
         if not isinstance(wave := given.get("wave"), Mapping):
             raise ConfigurationError(
-                f"not an excitation: field wave is {short(wave)}; wanted: a signal's table"
+                f"not an excitation: field wave is {shown(wave)}; wanted: a signal's table"
             )
         given["wave"] = dataclasses.asdict(wave_from_json(wave))
         try:

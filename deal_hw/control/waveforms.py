@@ -16,8 +16,8 @@ from typing import Any, ClassVar, Final, Literal, get_args
 import numpy as np
 
 from deal_hw import schema
-from deal_hw.errors import ConfigurationError, UnknownNameError
-from deal_hw.schema import STRICT, short
+from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.schema import STRICT
 from deal_hw.types import FloatArray
 
 Law = Literal["linear", "log"]
@@ -188,7 +188,7 @@ def wave_from_json(values: Mapping[str, Any]) -> Wave:
     given = dict(values)
     name = given.pop("wave", "")
     if not isinstance(name, str) or name not in WAVES:
-        raise UnknownNameError("wave", short(name), WAVES)
+        raise UnknownNameError("wave", shown(name), WAVES)
     try:
         found: Wave = schema.read_json(WAVES[name], json.dumps(given, allow_nan=False))
     except (TypeError, ValueError) as err:
