@@ -7,28 +7,34 @@ imported on use: `import deal_hw` stays light.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 from deal_hw.errors import SHORT, ConfigurationError, short, shown
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import GetCoreSchemaHandler, TypeAdapter, ValidationError
 
 T = TypeVar("T")
 
 STRICT: Final[Mapping[str, Any]] = MappingProxyType({"strict": True, "extra": "forbid"})
 """Value of ``__pydantic_config__`` in a dataclass: nothing is converted, unknown fields are refused."""
+FINITE: Final[Mapping[str, Any]] = MappingProxyType({**STRICT, "allow_inf_nan": False})
+"""The same, and all numbers are finite."""
+OPEN: Final[Mapping[str, Any]] = MappingProxyType({"strict": True})
+"""As :data:`STRICT`, but unknown fields are ignored."""
 SHOWN: Final = 3
 """How many wrong fields a message explains; it counts or names the others."""
 _MAX_NAMES: Final = 16
 
 
-def read_json(kind: type[T], text: str) -> T:
-    """Return the dataclass that a JSON text describes.
+def read_json(kind: type[T], text: str | bytes) -> T:
+    """Return the dataclass, or plain values, that a JSON text describes.
 
     Raises:
         ConfigurationError: The text is no JSON, or a field is wrong; the message names the fields.
@@ -40,6 +46,27 @@ def read_json(kind: type[T], text: str) -> T:
     except ValidationError as err:
         raise ConfigurationError(_explain(err)) from err
     return made
+
+
+def from_values(kind: type[T], values: Any) -> T:
+    """Return the dataclass that plain JSON values describe; errors as :func:`read_json`."""
+    try:
+        text = json.dumps(values)
+    except (TypeError, ValueError, RecursionError) as err:
+        raise ConfigurationError(f"not plain JSON values: {err}") from err
+    return read_json(kind, text)
+
+
+@dataclass(frozen=True, slots=True)
+class Tagged:
+    """Annotation of a union of dataclasses: a field of each, a ``Literal``, says which one it is."""
+
+    field: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        from pydantic import Field
+
+        return handler.generate_schema(Annotated[source, Field(discriminator=self.field)])
 
 
 @cache
