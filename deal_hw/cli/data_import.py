@@ -171,6 +171,9 @@ def _description(path: Path) -> dict[str, Any]:
     what, advice = "a robot's description", "see `description` in a dataset.json"
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
     with reading(path, what, advice, error=ConfigurationError):
+        missing = [key for key in ("name", "joint_names", "actuated", "state_rate_hz") if key not in values]
+        if missing:
+            raise ConfigurationError(f"it lacks {', '.join(missing)}; {advice}")
         check_description(values)
         number(values["state_rate_hz"], "state_rate_hz", 1e-3, 1e6)
     return values
