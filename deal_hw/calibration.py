@@ -207,8 +207,10 @@ def read_result(path: Path) -> CalibrationResult:
         ConfigurationError: The file holds no result; the message names the field.
     """
     file = path / RESULT_FILE if path.is_dir() else path
-    with reading(file, "a calibration result", "`deal-hw calibrate` writes one"):
-        return CalibrationResult.from_json(object_of(read_json(file)))
+    what, advice = "a calibration result", "`deal-hw calibrate` writes one"
+    values = read_json(file, dict[str, Any], what, advice)
+    with reading(file, what, advice):
+        return CalibrationResult.from_json(values)
 
 
 class StateStore(Protocol):

@@ -32,6 +32,8 @@ from collections.abc import Iterable, Mapping
 
 QUOTED = 200
 """Most characters of a file's content that a message repeats."""
+SHORT = 60
+"""Most characters of one value, where a message may show several."""
 LISTED = 800
 """Most characters of the names that a message lists."""
 
@@ -40,21 +42,25 @@ def short(value: object, most: int = QUOTED) -> str:
     """Return text, or the `repr` of another value, in one printable line of a bounded length.
 
     Args:
-        value: What a message is to show; it may come from a hostile file.
+        value: What a message is to show; it may come from a hostile file. Of a long list the beginning and
+            the number of entries are shown.
         most: Longest text to return.
     """
-    if not isinstance(value, str):
+    size = ""
+    if isinstance(value, _CONTAINERS):
+        size = f" ({len(value)} entries)" if len(value) > _REPR.maxlist else ""
         # A plain repr of nested lists that share their parts may be a million times as long as the file.
-        value = _REPR.repr(value) if isinstance(value, _CONTAINERS) else str(value)
-    text = " ".join(value[: 4 * most].split())
+        value = _REPR.repr(value)
+    text = " ".join(str(value)[: 4 * most].split())
     # Control characters of a file would speak to the terminal.
     text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= most else f"{text[: most - 4]} ..."
+    most -= len(size)
+    return (text if len(text) <= most else f"{text[: most - 4]} ...") + size
 
 
-def shown(value: object) -> str:
+def shown(value: object, most: int = SHORT) -> str:
     """Return a value of a file as a message shows it: :func:`short`, text in quotes."""
-    return repr(short(value)) if isinstance(value, str) else short(value)
+    return short(repr(value[: 4 * most]) if isinstance(value, str) else value, most)
 
 
 _CONTAINERS = (Mapping, list, tuple, set, frozenset)

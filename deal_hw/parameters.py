@@ -12,12 +12,13 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
-from deal_hw.reading import number, numbers, texts
+from deal_hw.reading import numbers
+from deal_hw.schema import FINITE, from_values
 from deal_hw.types import FloatArray
 
 Scale = Literal["log", "linear"]
@@ -45,6 +46,8 @@ class Parameter:
         prior_std: Standard deviation of that expectation in the parameter's own scale: a share of the value
             (0.05 for 5 %) on a log scale, the unit itself on a linear one.
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
 
     name: str
     kind: str
@@ -113,24 +116,6 @@ class Parameter:
             # Policies carry a digest of these values: those made before priors existed must keep theirs.
             del values["prior_mean"], values["prior_std"]
         return values
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Parameter:
-        """Return the parameter that :meth:`to_json` wrote.
-
-        Raises:
-            ConfigurationError: A value is of another kind than the field.
-        """
-        name = shown(values["name"])
-        if not all(isinstance(values[key], str) for key in ("name", "kind", "unit", "scale")):
-            raise ConfigurationError(f"parameter {name}: name, kind, unit and scale must be texts")
-        if not isinstance(values["known"], bool):
-            raise ConfigurationError(f"parameter {name}: known must be true or false")
-        keys = ["nominal", "low", "high"]
-        keys += [key for key in ("prior_mean", "prior_std") if values.get(key) is not None]
-        found = {key: number(values[key], f"parameter {name}: {key}") for key in keys}
-        elements = texts(values["elements"], f"parameter {name}: elements")
-        return cls(**{**values, **found, "elements": elements})
 
 
 class ParameterSpace:
@@ -271,9 +256,9 @@ class ParameterSpace:
         return [p.to_json() for p in self.parameters]
 
     @classmethod
-    def from_json(cls, values: Iterable[Mapping[str, Any]]) -> ParameterSpace:
+    def from_json(cls, values: Any) -> ParameterSpace:
         """Return the space that :meth:`to_json` wrote."""
-        return cls(Parameter.from_json(v) for v in values)
+        return cls(from_values(tuple[Parameter, ...], values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError
-from deal_hw.schema import SHOWN, STRICT, check_members, check_numbers, either, read_json, refusal, short
+from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError, shown
+from deal_hw.schema import SHOWN, STRICT, check_members, check_numbers, either, read_json, refusal
 from deal_hw.types import FloatArray
 
 Quantity = Literal[
@@ -208,7 +208,7 @@ class PolicySpec:
             PolicyMismatchError: It was not; the message names every field that differs.
         """
         wrong = {
-            name: f"policy has {short(given)}, robot has {short(own)}"
+            name: f"policy has {shown(given)}, robot has {shown(own)}"
             for name, (given, own) in {
                 "robot": (self.robot, description.name),
                 "joint_names": (self.joint_names, description.joint_names),
@@ -226,12 +226,12 @@ class PolicySpec:
         ):  # fmt: skip
             given = getattr(self, name)
             if len(given) != len(allowed) or any(g > a for g, a in zip(given, allowed, strict=True)):
-                wrong[name] = f"policy asks for {short(given)}, the robot allows at most {short(allowed)}"
+                wrong[name] = f"policy asks for {shown(given)}, the robot allows at most {shown(allowed)}"
         if wrong:
-            shown = "; ".join(f"{name}: {words}" for name, words in list(wrong.items())[:SHOWN])
+            listed = "; ".join(f"{name}: {words}" for name, words in list(wrong.items())[:SHOWN])
             others = "; also: " + ", ".join(list(wrong)[SHOWN:]) if len(wrong) > SHOWN else ""
             raise PolicyMismatchError(
-                f"the policy does not fit the robot: {shown}{others}; give a policy that was trained for "
+                f"the policy does not fit the robot: {listed}{others}; give a policy that was trained for "
                 f"{description.name!r}"
             )
 

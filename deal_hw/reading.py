@@ -1,27 +1,37 @@
 """Reads files that may be damaged or hostile: a size limit before, one clear line after.
 
 Every reader of JSON, YAML and NPZ goes through here, so that a limit is stated once and an exception of a
-parser never reaches the user as a traceback. What a file means is for the caller to say, inside
-:func:`reading`.
+parser never reaches the user as a traceback. What a file means is for the caller to say: of JSON by a
+dataclass, see :mod:`deal_hw.schema`, of others inside :func:`reading`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-import json
 import math
 import os
 import stat
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, TypeVar
 
 import numpy as np
 
-from deal_hw.errors import LISTED, ConfigurationError, DatasetError, DealHwError, MissingExtraError, short
+from deal_hw import schema
+from deal_hw.errors import (
+    LISTED,
+    ConfigurationError,
+    DatasetError,
+    DealHwError,
+    MissingExtraError,
+    short,
+    shown,
+)
 from deal_hw.types import FloatArray
+
+T = TypeVar("T")
 
 MIB: Final = 1 << 20
 JSON_BYTES: Final = 16 * MIB
@@ -89,20 +99,20 @@ def _reason(err: Exception) -> str:
 
 
 def check_size(path: Path, most: int) -> None:
-    """Check that a path is an ordinary file of a bounded size.
+    """Check that a path is an ordinary file of a bounded size; to be called inside :func:`reading`.
 
     Raises:
         OSError: There is none, or it cannot be looked at.
-        ConfigurationError: It is a folder or a device, or too large.
+        ValueError: It is a folder or a device, or too large.
     """
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         # A pipe or a device could keep the reader waiting, or feed it, for ever.
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device"
-        raise ConfigurationError(f"{path} is {kind}; name an ordinary file")
+        raise ValueError(f"it is {kind}; name an ordinary file")
     if status.st_size > most:
-        raise ConfigurationError(
-            f"{path} has {status.st_size / MIB:.1f} MiB; files of this kind may have {most / MIB:g} MiB"
+        raise ValueError(
+            f"it has {status.st_size / MIB:.1f} MiB; files of this kind may have {most / MIB:g} MiB"
         )
 
 
@@ -113,9 +123,35 @@ def read_bytes(path: Path, most: int) -> bytes:
         return file.read(most)
 
 
-def read_json(path: Path) -> Any:
-    """Return the values of a JSON file; to be called inside :func:`reading`."""
-    return json.loads(read_bytes(path, JSON_BYTES))
+def read_json(
+    path: Path,
+    kind: type[T],
+    what: str = "JSON",
+    advice: str = "",
+    *,
+    error: type[DealHwError] = DatasetError,
+    most: int = JSON_BYTES,
+) -> T:
+    """Return the dataclass, or plain values, that a JSON file describes.
+
+    Args:
+        path: The file.
+        kind: The dataclass, or a type such as ``dict[str, Any]``.
+        what: As for :func:`reading`.
+        advice: As for :func:`reading`.
+        error: What to raise.
+        most: Largest size [B].
+
+    Raises:
+        DealHwError: Of the given class: the file cannot be read, is too large or nested too deep, is no JSON,
+            or a field is wrong; names file and fields.
+    """
+    with reading(path, what, advice, error=error):
+        try:
+            return schema.read_json(kind, read_bytes(path, most))
+        except ConfigurationError as err:
+            then = f"; {advice}" if advice else ""
+            raise error(f"{path} cannot be read as {what}: {err}{then}") from err
 
 
 def read_yaml(path: Path) -> Any:
@@ -255,7 +291,7 @@ def number(value: Any, what: str, low: float = -math.inf, high: float = math.inf
         ConfigurationError: It is something else.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigurationError(f"{what} must be a number, got {short(value)}")
+        raise ConfigurationError(f"{what} must be a number, got {shown(value)}")
     try:
         found = float(value)
     except OverflowError:

@@ -7,29 +7,34 @@ imported on use: `import deal_hw` stays light.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import SHORT, ConfigurationError, short, shown
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import GetCoreSchemaHandler, TypeAdapter, ValidationError
 
 T = TypeVar("T")
 
 STRICT: Final[Mapping[str, Any]] = MappingProxyType({"strict": True, "extra": "forbid"})
 """Value of ``__pydantic_config__`` in a dataclass: nothing is converted, unknown fields are refused."""
+FINITE: Final[Mapping[str, Any]] = MappingProxyType({**STRICT, "allow_inf_nan": False})
+"""The same, and all numbers are finite."""
+OPEN: Final[Mapping[str, Any]] = MappingProxyType({"strict": True})
+"""As :data:`STRICT`, but unknown fields are ignored."""
 SHOWN: Final = 3
 """How many wrong fields a message explains; it counts or names the others."""
-_MAX_CHARACTERS: Final = 60
 _MAX_NAMES: Final = 16
 
 
-def read_json(kind: type[T], text: str) -> T:
-    """Return the dataclass that a JSON text describes.
+def read_json(kind: type[T], text: str | bytes) -> T:
+    """Return the dataclass, or plain values, that a JSON text describes.
 
     Raises:
         ConfigurationError: The text is no JSON, or a field is wrong; the message names the fields.
@@ -41,6 +46,27 @@ def read_json(kind: type[T], text: str) -> T:
     except ValidationError as err:
         raise ConfigurationError(_explain(err)) from err
     return made
+
+
+def from_values(kind: type[T], values: Any) -> T:
+    """Return the dataclass that plain JSON values describe; errors as :func:`read_json`."""
+    try:
+        text = json.dumps(values)
+    except (TypeError, ValueError, RecursionError) as err:
+        raise ConfigurationError(f"not plain JSON values: {err}") from err
+    return read_json(kind, text)
+
+
+@dataclass(frozen=True, slots=True)
+class Tagged:
+    """Annotation of a union of dataclasses: a field of each, a ``Literal``, says which one it is."""
+
+    field: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        from pydantic import Field
+
+        return handler.generate_schema(Annotated[source, Field(discriminator=self.field)])
 
 
 @cache
@@ -55,9 +81,7 @@ def _explain(err: ValidationError) -> str:
     errors = err.errors(include_url=False)
     found = []
     for error in errors[:SHOWN]:
-        parts = [
-            f"[{part}]" if isinstance(part, int) else f".{short(part, quote=False)}" for part in error["loc"]
-        ]
+        parts = [f"[{part}]" if isinstance(part, int) else f".{short(part, SHORT)}" for part in error["loc"]]
         place = "".join(parts).lstrip(".")
         if error["type"] == "value_error":
             # A check of a dataclass, which does not know its own place.
@@ -65,27 +89,19 @@ def _explain(err: ValidationError) -> str:
         elif not place or error["type"] == "missing":
             found.append(f"field {place} is missing" if place else error["msg"])
         else:
-            found.append(f"field {place} is {short(error['input'])}; {error['msg']}")
+            found.append(f"field {place} is {shown(error['input'])}; {error['msg']}")
     more = f"; and {len(errors) - SHOWN} more" if len(errors) > SHOWN else ""
     return "; ".join(found) + more
 
 
 def refusal(name: str, found: object, allowed: str, *, quote: bool = True) -> ConfigurationError:
     """Return the error that names a field, what was found and what is allowed."""
-    return ConfigurationError(f"field {name} is {short(found, quote=quote)}; allowed: {allowed}")
-
-
-def short(value: object, *, quote: bool = True) -> str:
-    """Return a value as a message shows it: whole where it is short, else its beginning and its size."""
-    text = repr(value)
-    text = text if quote or not isinstance(value, str) else text[1:-1]
-    size = f" ({len(value)} entries)" if isinstance(value, Sequence) and not isinstance(value, str) else ""
-    return text if len(text) <= _MAX_CHARACTERS else f"{text[: _MAX_CHARACTERS - 12]}...{size}"
+    return ConfigurationError(f"field {name} is {shown(found) if quote else found}; allowed: {allowed}")
 
 
 def either(allowed: Sequence[str]) -> str:
     """Return names as a message lists them; of many the first."""
-    text = ", ".join(short(name) for name in allowed[:_MAX_NAMES])
+    text = ", ".join(shown(name) for name in allowed[:_MAX_NAMES])
     return text if len(allowed) <= _MAX_NAMES else f"{text}, ... ({len(allowed)} in all)"
 
 

@@ -8,9 +8,10 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.schema import OPEN, from_values
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +107,8 @@ class WireOptions:
         key: Its private key (PEM).
     """
 
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
+
     domain: int = 0
     listen: bool = False
     mode: str = ""
@@ -136,8 +139,7 @@ class WireOptions:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> WireOptions:
         """Return the options that :meth:`to_json` wrote."""
-        files = {k: Path(values[k]) for k in ("ca", "certificate", "key") if values[k] is not None}
-        return cls(**{**values, **files})
+        return from_values(cls, values)
 
 
 class TopicTransport(Transport):

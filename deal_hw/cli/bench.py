@@ -20,7 +20,7 @@ from deal_hw.cli.options import Range, Ratio, Threads, check_ranges, given, refu
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError, shown
-from deal_hw.reading import object_of, read_json, reading
+from deal_hw.reading import read_json
 
 FORMAT = "deal_hw.bench/1"
 MOST_SEEDS = 10_000
@@ -288,16 +288,21 @@ def _line(row: Mapping[str, Any]) -> str:
     return text
 
 
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """What the file of a bench holds."""
+
+    format: str
+    rows: tuple[dict[str, Any], ...]
+
+
 def _load(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
-    with reading(path, "rows of a bench", "name another file"):
-        values = object_of(read_json(path))
-        if values["format"] != FORMAT:
-            raise DatasetError(
-                f"{path} has format {shown(values['format'])}, not {FORMAT!r}; name another file"
-            )
-        return [dict(object_of(row, "a row")) for row in values["rows"]]
+    found = read_json(path, _Rows, "rows of a bench", "name another file")
+    if found.format != FORMAT:
+        raise DatasetError(f"{path} has format {shown(found.format)}, not {FORMAT!r}; name another file")
+    return list(found.rows)
 
 
 def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -10,10 +10,11 @@ from typing import Annotated, Literal
 import tyro
 
 from deal_hw.calibration import SHORTEST_S
+from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.options import Checked, Range, RunSeconds, Seed, given, refuse
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
-from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
+from deal_hw.cli.supervised import dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
 from deal_hw.control.vigor import ATTEMPTS, GENTLEST, LIVELIEST

@@ -12,7 +12,7 @@ import tyro
 from deal_hw.cli.calibrate_checks import examine_recording
 from deal_hw.cli.options import Checked, Range, given, refuse
 from deal_hw.errors import ConfigurationError
-from deal_hw.reading import number, object_of, read_json, reading, texts
+from deal_hw.reading import number, read_json, reading
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
@@ -166,15 +166,14 @@ def _joint_facts(model: Path | None) -> JointFacts | None:
 
 
 def _description(path: Path) -> dict[str, Any]:
-    with reading(
-        path, "a robot's description", "see `description` in a dataset.json", error=ConfigurationError
-    ):
-        values = object_of(read_json(path))
+    from deal_hw.data.reader import check_description
+
+    what, advice = "a robot's description", "see `description` in a dataset.json"
+    values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
+    with reading(path, what, advice, error=ConfigurationError):
         missing = [key for key in ("name", "joint_names", "actuated", "state_rate_hz") if key not in values]
         if missing:
-            raise ConfigurationError(f"it lacks {', '.join(missing)}; see `description` in a dataset.json")
-        texts([values["name"]], "name")
-        for key in ("joint_names", "actuated"):
-            texts(values[key], key)
+            raise ConfigurationError(f"it lacks {', '.join(missing)}; {advice}")
+        check_description(values)
         number(values["state_rate_hz"], "state_rate_hz", 1e-3, 1e6)
-        return dict(values)
+    return values

@@ -18,9 +18,9 @@ from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.cli.run_plan import shipped_policy
-from deal_hw.cli.supervised import RunReport
 from deal_hw.control.cadence import CadenceReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError

@@ -8,10 +8,11 @@ from typing import Annotated
 
 import tyro
 
+from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.options import Checked, Range, RunSeconds, Seed
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
-from deal_hw.cli.supervised import RunReport, dataset_folder, run_episodes
+from deal_hw.cli.supervised import dataset_folder, run_episodes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
-from deal_hw.reading import object_of, read_json, reading
+from deal_hw.reading import read_json, reading
 
 T = TypeVar("T")
 _PARENT_CHECK_STEPS = 100
@@ -96,8 +96,10 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
     Raises:
         ConfigurationError: The file is not there, or holds no truth.
     """
-    with reading(path, "an emulator's truth", "--reveal-to writes one", error=ConfigurationError):
-        return parse(object_of(read_json(path)))
+    what, advice = "an emulator's truth", "--reveal-to writes one"
+    values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
+    with reading(path, what, advice, error=ConfigurationError):
+        return parse(values)
 
 
 def reveal(values: Mapping[str, Any], *, on_stdout: bool, path: Path | None) -> None:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
-from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig, Segment
+from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import (
     FAMILIES,
     ExcitationBehaviour,
@@ -29,6 +29,7 @@ from deal_hw.control.vigor import with_vigor
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.policy import Policy
+from deal_hw.schema import OPEN, from_values
 from deal_hw.transport import WireOptions
 
 Profile = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
@@ -66,6 +67,8 @@ class RunPlan:
         realtime: Whether to ask for SCHED_FIFO and locked memory.
         passive_timeout_s: How long the passive command is repeated at the end until the robot shows it [s].
     """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
     robot: str
     transport: str = "serial"
@@ -119,18 +122,7 @@ class RunPlan:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> RunPlan:
         """Return the plan that :meth:`to_json` wrote; other keys are ignored."""
-        known = {f.name: values[f.name] for f in dataclasses.fields(cls)}
-        rich = dict(known["rich"])
-        rich["hold_s"] = tuple(rich["hold_s"])
-        rich["segments"] = tuple(Segment(**part) for part in rich["segments"])
-        return cls(
-            **{
-                **known,
-                "rich": RichConfig(**rich),
-                "wire": WireOptions.from_json(known["wire"]),
-                "posture": PostureConfig(**known["posture"]),
-            }
-        )
+        return from_values(cls, values)
 
 
 def shipped_policy(robot: str) -> Path | None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.reading import object_of, read_json, reading
+from deal_hw.reading import read_json, reading
 
 if TYPE_CHECKING:
     from deal_hw.description import SensorModel
@@ -159,11 +159,10 @@ def read_distribution(path: Path) -> ParameterDistribution:
     Raises:
         ConfigurationError: There is no such file, or it holds no distribution.
     """
-    with reading(
-        path, "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json",
-        error=ConfigurationError,
-    ):  # fmt: skip
-        return ParameterDistribution.from_json(object_of(read_json(path)))
+    what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
+    values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
+    with reading(path, what, advice, error=ConfigurationError):
+        return ParameterDistribution.from_json(values)
 
 
 def _space(robot: str) -> ParameterSpace:

@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from deal_hw import schema
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation import Segment, segment_command
 from deal_hw.control.excitation_limits import centre, fit_to_limits, room
@@ -27,13 +26,11 @@ from deal_hw.control.waveforms import (
     ease,
     multisine,
     random_steps,
-    wave_from_json,
-    wave_to_json,
 )
-from deal_hw.data.files import read_json
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
-from deal_hw.schema import STRICT, short
+from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.reading import read_json, reading
+from deal_hw.schema import FINITE, from_values
 from deal_hw.types import FloatArray, JointCommand, RobotState
 
 FORMAT = "deal_hw.excitation/1"
@@ -119,7 +116,7 @@ class ExcitationPlan:
         ConfigurationError: The times make no sense.
     """
 
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
 
     robot: str
     digest: str
@@ -146,7 +143,7 @@ class ExcitationPlan:
         """
         if self.robot != description.name or self.digest != description.digest():
             raise ConfigurationError(
-                f"the excitation was made for robot {short(self.robot)} (description {short(self.digest)}), "
+                f"the excitation was made for robot {shown(self.robot)} (description {shown(self.digest)}), "
                 f"this is {description.name!r} ({description.digest()}); make another with `deal-hw excite`"
             )
         with np.errstate(all="ignore"):
@@ -165,18 +162,7 @@ class ExcitationPlan:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "format": FORMAT,
-            "robot": self.robot,
-            "digest": self.digest,
-            "seconds": self.seconds,
-            "balance_s": self.balance_s,
-            "ease_s": self.ease_s,
-            "wave": wave_to_json(self.wave),
-            "segments": [dataclasses.asdict(part) for part in self.segments],
-            "words": self.words,
-            "predicted": dict(self.predicted),
-        }
+        return {"format": FORMAT, **dataclasses.asdict(self)}
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> ExcitationPlan:
@@ -187,15 +173,10 @@ class ExcitationPlan:
         """
         given = dict(values)
         if (found := given.pop("format", None)) != FORMAT:
-            raise ConfigurationError(f"not an excitation: format is {short(found)}, not {FORMAT!r}")
-        if not isinstance(wave := given.get("wave"), Mapping):
-            raise ConfigurationError(
-                f"not an excitation: field wave is {short(wave)}; wanted: a signal's table"
-            )
-        given["wave"] = dataclasses.asdict(wave_from_json(wave))
+            raise ConfigurationError(f"not an excitation: format is {shown(found)}, not {FORMAT!r}")
         try:
-            return schema.read_json(cls, json.dumps(given))
-        except (TypeError, ValueError) as err:
+            return from_values(cls, given)
+        except ConfigurationError as err:
             raise ConfigurationError(f"not an excitation: {err}") from err
 
     def write(self, path: Path) -> None:
@@ -210,13 +191,10 @@ def read_plan(path: Path) -> ExcitationPlan:
     Raises:
         ConfigurationError: It cannot be read, or holds no plan.
     """
-    try:
-        values = read_json(path, dict[str, Any])
-    except DatasetError as err:
-        raise ConfigurationError(
-            f"--excite {err}; give one of {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` wrote"
-        ) from err
-    return ExcitationPlan.from_json(values)
+    advice = f"--excite takes {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` wrote"
+    values = read_json(path, dict[str, Any], "an excitation", advice, error=ConfigurationError)
+    with reading(path, "an excitation"):
+        return ExcitationPlan.from_json(values)
 
 
 def make_plan(description: RobotDescription, design: ExcitationDesign) -> ExcitationPlan:

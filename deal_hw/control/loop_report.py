@@ -80,14 +80,3 @@ class LoopReport:
             "cadence": self.cadence.to_json(), "clipped": self.clipped, "cycles_sent": self.cycles_sent,
             "error": self.error,
         }  # fmt: skip
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> LoopReport:
-        """Return the report that :meth:`to_json` wrote."""
-        return cls(
-            **{
-                **values,
-                "outcome": Outcome(values["outcome"]),
-                "cadence": CadenceReport.from_json(values["cadence"]),
-            }
-        )

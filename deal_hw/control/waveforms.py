@@ -7,17 +7,15 @@ only: what a table holds may be chosen by an optimiser, but the control process 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from deal_hw import schema
 from deal_hw.errors import ConfigurationError, UnknownNameError
-from deal_hw.schema import STRICT, short
+from deal_hw.schema import FINITE, Tagged
 from deal_hw.types import FloatArray
 
 Law = Literal["linear", "log"]
@@ -34,8 +32,9 @@ class Tones:
         phase: At time 0, (A, F) [rad].
     """
 
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
 
+    wave: Literal["tones"] = "tones"
     frequency_hz: tuple[tuple[float, ...], ...]
     amplitude: tuple[tuple[float, ...], ...]
     phase: tuple[tuple[float, ...], ...]
@@ -78,8 +77,9 @@ class Sweep:
         arrangement: How several joints share the time.
     """
 
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
 
+    wave: Literal["sweep"] = "sweep"
     amplitude: tuple[float, ...]
     duration_s: float
     low_hz: float
@@ -146,8 +146,9 @@ class Steps:
         value: (S, A) [m or rad].
     """
 
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
 
+    wave: Literal["steps"] = "steps"
     begin_s: tuple[float, ...]
     value: tuple[tuple[float, ...], ...]
 
@@ -169,31 +170,8 @@ class Steps:
         return dataclasses.replace(self, value=rows)
 
 
-Wave = Tones | Sweep | Steps
-WAVES: Final[Mapping[str, type[Wave]]] = {"tones": Tones, "sweep": Sweep, "steps": Steps}
-
-
-def wave_to_json(wave: Wave) -> dict[str, Any]:
-    """Return plain JSON values."""
-    (name,) = [name for name, kind in WAVES.items() if isinstance(wave, kind)]
-    return {"wave": name, **dataclasses.asdict(wave)}
-
-
-def wave_from_json(values: Mapping[str, Any]) -> Wave:
-    """Return the signal that :func:`wave_to_json` wrote.
-
-    Raises:
-        ConfigurationError: The values are not those of a signal.
-    """
-    given = dict(values)
-    name = given.pop("wave", "")
-    if not isinstance(name, str) or name not in WAVES:
-        raise UnknownNameError("wave", short(name), WAVES)
-    try:
-        found: Wave = schema.read_json(WAVES[name], json.dumps(given, allow_nan=False))
-    except (TypeError, ValueError) as err:
-        raise ConfigurationError(f"not the table of {name!r}: {err}") from err
-    return found
+Wave = Annotated[Tones | Sweep | Steps, Tagged("wave")]
+"""One of them; in JSON the field ``wave`` says which."""
 
 
 def ease(time_s: FloatArray, duration_s: float, ease_s: float) -> FloatArray:

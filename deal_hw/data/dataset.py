@@ -14,15 +14,19 @@ from types import TracebackType
 from typing import Any, ClassVar, Self
 
 from deal_hw.data.episode_info import EpisodeInfo, summarize
-from deal_hw.data.files import read_json, write_json
+from deal_hw.data.files import write_json
 from deal_hw.data.reader import Episode, check_description, read_episode
 from deal_hw.data.repair import repair
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
+from deal_hw.reading import MIB, read_json
 from deal_hw.schema import STRICT
 
 SCHEMA_VERSION = 1
 INDEX_NAME = "dataset.json"
+_WHAT = "the index of a dataset"
+_INDEX_BYTES = 64 * MIB
+"""That of 10,000 episodes has some 30 MB [B]."""
 _LOCK_NAME = ".lock"
 Notify = Callable[[str], None]
 
@@ -158,13 +162,13 @@ class Dataset:
     @classmethod
     def _load(cls, folder: Path, lock: int, notify: Notify) -> Self:
         path = folder / INDEX_NAME
-        version = read_json(path, _Version).schema_version
+        version = read_json(path, _Version, _WHAT, most=_INDEX_BYTES).schema_version
         if version != SCHEMA_VERSION:
             raise DatasetError(
                 f"{path} has schema version {version}, expected {SCHEMA_VERSION}; "
                 "it was written by another version of deal-hw"
             )
-        index = read_json(path, _Index)
+        index = read_json(path, _Index, _WHAT, most=_INDEX_BYTES)
         return cls(folder, index.description, index.episodes, lock, notify)
 
     def path(self, index: int) -> Path:

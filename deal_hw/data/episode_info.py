@@ -11,8 +11,8 @@ from deal_hw.data.checks import Severity, Verdict, check
 from deal_hw.data.clock_sync import synchronize
 from deal_hw.data.excitation import excitation
 from deal_hw.data.reader import Episode, read_episode
-from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError
-from deal_hw.schema import STRICT, short
+from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
+from deal_hw.schema import STRICT
 
 _MOST_JUMPS = 20
 """So many jumps of a clock the index names; a recording of nothing else must not fill it."""
@@ -65,17 +65,17 @@ class EpisodeInfo:
         parts = Path(self.file).parts
         if len(parts) != 2 or parts[0] != "episodes" or ".." in parts or "\0" in self.file:
             raise ConfigurationError(
-                f"episode file {short(self.file)} is not inside the dataset's episodes/ folder"
+                f"episode file {shown(self.file)} is not inside the dataset's episodes/ folder"
             )
         for verdict in self.verdicts:
             if _VERDICT - verdict.keys() or verdict["severity"] not in tuple(Severity):
-                raise ConfigurationError(f"field verdicts holds {short(dict(verdict))}, which is no verdict")
+                raise ConfigurationError(f"field verdicts holds {shown(dict(verdict))}, which is no verdict")
         clock, excitation = self.clock or {}, self.excitation or {}
         if self.clock is not None and not all(name in clock and _is_number(clock[name]) for name in _CLOCK):
-            raise ConfigurationError(f"field clock is {short(dict(clock))}; wanted: numbers or null")
+            raise ConfigurationError(f"field clock is {shown(dict(clock))}; wanted: numbers or null")
         for value in excitation.values():
             if not all(_is_number(part) for part in (value if isinstance(value, list | tuple) else [value])):
-                raise ConfigurationError(f"field excitation holds {short(value)}; wanted: numbers")
+                raise ConfigurationError(f"field excitation holds {shown(value)}; wanted: numbers")
 
 
 def _is_number(value: object) -> bool:

@@ -1,4 +1,4 @@
-"""Reads files that may hold anything, up to a size; writes so that a crash leaves no half of them."""
+"""Writes files so that a crash leaves no half of them; reads episodes up to a size."""
 
 from __future__ import annotations
 
@@ -7,44 +7,19 @@ import json
 import os
 import shutil
 import signal
-import stat
 import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from mcap.writer import MCAP0_MAGIC
 
-from deal_hw import schema
-from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
+from deal_hw.errors import DatasetError, EmptyRecordingError
+from deal_hw.reading import read_bytes, reading
 
 MAX_EPISODE_BYTES = 4 << 30
 """An episode is read into memory as a whole; a Go2 with its raw bytes records 0.7 MB/s at most [B]."""
-MAX_JSON_BYTES = 64 << 20
-"""The index of a dataset of 10,000 episodes has some 30 MB [B]."""
-
-T = TypeVar("T")
-
-
-def read_bytes(path: Path, most: int) -> bytes:
-    """Return what is in a file.
-
-    Raises:
-        DatasetError: It cannot be read, is no file, or has more bytes than ``most``.
-    """
-    path = Path(path)
-    try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
-            raise DatasetError(f"{path} cannot be read: it is not a file")
-        if found.st_size > most:
-            raise DatasetError(
-                f"{path} cannot be read: it has {found.st_size} bytes, at most {most} are allowed"
-            )
-        return path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def read_episode_bytes(path: Path) -> bytes:
@@ -54,7 +29,8 @@ def read_episode_bytes(path: Path) -> bytes:
         EmptyRecordingError: It has 0 bytes.
         DatasetError: It cannot be read, is too large, or does not begin like an MCAP file.
     """
-    data = read_bytes(path, MAX_EPISODE_BYTES)
+    with reading(path, "an episode"):
+        data = read_bytes(Path(path), MAX_EPISODE_BYTES)
     if not data:
         raise EmptyRecordingError(
             f"{path} is empty (0 bytes); nothing was recorded, there is nothing to repair"
@@ -65,23 +41,6 @@ def read_episode_bytes(path: Path) -> bytes:
             "DIR/episodes/000000.mcap"
         )
     return data
-
-
-def read_json(path: Path, kind: type[T]) -> T:
-    """Return the dataclass, or plain values, that a JSON file describes.
-
-    Raises:
-        DatasetError: It cannot be read, is too large, is no JSON, or a field is wrong; names the fields.
-    """
-    data = read_bytes(path, MAX_JSON_BYTES)
-    try:
-        return schema.read_json(kind, data.decode())
-    except UnicodeDecodeError as error:
-        raise DatasetError(
-            f"{path} is not UTF-8 text: byte {error.start} is 0x{data[error.start]:02x}"
-        ) from error
-    except ConfigurationError as error:
-        raise DatasetError(f"{path}: {error}") from error
 
 
 def write_json(path: Path, values: Any) -> None:

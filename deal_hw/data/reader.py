@@ -22,8 +22,9 @@ from deal_hw.errors import (
     EmptyRecordingError,
     ProtocolError,
     TornRecordingError,
+    shown,
 )
-from deal_hw.schema import read_json, short
+from deal_hw.schema import read_json
 from deal_hw.transport import Message
 from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
 
@@ -131,13 +132,13 @@ def check_description(values: Mapping[str, Any]) -> None:
     """
     names = [*_names(values, "joint_names"), *_names(values, "actuated")]
     if not names or not isinstance(values.get("name"), str):
-        raise ConfigurationError(f"the description {short(dict(values))} names no robot with joints")
+        raise ConfigurationError(f"the description {shown(dict(values))} names no robot with joints")
 
 
 def _names(description: Mapping[str, Any], field: str) -> list[str]:
     names = description.get(field)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ConfigurationError(f"the description's {field} are {short(names)}; wanted: a list of names")
+        raise ConfigurationError(f"the description's {field} are {shown(names)}; wanted: a list of names")
     return names
 
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from deal_hw.data.files import read_json, write_json
+from deal_hw.data.files import write_json
 from deal_hw.errors import DatasetError
+from deal_hw.reading import read_json
 
 _PACKAGES = (
     "deal-hw",
@@ -111,10 +112,7 @@ class RunFolder:
         Raises:
             DatasetError: The folder is not a run.
         """
-        try:
-            return read_json(self.path / "run.json", dict[str, Any])
-        except DatasetError as error:
-            raise DatasetError(f"{self.path} is not a run folder: {error}") from error
+        return read_json(self.path / "run.json", dict[str, Any], "the record of a run", "name a run's folder")
 
     def write(self, name: str, values: Any) -> Path:
         """Write plain JSON values to a file inside the folder, atomically; return its path."""

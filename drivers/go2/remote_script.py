@@ -36,10 +36,9 @@ def read_remote_script(path: Path) -> tuple[RemoteMoment, ...]:
         ConfigurationError: The file holds something else.
         UnknownNameError: There is no such button.
     """
-    with reading(path, "a remote's script", error=ConfigurationError):
-        entries = read_json(path)
-        if not isinstance(entries, list):
-            raise ConfigurationError(f"{path}: expected a list of objects with at_s and buttons or sticks")
+    what, advice = "a remote's script", "it is a list of objects with at_s and buttons or sticks"
+    entries = read_json(path, list[Any], what, advice, error=ConfigurationError)
+    with reading(path, what, error=ConfigurationError):
         return tuple(sorted((_moment(path, entry) for entry in entries), key=lambda moment: moment.at_ms))
 
 

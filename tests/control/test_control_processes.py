@@ -21,9 +21,10 @@ import pytest
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
+from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.replay import Replay, replay
 from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import InterruptedRunError, RunReport, run_episodes
+from deal_hw.cli.supervised import InterruptedRunError, run_episodes
 from deal_hw.control.handover import RUNNING, Beat
 from deal_hw.control.loop import Outcome
 from deal_hw.data.dataset import Dataset

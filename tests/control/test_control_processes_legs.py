@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import RunReport, run_episodes
+from deal_hw.cli.supervised import run_episodes
 from deal_hw.control.handover import RUNNING, Beat
 from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig

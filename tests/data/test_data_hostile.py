@@ -284,11 +284,11 @@ def test_what_is_no_episode_is_said_at_once(tmp_path: Path) -> None:
     huge = tmp_path / "huge.mcap"
     huge.touch()
     os.truncate(huge, files.MAX_EPISODE_BYTES + 1)
-    with pytest.raises(DatasetError, match=r"it has 4294967297 bytes, at most 4294967296 are allowed"):
+    with pytest.raises(DatasetError, match=r"it has 4096\.0 MiB; files of this kind may have 4096 MiB"):
         verify(huge)
     os.mkfifo(tmp_path / "pipe.mcap")
     for name in ("", "pipe.mcap"):
-        with pytest.raises(DatasetError, match="it is not a file"):
+        with pytest.raises(DatasetError, match="; name an ordinary file"):
             read_episode(tmp_path / name)
 
 
@@ -347,7 +347,7 @@ JSON_BOMBS = [
     (b"[" * 100_000, "recursion limit"),
     (b'{"a":' * 100_000, "recursion limit"),
     (b'"\\ud800"', "Invalid JSON"),
-    (b"\xff{}", "not UTF-8 text"),
+    (b"\xff{}", "Invalid JSON"),
     (b"[1]", "should be an object"),
     (b"", "Invalid JSON"),
     (b"1" * 5000, "number out of range"),

@@ -273,7 +273,7 @@ HOURS = {"column": "t", "unit": "h"}
         ({"time": "t", "joints": ["a", "a"]}, ConfigurationError, "each joint once"),
         ({"time": "t", "joints": [{"column": "a"}]}, ConfigurationError, "has no name"),
         ({"time": "t", "joints": [{"name": "a", "sign": 2}]}, ConfigurationError, "sign is 1 or -1"),
-        ({"time": "t", "joints": [{"name": "a", "sign": "x"}]}, ConfigurationError, "not a number"),
+        ({"time": "t", "joints": [{"name": "a", "sign": "x"}]}, ConfigurationError, "sign must be a number"),
         ({"time": "t", "joints": [{"name": "a", "unit": "turns"}]}, UnknownNameError, "'turns'"),
         ({"time": "t", "joints": [NO_SCALE]}, ConfigurationError, "no scale"),
         ({"time": "t", "joints": [NO_PAIR]}, ConfigurationError, "two numbers"),

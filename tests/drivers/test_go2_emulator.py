@@ -220,7 +220,7 @@ def test_wrong_options_are_refused_before_anything_opens() -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{", "truth.json cannot be read"), ("[]", "an object was expected"), ("{}", "is missing")],
+    [("{", "truth.json cannot be read"), ("[]", "should be an object"), ("{}", "is missing")],
 )
 def test_a_file_that_holds_no_truth_is_refused(tmp_path: Path, text: str, message: str) -> None:
     """Whatever is in the file, the error says what writes one."""

@@ -77,7 +77,7 @@ def test_linear_kinds_get_their_usual_width() -> None:
         ("kind: dof_damping, elements: FL_hip_joint, range: 3", r"must be \[low, high\]"),
         ("kind: dof_damping, elements: FL_hip_joint, ratio: 0.5", "must be above 1"),
         ("kind: dof_damping, elements: FL_hip_joint, range: [0.1, 1], ratio: 2", "not both"),
-        ("kind: dof_damping, elements: FL_hip_joint, nominal: .nan", "must be finite"),
+        ("kind: dof_damping, elements: FL_hip_joint, nominal: .nan", "must be a finite number"),
         ("kind: dof_damping, elements: FL_hip_joint, nominal: much", "must be a number"),
         ("kind: dof_damping, elements: FL_hip_joint, scale: lin", r"unknown scale 'lin'.*'linear'"),
         ("kind: dof_damping, elements: FL_hip_joint, rang: [0.1, 1]", r"unknown key 'rang'.*'range'"),

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
-from deal_hw.reading import NAMES, read_yaml, reading
+from deal_hw.reading import NAMES, number, read_yaml, reading
 
 TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in one of each."""
@@ -277,17 +277,11 @@ def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
     settings.update({key: str(values[key]) for key in ("unit", "target_unit", "column") if key in values})
     for key in ("sign", "offset"):
         if key in values:
-            settings[key] = _number(f"joint {name!r}: {key}", values[key])
+            settings[key] = number(values[key], f"joint {name!r}: {key}")
     for key in ("normalised", "target_normalised"):
         if values.get(key) is not None:
             settings[key] = _normalised(f"joint {name!r}: {key}", values[key])
     return JointColumns(name=name, index=index, slides=bool(values.get("slides", False)), **settings)
-
-
-def _number(what: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ConfigurationError(f"{what} is {shown(value)}, not a number")
-    return float(value)
 
 
 def _normalised(what: str, value: Any) -> Normalised:
@@ -299,7 +293,7 @@ def _normalised(what: str, value: Any) -> Normalised:
             raise ConfigurationError(
                 f"{what}: {key} is {shown(pair)}; give two numbers, such as {{from: [0, 1], to: [-0.2, 1.7]}}"
             )
-        pairs.append((_number(what, pair[0]), _number(what, pair[1])))
+        pairs.append((number(pair[0], what), number(pair[1], what)))
     return Normalised(file=pairs[0], robot=pairs[1])
 
 

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels, as_floats
 from deal_hw.errors import DatasetError, MissingExtraError, short
-from deal_hw.reading import NUMBERS, RECORDING_BYTES, check_size, number, object_of, read_json, reading
+from deal_hw.reading import NUMBERS, RECORDING_BYTES, check_size, read_json, reading
+from deal_hw.schema import OPEN, refusal
 from deal_hw.types import FloatArray
 
 FLOAT32_STAMP_S = 1e-4
@@ -50,20 +52,20 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
         raise DatasetError(f"{path} has no data/*/*.parquet; is the dataset downloaded whole?")
     found: dict[int, list[dict[str, FloatArray]]] = {}
     for file in files:
-        for episode, arrays in _read_file(file, info["features"]):
+        for episode, arrays in _read_file(file, info.features):
             if episodes is None or episode in episodes:
                 found.setdefault(episode, []).append(arrays)
     missing = sorted(set(episodes or ()) - set(found))
     if missing:
         raise DatasetError(f"{path} has no episodes {missing}; it has {len(found)} that were asked for")
     digest = _digest(path, files)
-    labels = {name: _names(feature) for name, feature in info["features"].items()}
+    labels = {name: _names(feature) for name, feature in info.features.items()}
     return [
         Channels(
             path=path,
             kind="lerobot",
             digest=digest,
-            arrays=_stamped(_joined(parts), float(info["fps"])),
+            arrays=_stamped(_joined(parts), info.fps),
             labels={name: names for name, names in labels.items() if names},
             part=f"episode {episode}",
         )
@@ -71,16 +73,25 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
     ]
 
 
-def _info(path: Path) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class _Info:
+    """What is needed of ``meta/info.json``: the features by name, and the rate [Hz]."""
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
+
+    features: dict[str, dict[str, Any]]
+    fps: float
+
+    def __post_init__(self) -> None:
+        if not 1e-3 <= self.fps <= 1e6:
+            raise refusal("fps", self.fps, "0.001 to 1e6 Hz")
+
+
+def _info(path: Path) -> _Info:
     file = path / "meta" / "info.json"
     if not file.is_file():
         raise DatasetError(f"{path} is not a LeRobot dataset: it has no meta/info.json")
-    with reading(file, "the description of a LeRobot dataset"):
-        info = dict(object_of(read_json(file)))
-        for name, feature in object_of(info["features"], "features").items():
-            object_of(feature, f"feature {short(name, 60)!r}")
-        number(info["fps"], "fps", low=1e-3, high=1e6)
-    return info
+    return read_json(file, _Info, "the description of a LeRobot dataset")
 
 
 def _read_file(file: Path, features: Mapping[str, Any]) -> list[tuple[int, dict[str, FloatArray]]]:

@@ -17,7 +17,7 @@ import yaml
 
 from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
-from deal_hw.reading import YAML_BYTES, parse_yaml, read_bytes, reading
+from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
 from deal_hw.sim.fields import element_id, element_names
 from deal_hw.sim.parameters import check_space, find_kind
 from deal_hw.sim.parameters.kind import Kind
@@ -63,11 +63,11 @@ def parse_space(text: str, model: Any, source: str = "params.yaml") -> Parameter
     if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
         raise ConfigurationError(f"{source}: `parameters` must be a list with at least one entry")
     parameters: list[Parameter] = []
-    for number, entry in enumerate(entries, 1):
+    for place, entry in enumerate(entries, 1):
         try:
             parameters += _parameters(entry, model)
         except ConfigurationError as err:
-            err.args = (f"{source}, entry {number}: {err}",)
+            err.args = (f"{source}, entry {place}: {err}",)
             raise
     names = [p.name for p in parameters]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -252,15 +252,7 @@ def _number(value: Any, what: str) -> float:
             value = float(value)
         except ValueError:
             pass
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigurationError(f"the {what} must be a number, got {shown(value)}")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise ConfigurationError(f"the {what} must be finite, got {shown(value)}")
-    return number
+    return number(value, f"the {what}")
 
 
 def _text(entry: Mapping[str, Any], key: str) -> str:

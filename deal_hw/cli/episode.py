@@ -1,0 +1,129 @@
+"""Starts the two processes of an episode, recorder and control, and waits for their ends."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from deal_hw import __version__
+from deal_hw.cli.episode_end import account
+from deal_hw.cli.episode_report import EpisodeReport
+from deal_hw.cli.keyboard import keys
+from deal_hw.cli.run_plan import RunPlan
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.handover import CONNECTING, HANDING_BACK, HOMING, LOADING, MAKING_PASSIVE, STARTING, Beat
+from deal_hw.control.passive import PassiveConfig, make_passive
+from deal_hw.control.supervisor import OPERATOR, Supervisor
+from deal_hw.data.excitation import Excitation
+from deal_hw.data.recorder_launch import start_recorder
+from deal_hw.errors import DealHwError
+from deal_hw.robot import Robot
+
+if TYPE_CHECKING:
+    from deal_hw.data.dataset import Dataset
+
+_IN_VAIN = PassiveConfig(timeout_s=1.0)
+"""Where the control process tried for its whole time, the supervisor's own path gets this chance."""
+
+
+class Episode:
+    """One episode: a recorder, a control process and the account of both."""
+
+    def __init__(
+        self,
+        plan: RunPlan,
+        robot: Robot,
+        port: str,
+        store: Dataset | None,
+        purpose: str,
+        task: str,
+        attempt: int = 0,
+        keep_fds: tuple[int, ...] = (),
+    ) -> None:
+        self._keep_fds = keep_fds
+        self.signal = ""
+        """Name of the signal by which the operator ended it; "" where there was none."""
+        self._plan, self._robot, self._port, self._store = plan, robot, port, store
+        self._path = store.next_episode_path() if store is not None else None
+        self._metadata = {
+            "robot": plan.robot,
+            "description_digest": robot.description.digest(),
+            "purpose": purpose,
+            "task": task,
+            "profile": plan.profile,
+            "policy": plan.policy,
+            "policy_digest": plan.policy_digest[:16],
+            "recording": plan.recording,
+            "excite": plan.excite,
+            "seed": plan.seed,
+            "seconds": plan.seconds,
+            "vigor": plan.vigor,
+            "attempt": attempt,
+            "dry_run": plan.dry_run,
+            "velocity": plan.velocity,
+            "stand": plan.stand,
+            "deal_hw": __version__,
+        }
+
+    def run(self, on_beat: Callable[[Beat], None]) -> EpisodeReport:
+        """Run it and return the account."""
+        recorder = None
+        if self._path is not None:
+            recorder = start_recorder(self._path, self._robot.description.to_json(), self._metadata)
+            try:
+                recorder.wait_ready()
+            except BaseException:
+                recorder.finish()
+                raise
+        port_fd = self._robot.fileno()
+        supervisor = Supervisor(
+            module="deal_hw.cli.control_process",
+            plan=self._plan.to_json(),
+            port_fd=port_fd if port_fd >= 0 else None,
+            passive=lambda phase, in_vain: self._make_passive(phase, in_vain, supervisor, on_beat),
+            recorder=recorder,
+            on_beat=on_beat,
+            keep_fds=self._keep_fds,
+        )
+        listening = (
+            keys(supervisor.tell, lambda: supervisor.stop(OPERATOR))
+            if self._plan.velocity == "keyboard"
+            else contextlib.nullcontext()
+        )
+        with listening:
+            end = supervisor.run()
+        self.signal = end.signal
+        report = account(end, self._path, self._robot.watchdog_s)
+        if self._store is not None and self._path is not None:
+            try:
+                facts = {"task": self._metadata["task"], **report.to_json()}
+                moved = self._store.note_episode(self._path, facts).excitation
+                if moved is not None:
+                    report = dataclasses.replace(report, motion=Excitation(**moved))
+            except (DealHwError, OSError) as err:
+                # As on a full disk. The report matters more, and the next open takes the recording in.
+                report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
+        return report
+
+    def _make_passive(
+        self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]
+    ) -> bool:
+        """Make the robot passive for a dead control process, where that one had set out to command it."""
+        untouched = (
+            STARTING,
+            LOADING,
+            CONNECTING,
+            HANDING_BACK,
+            *(() if self._robot.homes_by_motor else (HOMING,)),
+        )
+        if self._plan.dry_run or phase in untouched:
+            return True
+        clock = MonotonicClock()
+
+        def tell(text: str, silence_s: float) -> None:
+            on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
+
+        config = _IN_VAIN if in_vain else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
+        return make_passive(self._robot, clock, config, progress=tell, abandoned=lambda: supervisor.abandoned)

@@ -1,0 +1,76 @@
+"""How an episode ended, told from the ends of its two processes."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+from deal_hw.cli.episode_report import EpisodeReport
+from deal_hw.control.cadence import CadenceReport
+from deal_hw.control.loop import Outcome
+from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd
+
+_LINK_WARNING = 0.01
+"""Share of corrupt and missing state frames above which the operator is told."""
+
+
+def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeReport:
+    """Return how an episode went from how its processes ended.
+
+    Args:
+        end: That.
+        path: The recording; None where there is none.
+        watchdog_s: ``Robot.watchdog_s``.
+    """
+    result = end.result or {}
+    outcome, reason, error = _verdict(end, result)
+    warnings = list(result.get("warnings", ()))
+    if not end.passive_confirmed:
+        cut = (
+            f"Where the cable is cut, its own watchdog has stopped the motor after {watchdog_s:g} s"
+            if watchdog_s
+            else "Where the link is gone it still holds its last command, with stiff motors: use its remote "
+            "(damping), then its switch"
+        )
+        warnings.append(f"the robot did not confirm that it is passive: switch it off by hand. {cut}")
+    cadence = CadenceReport.from_json(result["cadence"]) if result.get("cadence") else None
+    if cadence is not None and cadence.link_errors > _LINK_WARNING * max(cadence.states, 1):
+        share = cadence.link_errors / (cadence.states + cadence.link_errors)
+        warnings.append(
+            f"{cadence.link_errors} link errors, {share:.0%} of the state frames: "
+            "check cable, connectors and grounding"
+        )
+    if end.recorder is not None and not end.recorder.complete:
+        why = "; ".join(end.recorder.errors) or "for an unknown reason"
+        warnings.append(f"the recording is incomplete ({why}); mend it with `deal-hw data repair {path}`")
+        if outcome is Outcome.FINISHED:
+            outcome, reason, error = Outcome.FAILED, f"the recorder failed: {why}", "DatasetError"
+    return EpisodeReport(
+        path=path,
+        outcome=outcome,
+        reason=reason,
+        passive_confirmed=end.passive_confirmed,
+        cadence=cadence,
+        clipped=dict(result.get("clipped", {})),
+        cycles_sent=int(result.get("cycles_sent", 0)),
+        states_recorded=end.recorder.states if end.recorder is not None else 0,
+        warnings=tuple(warnings),
+        error=error,
+    )
+
+
+def _verdict(end: ChildEnd, result: dict[str, Any]) -> tuple[Outcome, str, str]:
+    """Return outcome, reason in words and the error's class."""
+    operator = end.stop_cause in (OPERATOR, SUSPENDED)
+    if end.killed and not operator:
+        return Outcome.FAILED, f"the control process was killed: {end.killed}", "SafetyError"
+    if end.stop_cause and not operator:
+        return Outcome.FAILED, end.stop_cause, "DatasetError"
+    if result:
+        return Outcome(result["outcome"]), result["reason"], result["error"]
+    if operator:
+        return Outcome.STOPPED, end.stop_cause, ""
+    code = end.exit_code
+    how = f"by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"with exit code {code}"
+    return Outcome.FAILED, f"the control process died {how} without a report", "SafetyError"
