@@ -25,6 +25,8 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
 from deal_hw.testing.faulty_proxy import FaultyProxy
 
+UNDER_TEST = os.environ.get("DEAL_HW_PYTHON", sys.executable)
+"""Python of the deal-hw that is run, perhaps of an older checkout; emulator and judgement are of this one."""
 PATIENCE_S = 75.0
 """A run that has not ended by then hangs [s]."""
 CONNECTING, TAKING_OVER, ARMING, RISING, RUNNING, LYING_DOWN, ENDING = (
@@ -187,7 +189,7 @@ class Rig(ABC):
         """Return the command line of a run."""
         dry = ["--dry-run"] if self.case.dry else []
         where = ["--port", port or self.port, "--out", str(self.folder / out)]
-        return [sys.executable, "-m", "deal_hw", *self.arguments(), *where, *dry]
+        return [UNDER_TEST, "-m", "deal_hw", *self.arguments(), *where, *dry]
 
     def launch(self, out: str, port: str = "") -> subprocess.Popen[str]:
         """Start a run in a process group of its own, as a shell with job control does."""

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fault_acts import LINK_S, freeze_link, kill_both, link_cases, process_cases
-from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
+from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, UNDER_TEST, Case, Rig
 from fault_table import main
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -72,7 +72,7 @@ class CartpoleRig(Rig):
         _, policy, _, wanted = self.policy_arguments()
         where = [port or self.port, str(self.folder / out / "dataset")]
         dry = ["dry"] * self.case.dry
-        return [sys.executable, "-c", DEPLOY, policy, wanted, str(self._seconds), *where, *dry]
+        return [UNDER_TEST, "-c", DEPLOY, policy, wanted, str(self._seconds), *where, *dry]
 
     @property
     def _seconds(self) -> float:

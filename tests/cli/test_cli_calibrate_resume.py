@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
+from deal_hw import calibration
 from deal_hw.calib.report import page
-from deal_hw.calibration import Progress, ProgressCallback, read_result
+from deal_hw.calibration import Progress, ProgressCallback
 from deal_hw.cli import calibrate as verb
 from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
 from deal_hw.cli.virtual import VirtualCartpole
@@ -157,5 +158,5 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     assert f"the results in {tmp_path / 'calibration'} are whole" in told and "--resume" not in told
     assert {file.name for file in (tmp_path / "calibration").iterdir()} == FILES
     assert [file.name for file in tmp_path.iterdir()] == ["calibration"]
-    assert read_result(tmp_path / "calibration").method == "default"
+    assert calibration.read_result(tmp_path / "calibration").method == "default"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
