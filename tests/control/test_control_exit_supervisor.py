@@ -22,6 +22,7 @@ from deal_hw.data.recorder_launch import RecorderOutcome
 CHILD = """
 import json, os, signal, socket, struct, sys, time
 
+signal.alarm(20)  # Whoever forgets this process waits no longer.
 orders = json.load(sys.stdin)
 channel = socket.socket(fileno=orders["status_fd"])
 channel.setblocking(True)

@@ -36,6 +36,14 @@ class Rig:
         self.calls += 1
         self.silent.set()
 
+    def words(self) -> list[str]:
+        """Wait for words; the vigil is not silent meanwhile."""
+        for _ in range(round(PATIENCE_S * 1e3)):
+            if words := self.vigil.words():
+                return words
+            assert not self.silent.wait(0.001)
+        raise AssertionError("the words did not come")
+
     def close(self) -> None:
         """The supervisor is gone."""
         self.supervisor.close()
@@ -64,8 +72,7 @@ def test_a_supervisor_that_beats_is_never_taken_for_silent() -> None:
         rig.clock.advance_ns(round(SILENCE_S * 1e9) - 1)
         rig.supervisor.tell(HEARTBEAT)
         rig.supervisor.tell("x")
-        while not rig.vigil.words():
-            assert not rig.silent.wait(0.001)
+        assert rig.words() == ["x"]
     rig.close()
     assert rig.calls == 0
 
@@ -95,8 +102,7 @@ def test_a_supervisor_that_falls_silent_is_reported_once() -> None:
     rig.supervisor.tell(HEARTBEAT)
     rig.supervisor.tell("x")
     rig.vigil.start()
-    while not rig.vigil.words():
-        pass
+    assert rig.words() == ["x"]
     rig.clock.advance_ns(round(SILENCE_S * 1e9))
     assert rig.silent.wait(PATIENCE_S)
     rig.vigil._thread.join(PATIENCE_S)
