@@ -20,7 +20,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import IO, Any, cast
+from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
@@ -171,7 +171,8 @@ class Supervisor:
         if self._stop_cause:
             child.send_signal(signal.SIGTERM)
         self._stale_ns = self._clock.now_ns() + round(START_SILENCE_S * 1e9)
-        with contextlib.suppress(BrokenPipeError), cast("IO[bytes]", child.stdin) as orders:
+        assert child.stdin is not None
+        with contextlib.suppress(BrokenPipeError), child.stdin as orders:
             orders.write(json.dumps(plan).encode())
         self._status = StatusReceiver(receiver)
         return child, self._status

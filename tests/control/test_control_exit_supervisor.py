@@ -313,6 +313,31 @@ def test_heartbeats_go_by_the_clock() -> None:
     assert end.exit_code == 0
 
 
+def test_the_supervisor_wakes_up_as_soon_as_a_sign_of_life_is_overdue(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every 50 ms otherwise. 1 ms more, because the kernel may wake it up a little early."""
+    waits: list[float] = []
+    true_select = select.select
+    do = (
+        "channel.send(struct.pack('<cqdI', b'H', 10**9, 0.02, 0) + b'running')\n"
+        "while channel.recv(64) != b'go on': pass\n"
+        "channel.send(struct.pack('<cqdI', b'H', 10**9 - 1, 0.0, 0) + b'homing'); time.sleep(600)"
+    )
+    run = Run(do, clock=VirtualClock(10**9))
+
+    def wait(read: list[Any], write: list[Any], other: list[Any], timeout_s: float) -> Any:
+        waits.append(timeout_s)
+        if len(run.beats) == 1:
+            run.supervisor.tell("go on")
+        return true_select(read, write, other, timeout_s)
+
+    monkeypatch.setattr(module.select, "select", wait)
+    assert run.end().killed == "it gave no sign of life while homing"
+    assert waits[0] == 0.05
+    assert waits[-2:] == pytest.approx([0.021, 0.001], rel=1e-9)
+
+
 def test_a_process_that_never_beats_has_thirty_seconds() -> None:
     """To the nanosecond: it is let live at 30 s, and killed 1 ns later."""
 
