@@ -6,6 +6,7 @@ import os
 import select
 import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -355,13 +356,22 @@ def test_a_process_that_never_beats_has_thirty_seconds() -> None:
     assert clock.asked > 30
 
 
-def test_what_is_killed_is_hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine a killed process takes long to be gone, and the robot is stiff meanwhile."""
+def test_what_is_killed_is_hurried_and_waited_for_without_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot is stiff meanwhile: no time is lost on a busy machine, nor by a wait that polls."""
     hurried: list[int] = []
+    limits: list[float | None] = []
+    true_wait = subprocess.Popen.wait
+
+    def wait(child: subprocess.Popen[bytes], timeout: float | None = None) -> int:
+        limits.append(timeout)
+        return true_wait(child, timeout)
+
     monkeypatch.setattr(module, "hurry", hurried.append)
+    monkeypatch.setattr(subprocess.Popen, "wait", wait)
     run = Run("beat('homing', 0.02); time.sleep(600)")
     assert run.end().exit_code == -9
     assert run.supervisor._child is not None and hurried == [run.supervisor._child.pid]
+    assert limits == [None]
 
 
 class Recorder:

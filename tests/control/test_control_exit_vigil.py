@@ -7,6 +7,8 @@ import socket
 import subprocess
 import sys
 import threading
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -96,6 +98,30 @@ def test_a_wait_that_ends_early_is_taken_up_again() -> None:
     assert rig.calls == 0
 
 
+def test_the_kernels_wait_is_what_is_left_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread with a real-time priority must not spin; where nothing is left, it only looks."""
+    rig = Rig()
+    waits: list[float] = []
+
+    class Scripted(VirtualClock):
+        times_ms = iter((0, 5, 5, 30, 30))
+
+        def now_ns(self) -> int:
+            """Begin; what is left; not silent yet; what is left; silent."""
+            return next(self.times_ms) * 10**6
+
+    def wait(read: list[Any], write: list[Any], other: list[Any], timeout_s: float) -> tuple[list[Any], ...]:
+        waits.append(timeout_s)
+        return [], [], []
+
+    monkeypatch.setattr("deal_hw.control.vigil.select.select", wait)
+    rig.vigil._clock = Scripted()
+    rig.vigil.start()
+    assert rig.silent.wait(PATIENCE_S)
+    rig.close()
+    assert waits == pytest.approx([0.015, 0.0])
+
+
 def test_a_supervisor_that_falls_silent_is_reported_once() -> None:
     """As soon as the limit is reached, from the last beat on."""
     rig = Rig()
@@ -121,10 +147,28 @@ def test_a_supervisor_that_never_spoke_is_reported() -> None:
 
 
 def test_the_vigil_keeps_nobody_alive() -> None:
-    """Its thread is a daemon; the limit is the one that docs/safety.md names."""
+    """Its thread is a daemon, with a name for debuggers."""
     rig = Rig()
     assert rig.vigil._thread.daemon
-    assert SUPERVISOR_SILENCE_S == 1.0
+    assert rig.vigil._thread.name == "supervisor vigil"
+    rig.vigil.start()
+    rig.close()
+
+
+def test_the_limit_is_the_one_that_the_docs_name() -> None:
+    """docs/safety.md says 1 s."""
+    rig = Rig()
+    vigil = SupervisorVigil(rig.vigil._status, rig.clock, rig._on_silence)
+    assert vigil._silence_ns == round(SUPERVISOR_SILENCE_S * 1e9) == 10**9
+    rig.vigil.start()
+    rig.close()
+
+
+def test_words_that_nobody_takes_are_forgotten() -> None:
+    """The newest 256 are kept."""
+    rig = Rig()
+    rig.vigil._words.extend(map(str, range(300)))
+    assert rig.vigil.words() == list(map(str, range(44, 300)))
     rig.vigil.start()
     rig.close()
 
@@ -149,6 +193,32 @@ def test_a_claim_is_exclusive_and_says_who_holds_it() -> None:
     with second:
         assert second.fileno() >= 0
     second.release()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["", "/a/b/third", b"odd\xff", "fifth", "sixth"], "third odd\N{REPLACEMENT CHARACTER} fifth"),
+        (["x" * 200], "x" * 200),
+    ],
+)
+def test_a_claim_says_with_what_command_it_is_held(
+    arguments: list[str | bytes], words: str, tmp_path: Path
+) -> None:
+    """Six words at most, without their folders, 120 letters in all; an empty word counts and is not shown."""
+    holder = tmp_path / "holder.py"
+    holder.write_text(
+        "import sys\nfrom deal_hw.control.claim import LocalClaim\n"
+        "with LocalClaim('a robot'):\n    print(flush=True)\n    sys.stdin.read()\n"
+    )
+    command = [sys.executable, str(holder), *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None and child.stdout.readline() == b"\n"
+        with pytest.raises(PortBusyError) as raised:
+            LocalClaim("a robot").acquire()
+        child.communicate()
+    shown = f"{Path(sys.executable).name} holder.py {words}"[:120]
+    assert str(raised.value).startswith(f"a robot: the robot is in use by process {child.pid} ({shown}). Two")
 
 
 def test_a_claim_that_is_not_held_has_no_descriptor() -> None:
