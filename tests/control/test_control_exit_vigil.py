@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -260,6 +261,31 @@ def test_a_holder_that_cannot_be_asked_is_another_run() -> None:
         silent.bind(claim._name)
         with pytest.raises(PortBusyError, match="in use by another run"):
             claim.acquire()
+
+
+def test_a_holder_with_a_full_queue_is_not_waited_for() -> None:
+    """So many ask it at once that the kernel lets no more: then it is another run."""
+    claim = LocalClaim("a robot")
+    texts: list[str] = []
+
+    def ask() -> None:
+        with pytest.raises(PortBusyError) as raised:
+            claim.acquire()
+        texts.append(str(raised.value))
+
+    with contextlib.ExitStack() as opened:
+        busy = opened.enter_context(socket.socket(socket.AF_UNIX))
+        busy.bind(claim._name)
+        busy.listen(0)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                asking = opened.enter_context(socket.socket(socket.AF_UNIX))
+                asking.setblocking(False)
+                asking.connect(claim._name)
+        thread = threading.Thread(target=ask, daemon=True)
+        thread.start()
+        thread.join(PATIENCE_S)
+        assert len(texts) == 1 and "in use by another run. Two" in texts[0]
 
 
 def test_other_errors_of_the_kernel_come_out(monkeypatch: pytest.MonkeyPatch) -> None:
