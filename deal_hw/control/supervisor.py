@@ -77,6 +77,8 @@ class Supervisor:
         keep_fds: More descriptors that live as long as the control process, such as a claim.
     """
 
+    _stale_ns: int
+
     def __init__(
         self,
         *,
@@ -97,7 +99,6 @@ class Supervisor:
         self._result: dict[str, Any] | None = None
         self._killed = self._stop_cause = self._signal = ""
         self._stops = self._beat_ns = 0
-        self._stale_ns = 0
         self._phase = STARTING
 
     def run(self) -> ChildEnd:
