@@ -58,7 +58,7 @@ class ChildEnd:
     stop_cause: str
     passive_confirmed: bool
     recorder: RecorderOutcome | None
-    signal: str = ""
+    signal: str
 
 
 class Supervisor:
