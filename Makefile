@@ -61,7 +61,7 @@ coverage-safety: $(STAMP) ## each line and branch of the safety module and of th
 	  -m pytest -q tests/control/test_control_safety*.py tests/control/test_control_exit*.py
 	$(BIN)/coverage report $(SAFETY_COVERAGE) --show-missing --fail-under=100
 
-mutation: $(STAMP) ## change safety module and exit path, place by place; each change must break a test (an hour)
+mutation: $(STAMP) ## change safety module and exit path, place by place; each change must break a test (half an hour)
 	$(BIN)/python tools/mutate_safety.py
 
 bench: $(STAMP) ## a small benchmark; BENCH_ARGS chooses another

@@ -43,7 +43,7 @@ class LocalClaim:
         Raises:
             PortBusyError: Another run holds it; the text says which.
         """
-        held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        held = socket.socket(socket.AF_UNIX)
         try:
             held.bind(self._name)
             # Those who ask are never taken from the queue: it must be long enough for many of them.
@@ -74,12 +74,12 @@ class LocalClaim:
         self.release()
 
     def _holder(self) -> str:
-        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as asking:
             asking.setblocking(False)
             asking.connect(self._name)
             credentials = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER_CREDENTIALS.size)
             pid, _, _ = _PEER_CREDENTIALS.unpack(credentials)
             words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-            command = " ".join(Path(word.decode("utf-8", "replace")).name for word in words[:6] if word)
+            command = " ".join(Path(word.decode(errors="replace")).name for word in words[:6] if word)
             return f"process {pid} ({command[:120]})"
         return "another run"

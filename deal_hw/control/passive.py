@@ -24,7 +24,7 @@ class PassiveConfig:
     """How long the command is repeated without a sign of the robot [s]: longer than a network takes to come
     back (Zenoh goes to its end point once a second; a switch that restarts takes some 20 s)."""
     confirm_s: float = 0.05
-    """How long to wait for the robot to show each one [s]."""
+    """How long to wait for the robot to show each one, and at most to read what waited from before [s]."""
     reopen_s: float = 0.5
     """Time between two tries to open a transport that is lost [s]."""
     silent_s: float = 3.0
@@ -78,13 +78,15 @@ def make_passive(
 class _Endeavour:
     """The attempts at making one robot passive, and what is known of the link between them."""
 
+    _next_ns: int
+    _trouble: Exception | None
+
     def __init__(
         self, robot: Robot, clock: Clock, config: PassiveConfig, progress: Callable[[str, float], None]
     ) -> None:
         self._robot, self._clock, self._config, self._progress = robot, clock, config, progress
         self._begin_ns = self._heard_ns = clock.now_ns()
         self._reopen_ns = self._begin_ns
-        self._trouble: Exception | None = None
 
     @property
     def over(self) -> bool:
@@ -93,14 +95,12 @@ class _Endeavour:
 
     def attempt(self) -> bool:
         """Send the command once; return whether the robot showed that it is passive."""
+        self._next_ns = self._until_ns()
         # Even a bug in a driver must not keep the next attempt from being made.
         try:
-            # First of all the command. A sample that waited since before says nothing: only what comes from
-            # now on counts. A path that cannot be read may still be written.
+            # First of all the command: a path that cannot be read may still be written.
             self._robot.passive()
-            with contextlib.suppress(Exception):
-                self._drain()
-            confirmed = self._confirmed()
+            confirmed = self._drained() and self._confirmed()
             self._trouble = None
         except Exception as error:
             confirmed, self._trouble = False, error
@@ -108,7 +108,6 @@ class _Endeavour:
 
     def prepare_next(self) -> None:
         """Tell, open the transport again where it seems lost, and wait where the attempt took no time."""
-        until_ns = self._clock.now_ns() + (round(self._config.confirm_s * 1e9) if self._trouble else 0)
         silent = self._clock.now_ns() - self._heard_ns >= round(self._config.silent_s * 1e9)
         if (self._trouble is not None or silent) and self._clock.now_ns() >= self._reopen_ns:
             # Opening may take seconds where something listens and does not answer.
@@ -118,7 +117,11 @@ class _Endeavour:
             pause_s = self._config.reopen_s if self._trouble is not None else self._config.silent_s
             self._reopen_ns = self._clock.now_ns() + round(pause_s * 1e9)
         self._tell(silence_s=1.0)
-        self._clock.sleep_until_ns(until_ns)
+        self._clock.sleep_until_ns(self._next_ns)
+
+    def _until_ns(self) -> int:
+        """Return when the robot has had the time that it is given to show one command."""
+        return self._clock.now_ns() + round(self._config.confirm_s * 1e9)
 
     def _tell(self, silence_s: float) -> None:
         passed_s = (self._clock.now_ns() - self._begin_ns) // 10**9
@@ -131,16 +134,22 @@ class _Endeavour:
         text = f"{why}; passive command repeated for {passed_s} s, {left_s} s left"
         self._progress(text, silence_s)
 
-    def _drain(self) -> None:
-        try:
-            while True:
+    def _drained(self) -> bool:
+        """Forget the samples that waited; return whether the next one comes from after the command.
+
+        A robot that sends faster than it is read must not keep the next command from being sent.
+        """
+        until_ns = self._until_ns()
+        while self._clock.now_ns() < until_ns:
+            try:
                 self._robot.read_state(0.0)
-                self._heard_ns = self._clock.now_ns()
-        except TransportTimeoutError:
-            return
+            except TransportTimeoutError:
+                return True
+            self._heard_ns = self._clock.now_ns()
+        return False
 
     def _confirmed(self) -> bool:
-        until_ns = self._clock.now_ns() + round(self._config.confirm_s * 1e9)
+        until_ns = self._until_ns()
         while (left_ns := until_ns - self._clock.now_ns()) > 0:
             try:
                 state = self._robot.read_state(left_ns * 1e-9)

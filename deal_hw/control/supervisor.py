@@ -20,7 +20,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import IO, Any, cast
+from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
@@ -58,7 +58,7 @@ class ChildEnd:
     stop_cause: str
     passive_confirmed: bool
     recorder: RecorderOutcome | None
-    signal: str = ""
+    signal: str
 
 
 class Supervisor:
@@ -76,6 +76,8 @@ class Supervisor:
         clock: For heartbeats; the machine's monotonic clock by default.
         keep_fds: More descriptors that live as long as the control process, such as a claim.
     """
+
+    _stale_ns: int
 
     def __init__(
         self,
@@ -97,7 +99,6 @@ class Supervisor:
         self._result: dict[str, Any] | None = None
         self._killed = self._stop_cause = self._signal = ""
         self._stops = self._beat_ns = 0
-        self._stale_ns = 0
         self._phase = STARTING
 
     def run(self) -> ChildEnd:
@@ -171,7 +172,8 @@ class Supervisor:
         if self._stop_cause:
             child.send_signal(signal.SIGTERM)
         self._stale_ns = self._clock.now_ns() + round(START_SILENCE_S * 1e9)
-        with contextlib.suppress(BrokenPipeError), cast("IO[bytes]", child.stdin) as orders:
+        assert child.stdin is not None
+        with contextlib.suppress(BrokenPipeError), child.stdin as orders:
             orders.write(json.dumps(plan).encode())
         self._status = StatusReceiver(receiver)
         return child, self._status

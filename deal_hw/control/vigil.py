@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import select
 import threading
 from collections import deque
@@ -44,19 +43,14 @@ class SupervisorVigil:
 
     def words(self) -> list[str]:
         """Return what the supervisor told since the last call, heartbeats left out."""
-        words: list[str] = []
-        with contextlib.suppress(IndexError):
-            while True:
-                words.append(self._words.popleft())
-        return words
+        return [self._words.popleft() for _ in range(len(self._words))]
 
     def _listen(self) -> None:
         heard_ns = self._clock.now_ns()
         while True:
             left_ns = heard_ns + self._silence_ns - self._clock.now_ns()
             ready = select.select([self._status], [], [], max(left_ns, 0) * 1e-9)[0]
-            words = self._status.heard() if ready else []
-            if words:
+            if words := self._status.heard():
                 heard_ns = self._clock.now_ns()
                 self._words.extend(word for word in words if word != HEARTBEAT)
             elif ready:

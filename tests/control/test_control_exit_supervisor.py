@@ -6,9 +6,11 @@ import os
 import select
 import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -22,6 +24,7 @@ from deal_hw.data.recorder_launch import RecorderOutcome
 CHILD = """
 import json, os, signal, socket, struct, sys, time
 
+signal.alarm(20)  # Whoever forgets this process waits no longer.
 orders = json.load(sys.stdin)
 channel = socket.socket(fileno=orders["status_fd"])
 channel.setblocking(True)
@@ -159,17 +162,25 @@ def test_a_failing_supervisor_leaves_no_process_and_a_passive_robot() -> None:
 
 @pytest.mark.parametrize(
     ("number", "cause"),
-    [(signal.SIGINT, OPERATOR), (signal.SIGTERM, OPERATOR), (signal.SIGTSTP, SUSPENDED)],
+    [
+        (signal.SIGINT, "stopped by the operator"),
+        (signal.SIGTERM, "stopped by the operator"),
+        (signal.SIGTSTP, "suspended by the operator (Ctrl-Z)"),
+    ],
 )
 def test_the_operators_signals_ask_once_and_are_named(number: signal.Signals, cause: str) -> None:
     """The process ends by its passive route; Ctrl-Z stops nothing yet; the handlers of before are back."""
-    before = signal.getsignal(number)
+
+    def ours(number: int, frame: FrameType | None) -> None:
+        raise AssertionError("the signal did not reach the supervisor")
+
+    before = signal.signal(number, ours)
     run = Run(
         "on_term(stopped); beat('running'); time.sleep(600)", lambda run, beat: os.kill(os.getpid(), number)
     )
     end = run.end()
+    assert signal.signal(number, before) is ours
     assert end == ChildEnd({"passive_confirmed": True, "how": "asked"}, 0, "", cause, True, None, number.name)
-    assert signal.getsignal(number) is before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP])
@@ -312,6 +323,31 @@ def test_heartbeats_go_by_the_clock() -> None:
     assert end.exit_code == 0
 
 
+def test_the_supervisor_wakes_up_as_soon_as_a_sign_of_life_is_overdue(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every 50 ms otherwise. 1 ms more, because the kernel may wake it up a little early."""
+    waits: list[float] = []
+    true_select = select.select
+    do = (
+        "channel.send(struct.pack('<cqdI', b'H', 10**9, 0.02, 0) + b'running')\n"
+        "while channel.recv(64) != b'go on': pass\n"
+        "channel.send(struct.pack('<cqdI', b'H', 10**9 - 1, 0.0, 0) + b'homing'); time.sleep(600)"
+    )
+    run = Run(do, clock=VirtualClock(10**9))
+
+    def wait(read: list[Any], write: list[Any], other: list[Any], timeout_s: float) -> Any:
+        waits.append(timeout_s)
+        if len(run.beats) == 1:
+            run.supervisor.tell("go on")
+        return true_select(read, write, other, timeout_s)
+
+    monkeypatch.setattr(module.select, "select", wait)
+    assert run.end().killed == "it gave no sign of life while homing"
+    assert waits[0] == 0.05
+    assert waits[-2:] == pytest.approx([0.021, 0.001], rel=1e-9)
+
+
 def test_a_process_that_never_beats_has_thirty_seconds() -> None:
     """To the nanosecond: it is let live at 30 s, and killed 1 ns later."""
 
@@ -329,13 +365,36 @@ def test_a_process_that_never_beats_has_thirty_seconds() -> None:
     assert clock.asked > 30
 
 
-def test_what_is_killed_is_hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine a killed process takes long to be gone, and the robot is stiff meanwhile."""
+@pytest.fixture
+def limits(monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
+    """For how long the end of a process was waited for [s]; None without a limit."""
+    found: list[float | None] = []
+    true_wait = subprocess.Popen.wait
+
+    def wait(child: subprocess.Popen[bytes], timeout: float | None = None) -> int:
+        found.append(timeout)
+        return true_wait(child, timeout)
+
+    monkeypatch.setattr(subprocess.Popen, "wait", wait)
+    return found
+
+
+def test_a_process_has_three_seconds_to_end_after_its_last_word(limits: list[float | None]) -> None:
+    """It still has its files to close."""
+    assert Run("result(passive_confirmed=True)").end().exit_code == 0
+    assert limits == [3.0]
+
+
+def test_what_is_killed_is_hurried_and_waited_for_without_a_limit(
+    monkeypatch: pytest.MonkeyPatch, limits: list[float | None]
+) -> None:
+    """The robot is stiff meanwhile: no time is lost on a busy machine, nor by a wait that polls."""
     hurried: list[int] = []
     monkeypatch.setattr(module, "hurry", hurried.append)
     run = Run("beat('homing', 0.02); time.sleep(600)")
     assert run.end().exit_code == -9
     assert run.supervisor._child is not None and hurried == [run.supervisor._child.pid]
+    assert limits == [None]
 
 
 class Recorder:

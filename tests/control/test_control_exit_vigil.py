@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import subprocess
 import sys
 import threading
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,6 +39,14 @@ class Rig:
         self.calls += 1
         self.silent.set()
 
+    def words(self) -> list[str]:
+        """Wait for words; the vigil is not silent meanwhile."""
+        for _ in range(round(PATIENCE_S * 1e3)):
+            if words := self.vigil.words():
+                return words
+            assert not self.silent.wait(0.001)
+        raise AssertionError("the words did not come")
+
     def close(self) -> None:
         """The supervisor is gone."""
         self.supervisor.close()
@@ -64,8 +75,7 @@ def test_a_supervisor_that_beats_is_never_taken_for_silent() -> None:
         rig.clock.advance_ns(round(SILENCE_S * 1e9) - 1)
         rig.supervisor.tell(HEARTBEAT)
         rig.supervisor.tell("x")
-        while not rig.vigil.words():
-            assert not rig.silent.wait(0.001)
+        assert rig.words() == ["x"]
     rig.close()
     assert rig.calls == 0
 
@@ -89,14 +99,37 @@ def test_a_wait_that_ends_early_is_taken_up_again() -> None:
     assert rig.calls == 0
 
 
+def test_the_kernels_wait_is_what_is_left_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread with a real-time priority must not spin; where nothing is left, it only looks."""
+    rig = Rig()
+    waits: list[float] = []
+
+    class Scripted(VirtualClock):
+        times_ms = iter((0, 5, 5, 30, 30))
+
+        def now_ns(self) -> int:
+            """Begin; what is left; not silent yet; what is left; silent."""
+            return next(self.times_ms) * 10**6
+
+    def wait(read: list[Any], write: list[Any], other: list[Any], timeout_s: float) -> tuple[list[Any], ...]:
+        waits.append(timeout_s)
+        return [], [], []
+
+    monkeypatch.setattr("deal_hw.control.vigil.select.select", wait)
+    rig.vigil._clock = Scripted()
+    rig.vigil.start()
+    assert rig.silent.wait(PATIENCE_S)
+    rig.close()
+    assert waits == pytest.approx([0.015, 0.0])
+
+
 def test_a_supervisor_that_falls_silent_is_reported_once() -> None:
     """As soon as the limit is reached, from the last beat on."""
     rig = Rig()
     rig.supervisor.tell(HEARTBEAT)
     rig.supervisor.tell("x")
     rig.vigil.start()
-    while not rig.vigil.words():
-        pass
+    assert rig.words() == ["x"]
     rig.clock.advance_ns(round(SILENCE_S * 1e9))
     assert rig.silent.wait(PATIENCE_S)
     rig.vigil._thread.join(PATIENCE_S)
@@ -115,10 +148,28 @@ def test_a_supervisor_that_never_spoke_is_reported() -> None:
 
 
 def test_the_vigil_keeps_nobody_alive() -> None:
-    """Its thread is a daemon; the limit is the one that docs/safety.md names."""
+    """Its thread is a daemon, with a name for debuggers."""
     rig = Rig()
     assert rig.vigil._thread.daemon
-    assert SUPERVISOR_SILENCE_S == 1.0
+    assert rig.vigil._thread.name == "supervisor vigil"
+    rig.vigil.start()
+    rig.close()
+
+
+def test_the_limit_is_the_one_that_the_docs_name() -> None:
+    """docs/safety.md says 1 s."""
+    rig = Rig()
+    vigil = SupervisorVigil(rig.vigil._status, rig.clock, rig._on_silence)
+    assert vigil._silence_ns == round(SUPERVISOR_SILENCE_S * 1e9) == 10**9
+    rig.vigil.start()
+    rig.close()
+
+
+def test_words_that_nobody_takes_are_forgotten() -> None:
+    """The newest 256 are kept."""
+    rig = Rig()
+    rig.vigil._words.extend(map(str, range(300)))
+    assert rig.vigil.words() == list(map(str, range(44, 300)))
     rig.vigil.start()
     rig.close()
 
@@ -143,6 +194,32 @@ def test_a_claim_is_exclusive_and_says_who_holds_it() -> None:
     with second:
         assert second.fileno() >= 0
     second.release()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["", "/a/b/third", b"odd\xff", "fifth", "sixth"], "third odd\N{REPLACEMENT CHARACTER} fifth"),
+        (["x" * 200], "x" * 200),
+    ],
+)
+def test_a_claim_says_with_what_command_it_is_held(
+    arguments: list[str | bytes], words: str, tmp_path: Path
+) -> None:
+    """Six words at most, without their folders, 120 letters in all; an empty word counts and is not shown."""
+    holder = tmp_path / "holder.py"
+    holder.write_text(
+        "import sys\nfrom deal_hw.control.claim import LocalClaim\n"
+        "with LocalClaim('a robot'):\n    print(flush=True)\n    sys.stdin.read()\n"
+    )
+    command = [sys.executable, str(holder), *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None and child.stdout.readline() == b"\n"
+        with pytest.raises(PortBusyError) as raised:
+            LocalClaim("a robot").acquire()
+        child.communicate()
+    shown = f"{Path(sys.executable).name} holder.py {words}"[:120]
+    assert str(raised.value).startswith(f"a robot: the robot is in use by process {child.pid} ({shown}). Two")
 
 
 def test_a_claim_that_is_not_held_has_no_descriptor() -> None:
@@ -184,6 +261,31 @@ def test_a_holder_that_cannot_be_asked_is_another_run() -> None:
         silent.bind(claim._name)
         with pytest.raises(PortBusyError, match="in use by another run"):
             claim.acquire()
+
+
+def test_a_holder_with_a_full_queue_is_not_waited_for() -> None:
+    """So many ask it at once that the kernel lets no more: then it is another run."""
+    claim = LocalClaim("a robot")
+    texts: list[str] = []
+
+    def ask() -> None:
+        with pytest.raises(PortBusyError) as raised:
+            claim.acquire()
+        texts.append(str(raised.value))
+
+    with contextlib.ExitStack() as opened:
+        busy = opened.enter_context(socket.socket(socket.AF_UNIX))
+        busy.bind(claim._name)
+        busy.listen(0)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                asking = opened.enter_context(socket.socket(socket.AF_UNIX))
+                asking.setblocking(False)
+                asking.connect(claim._name)
+        thread = threading.Thread(target=ask, daemon=True)
+        thread.start()
+        thread.join(PATIENCE_S)
+        assert len(texts) == 1 and "in use by another run. Two" in texts[0]
 
 
 def test_other_errors_of_the_kernel_come_out(monkeypatch: pytest.MonkeyPatch) -> None:

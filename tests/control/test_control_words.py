@@ -12,8 +12,9 @@ from deal_hw.control.handover import HEARTBEAT, Beat, StatusReceiver, StatusSend
 from deal_hw.control.supervisor import ChildEnd, Supervisor
 
 CHILD = """
-import json, os, socket, sys
+import json, os, signal, socket, sys
 
+signal.alarm(20)  # Whoever says nothing to this process waits no longer.
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.handover import StatusSender
 
