@@ -30,7 +30,8 @@ ROOMS = {
         {"search", "fit"},
         {"deal_paper", "uncertainty"},
         {"validation", "design", "baselines"},
-        {"pipeline", "open_loop"},
+        {"pipeline"},
+        {"open_loop"},
         {"methods", "report"},
     ),
 }
