@@ -91,7 +91,8 @@ def damage_json(rng: random.Random, data: bytes, others: Sequence[bytes]) -> byt
     values = json.loads(data)
     for _ in range(rng.choice((1, 1, 2, 3))):
         values = damage_values(rng, values)
-    return json.dumps(values).replace(f'"{_DEEP}"', "[" * 100_000 + "]" * 100_000).encode()
+    # A few times only: repeated a hundred times twice over, the input itself would have 2 GB.
+    return json.dumps(values).replace(f'"{_DEEP}"', "[" * 100_000 + "]" * 100_000, 20).encode()
 
 
 def damage_values(rng: random.Random, values: Any) -> Any:
