@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -30,8 +31,10 @@ from deal_hw.calib.fit.refinement import mismatch
 from deal_hw.calib.pipeline import PolishedMethod, conclusive, local_fit, without_search
 from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
+from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.uncertainty.correlated import confounded
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, uncertainty
+from deal_hw.calib.validation.checks import with_causes, with_step
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.split_half import FALSE_ALARMS, Halves, HalvesRow, heed
 from deal_hw.calibration import (
@@ -124,6 +127,7 @@ class OpenLoop(CalibrationMethod[Problem]):
             return dataclasses.replace(
                 explained, steps=problem.steps - before, seconds=time.perf_counter() - began
             )
+        pieces, local_steps = problem, problem.steps - before
         if self.folds:
             problem = _whole(problem)
         work = _Work(problem, self.search, budget, progress, HORIZONS_S if self.folds else (LONG_S,))
@@ -145,6 +149,12 @@ class OpenLoop(CalibrationMethod[Problem]):
         known = _known(problem, fit)
         halves = _halves(problem, fit, recipe, known)
         known = heed(problem, known, theta, halves)
+        facts: dict[str, Any] = {}
+        if local is not None:
+            # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
+            local = with_rows(local)
+            known, facts["physics_step"] = with_step(pieces, local, known, theta)
+            known, facts["diagnosis"] = with_causes(pieces, local, known)
         left = mismatch(problem, theta, latency_s, MISMATCH_S)
         chi2 = left.cost / max(left.count, 1)
         found = confounded(problem, fit.hessian / known.inflation)
@@ -163,6 +173,7 @@ class OpenLoop(CalibrationMethod[Problem]):
             "at_bound": [n for n, b in zip(problem.space.names, known.shape.bound, strict=True) if b != 0],
             "halves": halves.to_json(),
             "confounded": [pair.to_json() for pair in found],
+            **facts,
         }
         return dataclasses.replace(
             searched,
@@ -176,7 +187,7 @@ class OpenLoop(CalibrationMethod[Problem]):
             latency_interval_s=known.latency_interval_s,
             chi2=chi2,
             alarms=(*known.alarms, *_unexplained(chi2)),
-            steps=work.steps,
+            steps=work.steps + (local_steps if pieces is problem else pieces.steps - before),
             seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
         )

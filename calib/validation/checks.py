@@ -20,6 +20,7 @@ from deal_hw.calib.uncertainty.intervals import (
 from deal_hw.calib.uncertainty.physics_step import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import Finding, diagnose, motions
 from deal_hw.calib.validation.split_half import compare_halves, heed
+from deal_hw.types import FloatArray
 
 MOST_CAUSES = 2
 """So many causes are worded in alarms; all are in the provenance."""
@@ -79,20 +80,40 @@ def judge(
             "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
         }
     if settings.physics_step:
-        step = check_step(problem, polished)
-        facts["physics_step"] = step.to_json()
-        alarm = step_alarm(problem, known, step)
-        known = counted(problem, known, polished.theta, step)
-        known = dataclasses.replace(known, alarms=(*known.alarms, *filter(None, [alarm])))
+        known, facts["physics_step"] = with_step(problem, polished, known, polished.theta)
     if settings.halves:
         halves = compare_halves(problem, polished, known)
         known = heed(problem, known, polished.theta, halves)
         facts["halves"] = halves.to_json()
     if settings.diagnosis and unexplained(polished):
-        found = diagnosed(problem, polished, known)
-        facts["diagnosis"] = [dataclasses.asdict(f) for f in found]
-        known = dataclasses.replace(known, alarms=(*known.alarms, *(_words(f) for f in found[:MOST_CAUSES])))
+        known, facts["diagnosis"] = with_causes(problem, polished, known)
     return known, facts
+
+
+def with_step(
+    problem: Problem, polished: Polished, known: Uncertainty, theta: FloatArray
+) -> tuple[Uncertainty, dict[str, Any]]:
+    """Return what is known, the physics step counted, and what the check found, as plain JSON values.
+
+    Args:
+        problem: The problem.
+        polished: Where a fit of windows ended, with linearised residuals.
+        known: What was known before.
+        theta: The estimate that is about, (K,).
+    """
+    step = check_step(problem, polished)
+    alarms = filter(None, [step_alarm(problem, known, step)])
+    known = counted(problem, known, theta, step)
+    return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), step.to_json()
+
+
+def with_causes(
+    problem: Problem, polished: Polished, known: Uncertainty
+) -> tuple[Uncertainty, list[dict[str, Any]]]:
+    """Return what is known, alarmed by what the residual looks like, and all causes as plain JSON values."""
+    found = diagnosed(problem, polished, known)
+    alarms = (_words(f) for f in found[:MOST_CAUSES])
+    return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
 
 
 def diagnosed(problem: Problem, polished: Polished, known: Uncertainty) -> tuple[Finding, ...]:

@@ -32,13 +32,15 @@ class Bench:
     """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
 
     bench: tyro.conf.Positional[
-        Literal["loop", "honest", "mismatch", "paper", "real", "go2-codec", "go2-transport"]
+        Literal["loop", "honest", "mismatch", "paper", "real", "verdict", "go2-codec", "go2-transport"]
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
     simulator here does. paper: DEAL's protocol, whose target is the centre of the range. real: recordings
-    of a real robot (--model, --data), judged on held-out motion. go2-codec: what the Go2's messages cost to
-    write and read. go2-transport: how regular 500 commands and states a second are over a wire."""
+    of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
+    without deliberate faults: is a right model called right, and a wrong one wrong? go2-codec: what the
+    Go2's messages cost to write and read. go2-transport: how regular 500 commands and states a second are
+    over a wire."""
 
     recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
 
@@ -159,7 +161,7 @@ def bench(config: Bench) -> int:
         return bench_transport(config.link, config.out, quiet=config.quiet)
     out = config.out or Path(f"{config.bench}.json")
     rows = _load(out)
-    makers = {"loop": _loop_runs, "real": _real_runs}
+    makers = {"loop": _loop_runs, "real": _real_runs, "verdict": _verdict_runs}
     names, runs = makers.get(config.bench, _calibration_runs)(config, out)
     done = {tuple(r.get(name, "") for name in names) for r in rows if not r["error"]}
     for number, (key, run) in enumerate(runs):
@@ -271,7 +273,26 @@ def _real_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
     return KEY, [(key, make(*cell)) for key, cell in zip(keys, cells, strict=True)]
 
 
+def _verdict_runs(config: Bench, out: Path) -> tuple[tuple[str, ...], Runs]:
+    try:
+        from deal_hw.cli.bench_verdict import KEY, cells, run_cell
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "bench") from err
+
+    budget = Budget(population=config.population, generations=config.generations)
+
+    def make(kind: str, fault: str, seed: int) -> Callable[[], dict[str, Any]]:
+        return lambda: run_cell(kind, fault, seed, budget=budget, threads=config.threads)
+
+    chosen = cells(parse_seeds(config.seeds))
+    return KEY, [(cell, make(*cell)) for cell in chosen]
+
+
 def _line(row: Mapping[str, Any]) -> str:
+    if row["bench"] == "verdict":
+        from deal_hw.cli.bench_verdict import line
+
+        return line(row)
     head = f"{' '.join(_group(row))} seed {row['seed']}"
     if row["error"]:
         return f"{head}: {row['error']}"
@@ -335,7 +356,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def _figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    if not rows or rows[0]["bench"] == "real":
+    if not rows or rows[0]["bench"] in ("real", "verdict"):
         return
     try:
         from matplotlib.figure import Figure
@@ -407,6 +428,11 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
     good = [row for row in rows if not row["error"]]
     if good and good[0]["bench"] == "real":
         _print_real(good)
+        return
+    if good and good[0]["bench"] == "verdict":
+        from deal_hw.cli.bench_verdict import summary
+
+        print("\n".join(summary(good)))
         return
     table = Table(title="median over seeds (worst)")
     for name in (

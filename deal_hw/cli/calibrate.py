@@ -175,9 +175,9 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
     budget = Budget(population=config.population, generations=config.generations, polish=config.polish)
-    work = prepare_dataset(config) if source.model is None else _prepare_model(config)
+    work = prepare(config)
     known_std = residual_std(config.residual_std, work.robot)
-    method = _usual_method(config, work.robot)
+    method = usual_method(config, work.robot)
     with (
         saying_how_to_resume(checkpoint),
         watching(
@@ -221,7 +221,16 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     )
 
 
-def _usual_method(config: Calibrate, robot: RobotModel) -> str:
+def prepare(config: Calibrate) -> Work:
+    """Read and check what is to be calibrated.
+
+    Raises:
+        DealHwError: A setting or a recording is unusable.
+    """
+    return prepare_dataset(config) if config.recordings.model is None else _prepare_model(config)
+
+
+def usual_method(config: Calibrate, robot: RobotModel) -> str:
     """Return the method, where none is named that which suits the recordings."""
     if config.method != DEFAULT or config.recordings.model is None:
         return config.method

@@ -1,0 +1,154 @@
+"""``deal-hw bench verdict``: is a right model called right, and a wrong one wrong, for the right reason?
+
+Robots in plain MuJoCo, each with a truth of its own, are calibrated as a user would: from CSV files and an
+MJCF, with default settings. Without a fault the model can explain all; each fault is something it lacks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.validation.checks import MOST_CAUSES
+from deal_hw.calib.validation.verdict import trust
+from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
+from deal_hw.cli.calibrate_model import Recordings
+from deal_hw.errors import DealHwError
+from deal_hw.testing.plain_robots import (
+    CAUSES,
+    FAULTS,
+    KINDS,
+    SIGN_WORDS,
+    Fault,
+    PlainRobot,
+    make_robot,
+    write,
+)
+
+KEY = ("task", "fault", "seed")
+RIGHT = ""
+"""The fault of a model that lacks nothing."""
+
+
+def cells(seeds: Sequence[int]) -> list[tuple[str, str, int]]:
+    """Return the robots by (kind, fault, seed): without a fault first."""
+    return [(kind, fault, seed) for fault in (RIGHT, *FAULTS) for seed in seeds for kind in KINDS]
+
+
+def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:
+    """Calibrate one robot; an error is kept in the row.
+
+    Args:
+        kind: A name in `KINDS`.
+        fault: A name in `FAULTS`, or "".
+        seed: Of the truth, and of everything random in the calibration.
+        budget: What a search may use.
+        threads: Simulation threads.
+    """
+    robot = make_robot(kind, seed, _fault(fault))
+    row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
+    with tempfile.TemporaryDirectory() as name:
+        model, fit, held_out = write(robot, Path(name))
+        config = Calibrate(
+            recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,), quiet=True
+        )
+        try:
+            work = prepare(config)
+            method = usual_method(config, work.robot)
+            result = calibrate_episodes(
+                work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget,
+                rng=np.random.default_rng(seed), threads=threads,
+            )  # fmt: skip
+        except DealHwError as err:
+            # Refused before any work: as good as red, if it says why.
+            return row | {"colour": "refused", "named": names(fault, [], [str(err)]), "refusal": str(err)}
+    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_CAUSES]]
+    return row | {
+        "causes": causes,
+        "colour": trust(result).colour,
+        "named": names(fault, causes, [*result.alarms, *work.telemetry]),
+        "alarms": list(result.alarms),
+        "search": result.provenance.get("search", ""),
+        "chi2": result.chi2,
+        "seconds": result.seconds,
+        "steps": result.steps,
+        **{f"heldout_nrmse_{name}": value for name, value in result.heldout_nrmse.items()},
+        **against_truth(robot, result),
+    }
+
+
+def _fault(name: str) -> Fault | None:
+    return next((fault for fault in FAULTS if fault == name), None)
+
+
+def names(fault: str, causes: Sequence[str], sentences: Sequence[str]) -> bool:
+    """Return whether the fault was named; True where there is none.
+
+    Args:
+        fault: A name in `FAULTS`, or "".
+        causes: The causes that alarms name, the likeliest first.
+        sentences: Refusals, warnings and alarms.
+    """
+    known = _fault(fault)
+    if known is None:
+        return True
+    if known == "sign":
+        return any(word in text for text in sentences for word in SIGN_WORDS)
+    return any(cause in CAUSES[known] for cause in causes)
+
+
+def against_truth(robot: PlainRobot, result: CalibrationResult) -> dict[str, Any]:
+    """Return the errors of the parameters that have a value, and how many intervals hold the truth."""
+    told = [
+        k
+        for k, name in enumerate(result.space.names)
+        if name in robot.truth and not (result.verdicts and result.verdicts[k] == "not identifiable")
+    ]
+    truth = np.array([robot.truth[result.space.names[k]] for k in told])
+    estimate, interval = result.estimate[told], result.interval[told]
+    inside = (interval[:, 0] <= truth) & (truth <= interval[:, 1])
+    return {
+        "parameters": len(result.space),
+        "told": len(told),
+        "error_percent": float(100 * np.mean(np.abs(estimate - truth) / truth)) if told else None,
+        "coverage90": float(np.mean(inside)) if told else None,
+        "latency_true": robot.delay_s,
+        "latency_found": result.latency_s,
+    }
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """Return one row in words."""
+    what = row["fault"] or "right model"
+    named = "" if not row["fault"] else ", named" if row["named"] else ", NOT named"
+    text = f"{row['task']} seed {row['seed']}, {what}: {row['colour']}{named}"
+    if "seconds" in row:
+        text += f", chi2 {row['chi2']:.3g}, search {row['search']}, {row['seconds']:.0f} s"
+    return text
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for each fault: colours, how often it was named."""
+    found = []
+    for fault in (RIGHT, *FAULTS):
+        mine = [r for r in rows if r["fault"] == fault and not r["error"]]
+        if not mine:
+            continue
+        colours = [str(r["colour"]) for r in mine]
+        counts = ", ".join(
+            f"{colours.count(c)} {c}" for c in ("green", "amber", "red", "refused") if c in colours
+        )
+        words = f"{fault}: {FAULTS[known]}" if (known := _fault(fault)) else "the model is right"
+        text = f"{words}: {len(mine)} robots, {counts}"
+        if known:
+            text += f"; named {sum(bool(r['named']) for r in mine)} times"
+        else:
+            held = [r["coverage90"] for r in mine if r.get("coverage90") is not None]
+            text += f"; 90 % intervals hold {100 * float(np.mean(held)):.0f} % of the truths" if held else ""
+        found.append(text)
+    return found

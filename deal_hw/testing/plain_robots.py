@@ -1,0 +1,278 @@
+"""Robots in plain MuJoCo with hidden truths and deliberate faults: what a calibration is tried on.
+
+Nothing of deal-hw simulates here: an MJCF text, ``mj_step``, a delay of the commands, sensor noise, a CSV.
+The model that is calibrated is the same text with other numbers, or lacks what the fault has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import UnknownNameError
+from deal_hw.types import FloatArray
+
+Fault = Literal["friction", "backlash", "jitter", "mass", "sign"]
+
+FAULTS: Mapping[Fault, str] = {
+    "friction": "dry friction is four times as high at rest and falls with speed (Stribeck)",
+    "backlash": "a gear with a play of 0.06 rad between servo and joint",
+    "jitter": "the delay of each command is between none and twice the mean",
+    "mass": "the last link weighs 50 % more than in the model",
+    "sign": "the last servo turns the other way",
+}
+"""Faults by name, as they are described to people."""
+
+CAUSES: Mapping[Fault, tuple[str, ...]] = {
+    "friction": ("friction",),
+    "backlash": ("backlash",),
+    "jitter": ("delay",),
+    "mass": ("load", "inertia"),
+    "sign": (),
+}
+"""Causes of the calibration's diagnosis that name the fault; a wrong sign is refused or warned of before."""
+
+SIGN_WORDS = ("sign", "wrong way", "other way", "against")
+"""A refusal or warning with one of these words names a servo that turns the other way."""
+
+STRIBECK_SPEED = 0.15
+"""Speed at which the extra dry friction has fallen to 1/e [rad/s or m/s]."""
+
+STRIBECK_EXTRA = 3.0
+PLAY = 0.06
+RATE_HZ = 200.0
+NOISE = 1e-3
+"""Standard deviation of a position sample [rad or m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Joint:
+    """A joint and what moves it; ``kp`` 0 for a joint without a motor."""
+
+    name: str
+    damping: float
+    frictionloss: float
+    armature: float
+    kp: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A robot: its joints, and bodies in MJCF with one ``{joint NAME}`` for each joint."""
+
+    joints: tuple[_Joint, ...]
+    bodies: str
+    step_s: float = 0.001
+
+
+KINDS: Mapping[str, _Kind] = {
+    "pendulum": _Kind(
+        (_Joint("pivot", 0.05, 0.02, 0.002, 4.0),),
+        '<body name="rod" pos="0 0 1">{pivot}<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.015" '
+        'mass="{mass:0.25}"/></body>',
+    ),
+    "double-pendulum": _Kind(
+        (_Joint("shoulder", 0.3, 0.1, 0.01, 30.0), _Joint("elbow", 0.15, 0.05, 0.005, 15.0)),
+        '<body name="upper" pos="0 0 1">{shoulder}<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" '
+        'mass="0.5"/><body name="fore" pos="0 0 -0.3">{elbow}<geom type="capsule" '
+        'fromto="0 0 0 0 0 -0.25" size="0.015" mass="{mass:0.3}"/></body></body>',
+    ),
+    "arm": _Kind(
+        (
+            _Joint("yaw", 0.4, 0.12, 0.02, 40.0),
+            _Joint("shoulder", 0.5, 0.15, 0.02, 60.0),
+            _Joint("elbow", 0.3, 0.08, 0.01, 40.0),
+        ),
+        '<body name="base" pos="0 0 0.3">{yaw:0 0 1}<geom type="cylinder" size="0.05 0.04" mass="0.6"/>'
+        '<body name="upper" pos="0 0 0.05" euler="0 0.8 0">{shoulder}<geom type="capsule" '
+        'fromto="0 0 0 0 0 0.25" size="0.025" mass="0.5"/><body name="fore" pos="0 0 0.25" '
+        'euler="0 0.7 0">{elbow}<geom type="capsule" fromto="0 0 0 0 0 0.22" size="0.02" '
+        'mass="{mass:0.35}"/></body></body></body>',
+    ),
+    "cart-pole": _Kind(
+        (_Joint("slide", 2.0, 0.6, 0.1, 300.0), _Joint("pole", 0.004, 0.002, 0.0005, 0.0)),
+        '<body name="cart" pos="0 0 1">{slide:slide}<geom type="box" size="0.05 0.04 0.03" mass="0.5"/>'
+        '<body name="rod">{pole}<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.008" '
+        'mass="{mass:0.12}"/></body></body>',
+    ),
+    "leg": _Kind(
+        (
+            _Joint("abduction", 0.2, 0.2, 0.01, 60.0),
+            _Joint("hip", 0.2, 0.2, 0.01, 60.0),
+            _Joint("knee", 0.2, 0.2, 0.02, 60.0),
+        ),
+        '<body name="hip_body" pos="0 0 1">{abduction:1 0 0}<geom type="sphere" size="0.04" mass="0.7"/>'
+        '<body name="thigh" pos="0 0.08 0" euler="0 0.7 0">{hip}<geom type="capsule" '
+        'fromto="0 0 0 0 0 -0.21" size="0.02" mass="1.1"/><body name="shank" pos="0 0 -0.21" '
+        'euler="0 -1.4 0">{knee}<geom type="capsule" fromto="0 0 0 0 0 -0.21" size="0.012" '
+        'mass="{mass:0.22}"/></body></body></body>',
+    ),
+}
+"""The robots by name: one to three joints, servos with and without a free joint behind them."""
+
+SPREAD = {"damping": 2.0, "frictionloss": 2.0, "armature": 2.0, "kp": 1.5}
+"""Truths lie within these factors of the model's values."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlainRobot:
+    """A model and the robot that it stands for.
+
+    Attributes:
+        kind: A name in `KINDS`.
+        model: MJCF of the model that is calibrated.
+        robot: MJCF of the robot.
+        truth: The robot's values by the names that ``deal-hw calibrate --model`` gives them.
+        delay_s: Mean delay of the commands, a whole number of physics steps [s].
+        fault: What the model lacks, or None.
+        seed: Drew the truth; draws motions and noise.
+    """
+
+    kind: str
+    model: str
+    robot: str
+    truth: Mapping[str, float]
+    delay_s: float
+    fault: Fault | None
+    seed: int
+
+
+def make_robot(kind: str, seed: int, fault: Fault | None = None) -> PlainRobot:
+    """Return a robot with a truth of its own.
+
+    Raises:
+        UnknownNameError: There is no such kind.
+    """
+    if kind not in KINDS:
+        raise UnknownNameError("robot", kind, KINDS)
+    rng = np.random.default_rng([seed, *kind.encode()])
+    made, names = KINDS[kind], {"damping": "damping", "frictionloss": "frictionloss", "armature": "armature"}
+    truth: dict[str, float] = {}
+    values: dict[str, dict[str, float]] = {}
+    for joint in made.joints:
+        own: dict[str, float] = {}
+        for name, factor in SPREAD.items():
+            own[name] = getattr(joint, name) * float(np.exp(rng.uniform(-1, 1) * np.log(factor)))
+            if own[name]:
+                truth[f"{joint.name}.{names.get(name, 'servo_stiffness')}"] = own[name]
+        values[joint.name] = own
+    delay_s = made.step_s * int(rng.integers(2, 16))
+    return PlainRobot(
+        kind=kind,
+        model=_mjcf(kind, made, {j.name: {n: getattr(j, n) for n in SPREAD} for j in made.joints}, 1.0),
+        robot=_mjcf(kind, made, values, 1.5 if fault == "mass" else 1.0),
+        truth=truth,
+        delay_s=delay_s,
+        fault=fault,
+        seed=seed,
+    )
+
+
+def _mjcf(kind: str, made: _Kind, values: Mapping[str, Mapping[str, float]], heavier: float) -> str:
+    bodies, actuators = made.bodies, []
+    for joint in made.joints:
+        own = values[joint.name]
+        start = bodies.index("{" + joint.name)
+        end = bodies.index("}", start) + 1
+        _, _, axis = bodies[start + 1 : end - 1].partition(":")
+        place = 'type="slide" axis="1 0 0"' if axis == "slide" else f'axis="{axis or "0 1 0"}"'
+        text = f'<joint name="{joint.name}" {place} ' + " ".join(
+            f'{name}="{own[name]:.9g}"' for name in ("damping", "frictionloss", "armature")
+        )
+        bodies = bodies[:start] + text + "/>" + bodies[end:]
+        if joint.kp:
+            actuators.append(f'<position name="{joint.name}" joint="{joint.name}" kp="{own["kp"]:.9g}"/>')
+    start = bodies.index("{mass:")
+    end = bodies.index("}", start)
+    bodies = bodies[:start] + f"{heavier * float(bodies[start + 6 : end]):.9g}" + bodies[end + 1 :]
+    return (
+        f'<mujoco model="{kind}"><compiler angle="radian"/>'
+        f'<option timestep="{made.step_s:g}" integrator="implicitfast"/>'
+        f"<worldbody>{bodies}</worldbody><actuator>{''.join(actuators)}</actuator></mujoco>\n"
+    )
+
+
+def record(robot: PlainRobot, number: int, seconds: float) -> str:
+    """Return a recording as CSV text: time, positions, and what was commanded.
+
+    Args:
+        robot: The robot.
+        number: Which motion; each number is another one.
+        seconds: How long [s].
+    """
+    model = mujoco.MjModel.from_xml_string(robot.robot)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng([robot.seed, number, 7])
+    step_s, rows = float(model.opt.timestep), round(seconds * RATE_HZ)
+    substeps, time = round(1 / (RATE_HZ * step_s)), np.arange(rows) / RATE_HZ
+    commands = _motion(rng, time, model.nu)
+    arrives = np.full(rows, round(robot.delay_s / step_s)) + substeps * np.arange(rows)
+    if robot.fault == "jitter":
+        late = rng.uniform(0.0, 2.0 * robot.delay_s / step_s, rows)
+        arrives = np.maximum.accumulate(substeps * np.arange(rows) + late.astype(np.int64))
+    joint = model.actuator_trnid[:, 0]
+    dof, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
+    positions = np.empty((rows, model.nq))
+    next_row, engaged = 0, data.qpos[place].copy()
+    for step in range(rows * substeps):
+        if step % substeps == 0:
+            positions[step // substeps] = data.qpos
+        while next_row < rows and arrives[next_row] <= step:
+            next_row += 1
+        wanted = commands[max(next_row - 1, 0)].copy()
+        if robot.fault == "backlash":
+            # The servo's side of the gear: it drives the joint only where the play is used up.
+            engaged = np.clip(engaged, wanted - PLAY / 2, wanted + PLAY / 2)
+            wanted = engaged
+        if robot.fault == "sign":
+            wanted[-1] = -wanted[-1]
+        data.ctrl[:] = wanted
+        if robot.fault == "friction":
+            speed = data.qvel[dof]
+            extra = STRIBECK_EXTRA * model.dof_frictionloss[dof] * np.exp(-np.abs(speed) / STRIBECK_SPEED)
+            data.qfrc_applied[dof] = -extra * np.tanh(speed / 0.01)
+        mujoco.mj_step(model, data)
+    measured = positions + NOISE * rng.standard_normal(positions.shape)
+    names = [model.joint(i).name for i in range(model.njnt)]
+    moved = [model.joint(int(i)).name for i in joint]
+    header = ",".join(["time", *names, *(f"{name}.command" for name in moved)])
+    lines = [
+        ",".join(f"{value:.7g}" for value in (t, *position, *command))
+        for t, position, command in zip(time, measured, commands, strict=True)
+    ]
+    return "\n".join([header, *lines]) + "\n"
+
+
+def _motion(rng: np.random.Generator, time: FloatArray, count: int) -> FloatArray:
+    """Return set-points of six sines and a hold in between, starting at rest, (T, count)."""
+    found = np.zeros((len(time), count))
+    for column in range(count):
+        for _ in range(6):
+            frequency, phase = rng.uniform(0.1, 1.6), rng.uniform(0, 2 * np.pi)
+            found[:, column] += rng.uniform(0.04, 0.2) * np.sin(2 * np.pi * frequency * time + phase)
+    return np.asarray((found - found[0]) * np.minimum(time, 1.0)[:, None])
+
+
+def write(robot: PlainRobot, folder: Path, *, seconds: float = 12.0) -> tuple[Path, list[Path], Path]:
+    """Write the model, two recordings to fit and one that only judges.
+
+    Args:
+        robot: The robot.
+        folder: Where.
+        seconds: Length of each recording [s].
+
+    Returns:
+        Model, recordings to fit, held-out recording.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    model = folder / "robot.xml"
+    model.write_text(robot.model, encoding="utf-8")
+    paths = [folder / name for name in ("fit1.csv", "fit2.csv", "held-out.csv")]
+    for number, path in enumerate(paths):
+        path.write_text(record(robot, number, seconds), encoding="utf-8")
+    return model, paths[:2], paths[2]

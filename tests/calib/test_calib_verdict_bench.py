@@ -1,0 +1,98 @@
+"""`bench verdict`: robots in plain MuJoCo with hidden truths and faults, and what its rows say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from deal_hw.calibration import Budget
+from deal_hw.cli import bench_verdict
+from deal_hw.cli.bench_verdict import cells, line, names, run_cell, summary
+from deal_hw.errors import UnknownNameError
+from deal_hw.testing import plain_robots
+from deal_hw.testing.plain_robots import FAULTS, KINDS, NOISE, PlainRobot, make_robot, record, write
+from deal_hw.types import FloatArray
+
+
+def samples(robot: PlainRobot, seconds: float = 2.0) -> FloatArray:
+    """Return the columns of a recording: time, positions, commands."""
+    return np.loadtxt(record(robot, 0, seconds).splitlines(), delimiter=",", skiprows=1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_robot_is_its_model_with_other_numbers(kind: str) -> None:
+    """Same seed, same robot; truths lie within their factors of the model, which has the same joints."""
+    robot, again, other = make_robot(kind, 3), make_robot(kind, 3), make_robot(kind, 4)
+    assert robot == again and robot.truth != other.truth
+    model, truth = (mujoco.MjModel.from_xml_string(text) for text in (robot.model, robot.robot))
+    assert model.nq == truth.nq and model.nu == truth.nu
+    assert np.all(np.abs(np.log(truth.dof_damping / model.dof_damping)) <= np.log(2.0) + 1e-9)
+    assert np.allclose(truth.body_mass, model.body_mass)
+    joint = model.joint(0).name
+    assert robot.truth[f"{joint}.damping"] == pytest.approx(float(truth.dof_damping[0]))
+    assert any(robot.delay_s == pytest.approx(0.001 * n) for n in range(2, 16))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_changes_the_recording_beyond_noise(fault: plain_robots.Fault) -> None:
+    """Commands are the same, positions differ by more than ten times the noise (a jitter by five)."""
+    right, wrong = (samples(make_robot("double-pendulum", 1, f)) for f in (None, fault))
+    assert np.array_equal(right[:, 3:], wrong[:, 3:])
+    assert np.abs(right[:, 1:3] - wrong[:, 1:3]).max() > (5 if fault == "jitter" else 10) * NOISE
+
+
+def test_the_mass_fault_makes_the_last_link_half_as_heavy_again() -> None:
+    """0.3 kg in the model, 0.45 kg in the robot; the other link is right."""
+    robot = make_robot("double-pendulum", 0, "mass")
+    model, truth = (mujoco.MjModel.from_xml_string(text) for text in (robot.model, robot.robot))
+    assert model.body("fore").mass[0] == pytest.approx(0.3)
+    assert truth.body("fore").mass[0] == pytest.approx(0.45)
+    assert truth.body("upper").mass[0] == model.body("upper").mass[0]
+
+
+def test_an_unknown_robot_is_refused() -> None:
+    """The message lists the robots."""
+    with pytest.raises(UnknownNameError, match="pendulum"):
+        make_robot("pendulu", 0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "causes", "sentences", "named"),
+    [
+        ("", [], [], True),
+        ("friction", ["damping", "friction"], [], True),
+        ("friction", [], ["friction law, backlash or a varying delay"], False),
+        ("jitter", ["delay"], [], True),
+        ("mass", ["backlash"], [], False),
+        ("sign", [], ["is its sign in the column map right"], True),
+        ("sign", ["friction"], ["the model does not explain the recording"], False),
+    ],
+)
+def test_a_fault_is_named_by_its_cause_only(
+    fault: str, causes: list[str], sentences: list[str], named: bool
+) -> None:
+    """A sentence that lists all usual causes names none."""
+    assert names(fault, causes, sentences) is named
+
+
+def test_cells_begin_with_right_models() -> None:
+    """Five robots without a fault for each seed, then each fault."""
+    found = cells([0, 1])
+    assert len(found) == 2 * len(KINDS) * (1 + len(FAULTS))
+    assert {fault for _, fault, _ in found[: 2 * len(KINDS)]} == {""}
+
+
+def test_a_right_pendulum_ends_green(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrated from CSV and MJCF as a user would: truths in the intervals, no search, said in one line."""
+
+    def short(robot: PlainRobot, folder: Path) -> tuple[Path, list[Path], Path]:
+        return write(robot, folder, seconds=3.0)
+
+    monkeypatch.setattr(bench_verdict, "write", short)
+    row = run_cell("pendulum", "", 2, budget=Budget(population=8, generations=2), threads=1)
+    assert row["colour"] == "green" and row["search"] == "local fit" and row["alarms"] == []
+    assert row["coverage90"] >= 0.75 and row["latency_found"] == pytest.approx(row["latency_true"], abs=1e-3)
+    assert "green" in line(row) and "1 robots, 1 green" in summary([row])[0]
