@@ -48,7 +48,7 @@ CONFINED = {
     "onnx": {"policies", "testing"},
     "onnxscript": {"policies"},
     "onnxruntime": {"policies"},
-    "mujoco": {"sim"},
+    "mujoco": {"sim", "testing"},
     "rerun": {"viz"},
     "mcap": {"data"},
     "mcap_ros2": {"data"},
