@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.refinement import CONTACT_STAGES_S, STAGES_S, Polished, polish
 from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis, robust_polish
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import statement, with_rows
@@ -26,12 +27,19 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
+from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
 RESTARTS = 2
 SAME_CHI2 = 0.2
 FEWEST_GENERATIONS = 15
 """With fewer generations left in the budget another search would not get anywhere."""
+
+LOCAL_S = 8.0
+"""The local fit finds its way on so much of the recordings [s]."""
+
+LOCAL_HOPELESS = 4.0
+"""Windows of 0.2 s whose chi2 stays above this are not explained by longer fits either."""
 
 SCAN_TICKS = 2
 SCAN_ITERATIONS = 10
@@ -224,7 +232,8 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
     """Refine the model's own values; return None where they are too far to be refined.
 
     Costs a small part of a search. Where its residual is explained by the sensors' noise nothing is left to
-    search for.
+    search for. A part of the recordings says where the fit goes; all of them are fitted only where that part
+    can be explained.
     """
     fixed = problem.fixed_latency_s is not None
     latency_s = problem.fixed_latency_s or 0.0
@@ -234,8 +243,35 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
             words = f"from the model's own values: chi2 {chi2:.3g}"
             progress(Progress("local fit", done, done, words, values={"chi2": chi2}))
 
-    found = polish(problem, problem.space.nominal, latency_s, fixed_latency=fixed, notify=notify)
-    return found if np.isfinite(found.chi2) else None
+    def fit(part: Problem, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None) -> Polished:
+        return polish(
+            part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.exact
+        )
+
+    part, nominal = _spread(problem, LOCAL_S), problem.space.nominal
+    if part is problem or problem.exact:
+        found = fit(problem, nominal, latency_s, None)
+        return found if np.isfinite(found.chi2) else None
+    short, *longer = CONTACT_STAGES_S if problem.robot.base is not None else STAGES_S
+    found = fit(part, nominal, latency_s, (short,))
+    if not found.chi2 < LOCAL_HOPELESS:
+        return found if np.isfinite(found.chi2) else None
+    try:
+        return fit(problem, found.theta, found.latency_s, longer)
+    except InsufficientDataError:
+        # No recording holds a longer window.
+        return fit(problem, found.theta, found.latency_s, (short,))
+
+
+def _spread(problem: Problem, seconds: float) -> Problem:
+    """Return the problem with pieces of a second, evenly spread, that add up to about so many seconds."""
+    lengths = [len(e.sample) for e in problem.episodes]
+    period_s = problem.episodes[0].period_s
+    piece = max(round(1.0 / period_s), 1)
+    every = max(math.floor(sum(lengths) * period_s / seconds), 1)
+    number = np.arange(sum(lengths)) // piece
+    kept = np.split(number % every == 0, np.cumsum(lengths)[:-1])
+    return problem.part(kept) if every > 1 else problem
 
 
 def conclusive(problem: Problem, polished: Polished) -> bool:
