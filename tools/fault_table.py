@@ -364,7 +364,9 @@ def main(
     # A shell that starts a program in the background has it ignore Ctrl-C, and so would all that it starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     calls, rows = earlier(given.out)
-    calls.append({"argv": sys.argv[1:], "machine": describe_machine()})
+    # Names of files only: where they lay on this machine is nobody's business.
+    argv = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
+    calls.append({"argv": argv, "machine": describe_machine()})
     bad = 0
     for row in run_cases(rig_type, chosen, wire, given, rows):
         rows[row["fault"]] = row
