@@ -69,9 +69,11 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
         return search
     from deal_hw.calib.pipeline import PolishedMethod
     from deal_hw.calib.search.eki import Weki
+    from deal_hw.calib.validation.checks import Validation
 
     if isinstance(search, Weki):
         search = dataclasses.replace(
             search, settings=dataclasses.replace(search.settings, before_polish=True)
         )
-    return PolishedMethod(search, name)
+    # Who names a search wants it run, also where the model's own values could be refined without one.
+    return PolishedMethod(search, name, Validation(local_first=name == "default"))
