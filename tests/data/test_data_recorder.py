@@ -188,7 +188,7 @@ def test_unwritable_folder_is_said(tmp_path: Path) -> None:
 
 def test_unusable_files_are_told_apart(tmp_path: Path, write_episode: WriteEpisode) -> None:
     """Absent, empty, foreign, torn and silent recordings each get their own error."""
-    with pytest.raises(DatasetError, match="No such file"):
+    with pytest.raises(DatasetError, match="there is no such file"):
         read_trajectory(tmp_path / "absent.mcap")
     (tmp_path / "empty.mcap").touch()
     with pytest.raises(EmptyRecordingError, match="0 bytes"):
