@@ -140,6 +140,20 @@ def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
     return rows.parameter - np.einsum("wrs,wsp->wrp", js, gain), normal
 
 
+def without_starts(start: FloatArray, normal: FloatArray, x: FloatArray) -> FloatArray:
+    """Return columns, (W, R, n), without what start states can do of them.
+
+    Args:
+        start: Derivatives by the start states, (W, R, S).
+        normal: The start states' normal matrices, (W, S, S).
+        x: The columns.
+    """
+    if start.shape[2] == 0:
+        return x
+    moved = np.linalg.solve(normal, np.einsum("wrs,wri->wsi", start, x))
+    return np.asarray(x - np.einsum("wrs,wsi->wri", start, moved))
+
+
 def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> _Level:
     shifts, expected, follows = [], [], []
     for of_episode in rows:

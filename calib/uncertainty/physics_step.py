@@ -19,7 +19,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.uncertainty.at_fit import widened_to
-from deal_hw.calib.uncertainty.cluster_robust import eliminated
+from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
 from deal_hw.types import FloatArray
 
@@ -166,11 +166,8 @@ def _refitted(
     P = len(belief)
     cost, gradient, hessian = 0.0, np.zeros(P), np.diag(belief)
     for one in rows:
-        jacobian, start = eliminated(one)
-        residual = one.residual
-        if start.shape[1]:
-            toward = np.einsum("wri,wr->wi", one.start, residual)[..., None]
-            residual = residual - np.einsum("wri,wi->wr", one.start, np.linalg.solve(start, toward)[..., 0])
+        jacobian, normal = eliminated(one)
+        residual = without_starts(one.start, normal, one.residual[..., None])[..., 0]
         cost += float(np.sum(residual**2))
         gradient += np.einsum("wri,wr->i", jacobian, residual)
         hessian += np.einsum("wri,wrj->ij", jacobian, jacobian)

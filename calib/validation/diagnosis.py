@@ -20,7 +20,7 @@ from scipy.stats import chi2 as chi2_law
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.uncertainty.cluster_robust import eliminated
+from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.types import FloatArray
 
 Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "contact"]
@@ -222,7 +222,7 @@ class _Left:
         """Take it out of the motions' residuals; ``gain`` is the parameters' covariance, (P, P)."""
         both = [eliminated(m.rows) for m in found]
         residual = [
-            _without_starts(m.rows.start, normal, m.rows.residual[..., None])[..., 0]
+            without_starts(m.rows.start, normal, m.rows.residual[..., None])[..., 0]
             for m, (_, normal) in zip(found, both, strict=True)
         ]
         back = sum(np.einsum("wrp,wr->p", J, r) for (J, _), r in zip(both, residual, strict=True))
@@ -240,7 +240,7 @@ def _explained(left: _Left, columns: Sequence[FloatArray], gain: FloatArray) -> 
     for motion, own, effective, normal, r in parts:
         W, _, S = motion.rows.start.shape
         x = np.concatenate([own.reshape(W, -1, J * n), np.zeros((W, S, J * n))], axis=1)
-        x = _without_starts(motion.rows.start, normal, x)
+        x = without_starts(motion.rows.start, normal, x)
         matrix += np.einsum("wri,wrj->ij", x, x)
         vector += np.einsum("wri,wr->i", x, r)
         cross += np.einsum("wrp,wri->pi", effective, x)
@@ -252,13 +252,6 @@ def _explained(left: _Left, columns: Sequence[FloatArray], gain: FloatArray) -> 
     own_size = np.sqrt(np.maximum(np.diag(matrix), 1e-6 * size**2))
     each = np.sum((vector / own_size).reshape(J, n) ** 2, axis=1)
     return explained, each, int(solved[2])
-
-
-def _without_starts(js: FloatArray, normal: FloatArray, x: FloatArray) -> FloatArray:
-    if js.shape[2] == 0:
-        return x
-    moved = np.linalg.solve(normal, np.einsum("wrs,wri->wsi", js, x))
-    return np.asarray(x - np.einsum("wrs,wsi->wri", js, moved))
 
 
 def _forced(motion: Motion, force: FloatArray) -> FloatArray:
@@ -330,7 +323,7 @@ def _varying_delay(left: _Left) -> tuple[float, int]:
         moved = np.einsum("whmj,whj->whm", motion.direct, motion.velocity)
         x = (moved[..., None] * (label[:, None, None] == np.arange(pieces))).reshape(W, H * M, pieces)
         x = np.concatenate([x, np.zeros((W, motion.rows.start.shape[2], pieces))], axis=1)
-        x = _without_starts(motion.rows.start, normal, x)
+        x = without_starts(motion.rows.start, normal, x)
         matrix, vector = np.einsum("wri,wrj->wij", x, x), np.einsum("wri,wr->wi", x, r)
         solved = np.einsum("wij,wj->wi", np.linalg.pinv(matrix, rcond=1e-6, hermitian=True), vector)
         explained += float(np.sum(solved * vector))

@@ -151,7 +151,7 @@ def make_robot(kind: str, seed: int, fault: Fault | None = None) -> PlainRobot:
     if kind not in KINDS:
         raise UnknownNameError("robot", kind, KINDS)
     rng = np.random.default_rng([seed, *kind.encode()])
-    made, names = KINDS[kind], {"damping": "damping", "frictionloss": "frictionloss", "armature": "armature"}
+    made = KINDS[kind]
     truth: dict[str, float] = {}
     values: dict[str, dict[str, float]] = {}
     for joint in made.joints:
@@ -159,7 +159,7 @@ def make_robot(kind: str, seed: int, fault: Fault | None = None) -> PlainRobot:
         for name, factor in SPREAD.items():
             own[name] = getattr(joint, name) * float(np.exp(rng.uniform(-1, 1) * np.log(factor)))
             if own[name]:
-                truth[f"{joint.name}.{names.get(name, 'servo_stiffness')}"] = own[name]
+                truth[f"{joint.name}.{'servo_stiffness' if name == 'kp' else name}"] = own[name]
         values[joint.name] = own
     delay_s = made.step_s * int(rng.integers(2, 16))
     return PlainRobot(
