@@ -25,9 +25,9 @@ from scipy.stats import norm
 
 from deal_hw.calib.baselines.simple import Nominal
 from deal_hw.calib.data.checks import check_excitation
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
-from deal_hw.calib.fit.refinement import mismatch
+from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline import PolishedMethod, conclusive, local_fit, without_search
 from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
@@ -155,7 +155,7 @@ class OpenLoop(CalibrationMethod[Problem]):
             local = with_rows(local)
             known, facts["physics_step"] = with_step(pieces, local, known, theta)
             known, facts["diagnosis"] = with_causes(pieces, local, known)
-        left = mismatch(problem, theta, latency_s, MISMATCH_S)
+        left = at_parameters(problem, theta, latency_s, samples_in(problem, MISMATCH_S)).normal
         chi2 = left.cost / max(left.count, 1)
         found = confounded(problem, fit.hessian / known.inflation)
         words = tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found))))
@@ -350,18 +350,17 @@ def _mean(problem: Problem, members: Sequence[Member]) -> Member:
 
 
 def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
-    prior = np.append(1 / problem.space.prior[1] ** 2, 0.0)
     return uncertainty(
         problem.space,
         fit.theta,
         fit.latency_s,
-        fit.hessian + np.diag(prior),
+        fit.hessian,
         1.0,
         fit.residual,
         problem.latency_range_s,
         fixed_latency=problem.fixed_latency_s is not None,
         gradient=fit.gradient,
-        prior=prior,
+        prior=fit.prior,
         rows=fit.rows,
     )
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import CONTACT_STAGES_S, STAGES_S, Polished, polish
-from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis, robust_polish
+from deal_hw.calib.fit.refinement import SETTINGS, Polished, at_parameters, polish, polish_robust
+from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import statement, with_rows
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Z90, Uncertainty, intervals
 from deal_hw.calib.validation.checks import Validation, judge, unexplained
-from deal_hw.calib.validation.cross_validation import Choice, at_estimate, choose
+from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,
@@ -153,7 +153,7 @@ class PolishedMethod(CalibrationMethod[Problem]):
         scan = None
         if choice is not None and choice.chosen == "search":
             length, states = polished.shooting.length, polished.shooting.states(polished.point)
-            polished = at_estimate(problem, searched, length, states)
+            polished = at_parameters(problem, searched.estimate, searched.latency_s, length, states)
         elif problem.fixed_latency_s is None:
             scan = scan_latency(problem, polished, progress)
         whole = scan is not None and scan.polished[scan.best].normal.cost < polished.normal.cost + SCAN_WORSE
@@ -161,7 +161,7 @@ class PolishedMethod(CalibrationMethod[Problem]):
             polished = scan.polished[scan.best]
         decided = whole or problem.fixed_latency_s is not None
         if choice is not None and choice.chosen == "robust polish":
-            polished = robust_polish(problem, polished, decided)
+            polished = polish_robust(polished, decided)
         polished = with_rows(polished)
         known = statement(problem, polished, fixed_latency=decided)
         if scan is not None and whole:
@@ -252,7 +252,8 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
     if part is problem or problem.exact:
         found = fit(problem, nominal, latency_s, None)
         return found if np.isfinite(found.chi2) else None
-    short, *longer = CONTACT_STAGES_S if problem.robot.base is not None else STAGES_S
+    stages_s = SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
+    short, *longer = stages_s
     found = fit(part, nominal, latency_s, (short,))
     if not found.chi2 < LOCAL_HOPELESS:
         return found if np.isfinite(found.chi2) else None
@@ -334,16 +335,7 @@ def polish_from(problem: Problem, searched: CalibrationResult, progress: Progres
         if progress is not None:
             progress(Progress("polish", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
 
-    def run(settle: bool) -> Polished:
-        return polish(problem, searched.estimate, latency, fixed_latency=fixed, notify=notify, settle=settle)
-
-    settled = run(True)
-    if problem.exact or problem.robot.base is not None:
-        return settled
-    # Kinks make several minima (a speed limit for a latency); the two ways to move start states end in
-    # different ones often enough to be worth a second polish, which is cheap beside the search.
-    free = run(False)
-    return free if _better(free, settled) else settled
+    return polish(problem, searched.estimate, latency, fixed_latency=fixed, notify=notify)
 
 
 def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallback | None) -> LatencyScan:

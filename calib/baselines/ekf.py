@@ -17,8 +17,13 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.problem import WindowData
-from deal_hw.calib.fit.refinement import value_bounds
-from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, POSITION_STEP, VELOCITY_STEP
+from deal_hw.calib.fit.residual import (
+    LATENCY_STEP_S,
+    PARAMETER_STEP,
+    POSITION_STEP,
+    VELOCITY_STEP,
+    value_bounds,
+)
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.calib.uncertainty.intervals import Z90, intervals

@@ -19,17 +19,16 @@ import numpy as np
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.refinement import DAMPINGS as ALL_DAMPINGS
-from deal_hw.calib.fit.refinement import damped_step, value_bounds
-from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP
+from deal_hw.calib.fit.contacts import damped_step
+from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, value_bounds
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.calib.uncertainty.intervals import uncertainty
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
-DAMPINGS = ALL_DAMPINGS[::2]
-"""Every second one: with ten starts each costs ten simulations of the recording."""
+DAMPINGS = 10.0 ** np.arange(-5.0, 4.0, 2.0)
+"""With ten starts each costs ten simulations of the recording."""
 
 DRAW_SHARE = 3
 """Drawing takes at most one part in so many of a small budget's generations."""

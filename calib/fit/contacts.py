@@ -10,15 +10,17 @@ takes that way of following which suits it best.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.calib.fit.residual import Normal, Point, Shooting
+from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 
-Propose = Callable[[FloatArray, FloatArray, FloatArray, float], FloatArray]
-"""Damped step of the parameters, (K + 1,), from value, gradient, hessian and damping."""
+STEP_LIMIT = 0.7
+"""Largest step of a parameter in its own scale (about a factor two)."""
+
+LATENCY_STEP_LIMIT_S = 0.005
 
 START_DAMPINGS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 """Levenberg's damping of start states, in units of the smoothed states' standard deviations."""
@@ -44,7 +46,7 @@ START_ITERATIONS = 4
 
 
 def solve_contacts(
-    shooting: Shooting, point: Point, iterations: int, propose: Propose
+    shooting: Shooting, point: Point, iterations: int, *, fixed_latency: bool
 ) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states; the best point that was seen is handed back.
 
@@ -52,7 +54,7 @@ def solve_contacts(
         shooting: The windows.
         point: Where to start.
         iterations: Most steps of the parameters.
-        propose: Makes a damped step of the parameters that stays inside the range.
+        fixed_latency: Keep the latency.
     """
     best, best_cost = settle(shooting, point, START_ITERATIONS)
     here, waited, used = best, 0, 0
@@ -66,7 +68,7 @@ def solve_contacts(
         waited = 0 if fell > GAIN else waited + 1
         if waited > PATIENCE:
             break
-        here, cost = _stepped(shooting, here, normal, gains, propose)
+        here, cost = _stepped(shooting, here, normal, gains, fixed_latency)
         if cost < best_cost:
             best, best_cost = here, cost
         elif cost > best_cost * (1 + WORSE):
@@ -117,7 +119,7 @@ def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, l
 
 
 def _stepped(
-    shooting: Shooting, point: Point, normal: Normal, gains: Sequence[FloatArray], propose: Propose
+    shooting: Shooting, point: Point, normal: Normal, gains: Sequence[FloatArray], fixed_latency: bool
 ) -> tuple[Point, float]:
     """Return where the best step of the parameters leads, and the cost there."""
     # Where start states are at their best the residual alone says where to go; the gradient with start
@@ -125,8 +127,9 @@ def _stepped(
     plain = normal.gradient.copy()
     for rows, gain in zip(normal.rows, gains, strict=True):
         plain += np.einsum("wsp,ws->p", gain, np.einsum("wrs,wr->ws", rows.start, rows.residual))
+    bounds = value_bounds(shooting.problem)
     steps = [
-        propose(point.value, gradient, normal.hessian, damping)
+        damped_step(point.value, gradient, normal.hessian, damping, *bounds, fixed_latency)
         for gradient in (normal.gradient, plain)
         for damping in STEP_DAMPINGS
     ]
@@ -171,3 +174,43 @@ def _best_windows(
         found.append(Point(mine[0].value, tuple(position), tuple(velocity)))
         totals.append(total)
     return found, np.array(totals) + shooting.prior_costs(found)
+
+
+def damped_step(
+    value: FloatArray,
+    gradient: FloatArray,
+    hessian: FloatArray,
+    damping: float,
+    low: FloatArray,
+    high: FloatArray,
+    fixed_latency: bool,
+) -> FloatArray:
+    """Return the Levenberg-Marquardt step inside the range, (K + 1,).
+
+    Args:
+        value: Parameters in their own scale, then the latency [s], (K + 1,).
+        gradient: Half the cost's gradient there, (K + 1,).
+        hessian: Half its Gauss-Newton Hessian, (K + 1, K + 1).
+        damping: How much shorter than the Gauss-Newton step.
+        low: Least values, (K + 1,).
+        high: Greatest values, (K + 1,).
+        fixed_latency: Keep the latency.
+    """
+    free = np.ones(len(value), dtype=bool)
+    free[-1] = not fixed_latency
+    # A parameter at its bound that wants to leave the range stays; the others are solved without it.
+    free &= ~((value <= low) & (gradient > 0)) & ~((value >= high) & (gradient < 0))
+    step = np.zeros(len(value))
+    if not free.any():
+        return step
+    scale = np.append(np.ones(len(step) - 1), 100.0)  # 10 ms of latency count like a factor e.
+    limit = np.append(np.full(len(step) - 1, STEP_LIMIT), LATENCY_STEP_LIMIT_S)
+    H = hessian[np.ix_(free, free)]
+    # Levenberg's damping in units of the parameters' scale beside Marquardt's relative one: a parameter
+    # that the data cannot see (a limit never reached) must not run away.
+    weight = np.diag(H) + np.max(np.diag(H) / scale[free] ** 2) * 1e-9 * scale[free] ** 2 + scale[free] ** 2
+    step[free] = -np.linalg.solve(H + damping * np.diag(weight), gradient[free])
+    shrink = np.max(np.abs(step) / limit)
+    if shrink > 1:
+        step = step / shrink
+    return np.asarray(np.clip(value + step, low, high) - value)

@@ -1,4 +1,4 @@
-"""The polish: Levenberg-Marquardt on multiple shooting in growing windows, the latency one more unknown."""
+"""The refinement: least squares on multiple shooting in growing windows, the latency one more unknown."""
 
 from __future__ import annotations
 
@@ -11,57 +11,60 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.contacts import START_ITERATIONS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
+from deal_hw.calib.fit.robust import cauchy_windows, huber_weights
+from deal_hw.calib.fit.solver import SolverSettings, settled, solve
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
-STAGES_S = (0.2, 0.4, 0.8)
-"""Window lengths, short first: short windows have a wide basin, long ones the information."""
 
-WORSE = 1.2
-"""A longer window whose chi2 grows by more than this factor is not kept: its start states are in another
-basin, or the model is wrong in a way that adds up."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefinementSettings:
+    """Settings of :func:`polish`.
 
-STEP_LIMIT = 0.7
-"""Largest step of a parameter in its own scale (about a factor two)."""
+    Attributes:
+        stages_s: Window lengths, short first: short windows have a wide basin, long ones the information [s].
+        contact_stages_s: The same where feet touch the floor: longer windows add more kinks than information.
+        given_stages_s: The same where start states are exact. Over a single sample predictions are nearly
+            straight in the motors' gains and hardly a foot lands otherwise than it did, so the basin is about
+            as wide as the range; windows of 0.1 s from the start ended in others (0.18 % off).
+        worse: A longer window whose chi2 grows by more than this factor is not kept: its start states are in
+            another basin, or the model is wrong in a way that adds up.
+        explained: A chi2 below this is not worth other start states.
+        shakes: Spreads of the start states that are drawn where contacts leave the solver stuck, in standard
+            deviations.
+        shake_count: Draws of each.
+        shaken: Draws that leave more than this share of the cost are the last: it is the model that is wrong.
+        robust_rounds: Rounds of Huber's weights, see :func:`polish_robust`.
+        robust_iterations: Most steps of each.
+        rounds: Most rounds of weights where start states are exact.
+        round_iterations: Most steps of each.
+        given_chi2: Where start states are exact the truth leaves no residual at all in most windows; a kink
+            magnifies rounding in a few.
+        given_still: A round of weights that moves no parameter by more, in its own scale, is the last.
+        given_right: Where the chi2 of most of the shortest windows is below this the latency is the right
+            whole step.
+    """
 
-LATENCY_STEP_LIMIT_S = 0.005
-EXPLAINED = 1.25
-"""A residual below this is not worth another basin."""
+    stages_s: tuple[float, ...] = (0.2, 0.4, 0.8)
+    contact_stages_s: tuple[float, ...] = (0.2, 0.4)
+    given_stages_s: tuple[float, ...] = (0.02, 0.04, 0.1)
+    worse: float = 1.2
+    explained: float = 1.25
+    shakes: tuple[float, ...] = (0.5, 0.25, 0.12)
+    shake_count: int = 60
+    shaken: float = 0.95
+    robust_rounds: int = 3
+    robust_iterations: int = 4
+    rounds: int = 4
+    round_iterations: int = 4
+    given_chi2: float = 1e-9
+    given_still: float = 1e-7
+    given_right: float = 1.0
 
-SHAKES = (0.5, 0.25, 0.12)
-"""Spreads of the start states that are drawn where the solver got stuck, in standard deviations."""
 
-SHAKE_COUNT = 60
-SHAKEN = 0.95
-"""Draws that leave more than this share of the cost are the last ones: it is the model that is wrong."""
-
-CONTACT_STAGES_S = (0.2, 0.4)
-"""Where feet touch the floor longer windows add more kinks than information."""
-
-
-EXACT_STAGES_S = (0.02, 0.04, 0.1)
-"""Window lengths where states are exact. Over a single sample predictions are nearly straight in the drives'
-gains and hardly a foot lands otherwise than it did, so the basin is about as wide as the range; windows of
-0.1 s from the start ended in others (0.18 % off, and whole searches were repeated)."""
-
-EXACT_ITERATIONS = 12
-EXACT_ROUNDS = 4
-EXACT_ROUND_ITERATIONS = 4
-EXACT_CHI2 = 1e-9
-"""Where states are exact the truth leaves no residual at all in most windows; a kink magnifies rounding in a
-few."""
-
-EXACT_SHARE = 0.75
+SETTINGS = RefinementSettings()
+MOST_WINDOWS = 0.75
 """So many of the windows are most."""
-
-EXACT_STILL = 1e-7
-"""A round of weights that moves no parameter by more, in its own scale, is the last one."""
-
-EXACT_RIGHT = 1.0
-"""Where the chi2 of most of the shortest windows is below this the latency is the right whole step."""
-
-DAMPINGS = 10.0 ** np.arange(-5.0, 4.0)
-CONVERGED = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +100,6 @@ def polish(
     notify: Callable[[int, float], None] | None = None,
     states: States | None = None,
     shake: bool = True,
-    settle: bool = True,
 ) -> Polished:
     """Polish parameters from a start.
 
@@ -110,151 +112,55 @@ def polish(
         fixed_latency: Keep the latency.
         notify: Called with iterations done and chi2.
         states: Where the first stage's windows start; the smoothed states by default.
-        shake: Search other start states where contacts leave the solver stuck.
-        settle: Move start states only where that helps their window.
+        shake: Search other start states where contacts leave the solver stuck; where states are exact, let
+            windows that no small step explains weigh less.
 
     Raises:
         InsufficientDataError: Not even the shortest window fits.
     """
-    space = problem.space
+    space, settings = problem.space, SETTINGS
     theta = np.clip(theta, space.low, space.high)
     if problem.exact:
-        if not shake:
-            return _polish_stages(
-                problem, theta, latency_s, stages_s or EXACT_STAGES_S, notify, iterations=iterations, rounds=0
-            )
-        return _polish_exact(problem, theta, latency_s, fixed_latency, notify)
-    contacts = problem.robot.base is not None
-    stages_s = stages_s or (CONTACT_STAGES_S if contacts else STAGES_S)
+        stages_s = stages_s or settings.given_stages_s
+        if shake and not fixed_latency:
+            theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
+        # The latency of a simulated target is a whole number of steps.
+        fixed_latency = True
+    elif stages_s is None:
+        stages_s = settings.contact_stages_s if problem.robot.base is not None else settings.stages_s
+    free = len(space) + (0 if fixed_latency else 1)
     result: Polished | None = None
     # Fixed: a polish is part of the data's analysis, not of the search's luck.
     rng = np.random.default_rng(0)
     done = 0
     for seconds in stages_s:
         try:
-            shooting = Shooting(problem, samples_in(problem, seconds), settle=settle)
+            shooting = Shooting(problem, _samples(problem, seconds))
         except InsufficientDataError:
             if result is None:
                 raise
             break
-        start = shooting.start(theta, latency_s, states)
-        free = len(space) + (0 if fixed_latency else 1)
-        spreads = SHAKES if shake else ()
-        point, normal, used = _solve_shaken(shooting, start, iterations, fixed_latency, free, rng, spreads)
+        point = shooting.start(theta, latency_s, states)
+        if shooting.contacts:
+            point, normal, used = _with_contacts(shooting, point, iterations, fixed_latency, shake, rng)
+        elif shooting.given:
+            point, normal, used = _from_exact(shooting, point, iterations, settings.rounds if shake else 0)
+        else:
+            solver = SolverSettings(iterations=iterations)
+            point, normal, used = solve(shooting, point, solver, fixed_latency=fixed_latency)
         done += used
         chi2 = normal.cost / max(normal.count - free, 1)
-        if result is not None and chi2 > WORSE * max(result.chi2, 1.0):
+        if result is not None and not shooting.given and chi2 > settings.worse * max(result.chi2, 1.0):
             break
         theta, latency_s = shooting.theta(point), float(point.value[-1])
-        states = shooting.states(point)
+        if not shooting.given:
+            states = shooting.states(point)
         result = Polished(theta, latency_s, chi2, normal, point, shooting, done)
         if notify is not None:
             notify(done, chi2)
     if result is None:
         raise InsufficientDataError("no window length was given")
     return result
-
-
-def _polish_exact(
-    problem: Problem,
-    theta: FloatArray,
-    latency_s: float,
-    fixed_latency: bool,
-    notify: Callable[[int, float], None] | None,
-) -> Polished:
-    """Polish from exact states at the whole step of latency that explains most windows.
-
-    The latency of a simulated target is a whole number of steps; a search may end beside it.
-    """
-    step_s = problem.episodes[0].step_s
-    nearest = round(latency_s / step_s)
-    ticks = [nearest]
-    if not fixed_latency:
-        low, high = (round(v / step_s) for v in problem.latency_range_s)
-        near = sorted((nearest - 1, nearest + 1), key=lambda t: abs(t * step_s - latency_s))
-        ticks += [t for t in near if low <= t <= high]
-    best: Polished | None = None
-    done = 0
-    for tick in ticks:
-        found = _polish_stages(problem, theta, tick * step_s, EXACT_STAGES_S[:1], notify, done=done, rounds=1)
-        done = found.iterations
-        if best is None or _most(found.normal) < _most(best.normal):
-            best = found
-        if _most(best.normal) < EXACT_RIGHT:
-            break
-    if best is None:
-        raise RuntimeError("unreachable: the nearest step is always tried")
-    return _polish_stages(problem, best.theta, best.latency_s, EXACT_STAGES_S, notify, done=done)
-
-
-def _polish_stages(
-    problem: Problem,
-    theta: FloatArray,
-    latency_s: float,
-    stages_s: Sequence[float],
-    notify: Callable[[int, float], None] | None,
-    *,
-    done: int = 0,
-    iterations: int = EXACT_ITERATIONS,
-    rounds: int = EXACT_ROUNDS,
-) -> Polished:
-    """Polish from exact states at one latency, in growing windows.
-
-    Args:
-        problem: The problem.
-        theta: Start, (K,).
-        latency_s: A whole number of steps [s].
-        stages_s: Window lengths, in order [s].
-        notify: Called with iterations done and chi2.
-        done: Iterations before.
-        iterations: Most iterations of each stage before its rounds.
-        rounds: Most rounds of weights in each stage.
-    """
-    period_s = problem.episodes[0].period_s
-    found: Polished | None = None
-    for seconds in stages_s:
-        shooting = Shooting(problem, max(round(seconds / period_s), 1))
-        point, normal, more = _solve_exact(shooting, shooting.start(theta, latency_s), iterations, rounds)
-        theta, done = shooting.theta(point), done + more
-        chi2 = normal.cost / normal.count
-        found = Polished(theta, latency_s, chi2, normal, point, shooting, done)
-        if notify is not None:
-            notify(done, chi2)
-    if found is None:
-        raise InsufficientDataError("no window length was given")
-    return found
-
-
-def _most(normal: Normal) -> float:
-    """Return the chi2 that most windows stay below."""
-    each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in normal.residual])
-    return float(np.quantile(each, EXACT_SHARE))
-
-
-def _solve_exact(plain: Shooting, point: Point, iterations: int, rounds: int) -> tuple[Point, Normal, int]:
-    """Solve from exact states: most windows are predicted to rounding, so what others miss is a kink.
-
-    A window in which feet slip at another moment than they did has a residual that no small step mends, and
-    least squares would bend the parameters to it. So after a first, plain round each window weighs less the
-    more it exceeds the median (Cauchy's weights), which leaves the solution to those that can be explained.
-    """
-    point, normal, used = _solve(plain, point, iterations, True, EXACT_CHI2)
-    for _ in range(rounds):
-        if _most(normal) < EXACT_CHI2:
-            break
-        costs = [np.sum(r**2, axis=(1, 2)) for r in normal.residual]
-        median = max(float(np.median(np.concatenate(costs))), 1e-12)
-        data = [
-            dataclasses.replace(d, std=d.std * np.sqrt(1.0 + c / median)[:, None, None])
-            for d, c in zip(plain.data, costs, strict=True)
-        ]
-        weighed, before = Shooting(plain.problem, plain.length, data=data), point.value
-        point, _, more = _solve(weighed, point, EXACT_ROUND_ITERATIONS, True, EXACT_CHI2)
-        used += more
-        normal = plain.normal(point)
-        if np.max(np.abs(point.value - before)) < EXACT_STILL:
-            break
-    return point, normal, used
 
 
 def polish_windows(
@@ -268,143 +174,150 @@ def polish_windows(
         iterations: Most iterations.
         fixed_latency: Keep the latency.
     """
-    point, normal, used = _solve(shooting, point, iterations, fixed_latency)
+    if shooting.contacts:
+        point, normal, used = solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
+    else:
+        solver = SolverSettings(iterations=iterations)
+        point, normal, used = solve(shooting, point, solver, fixed_latency=fixed_latency)
     free = len(shooting.problem.space) + (0 if fixed_latency else 1)
     chi2 = normal.cost / max(normal.count - free, 1)
     return Polished(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
 
 
-def mismatch(problem: Problem, theta: FloatArray, latency_s: float, seconds: float) -> Normal:
-    """Return the residuals that fitted start states leave, all parameters fixed.
+def polish_robust(polished: Polished, fixed_latency: bool) -> Polished:
+    """Polish on from where a polish ended, large residuals weighing less.
+
+    The windows' standard deviations are divided by the weights' roots, so that normal equations, intervals
+    and start states all see the same weights. ``chi2`` stays that of all residuals alike, or the loss would
+    hide that the model is wrong.
+
+    Args:
+        polished: Where to start; its windows are kept.
+        fixed_latency: Keep the latency.
+    """
+    plain, found, iterations = polished.shooting, polished, polished.iterations
+    for _ in range(SETTINGS.robust_rounds):
+        data = [
+            dataclasses.replace(d, std=d.std / np.sqrt(huber_weights(r)))
+            for d, r in zip(plain.data, plain.residuals(found.point), strict=True)
+        ]
+        found = polish_windows(
+            plain.on(data), found.point, SETTINGS.robust_iterations, fixed_latency=fixed_latency
+        )
+        iterations += found.iterations
+    free = len(plain.problem.space) + (0 if fixed_latency else 1)
+    chi2 = float(plain.costs([found.point])[0]) / max(found.normal.count - free, 1)
+    return dataclasses.replace(found, chi2=chi2, iterations=iterations)
+
+
+def at_parameters(
+    problem: Problem, theta: FloatArray, latency_s: float, length: int, states: States | None = None
+) -> Polished:
+    """Return parameters with start states fitted to them, as if the polish had ended there.
 
     A prediction from smoothed start states errs by what smoothing errs, which says nothing of the model.
 
     Args:
-        problem: Recordings and simulator.
+        problem: The problem.
         theta: Physical parameters, (K,).
         latency_s: Total latency [s].
-        seconds: Length of the windows [s].
+        length: Samples of a window.
+        states: Where start states begin; the smoothed states by default.
 
     Raises:
         InsufficientDataError: No recording holds a window.
     """
-    shooting = Shooting(problem, samples_in(problem, seconds))
-    point = shooting.start(theta, latency_s)
-    if problem.robot.base is not None:
-        return shooting.normal(settle(shooting, point, START_ITERATIONS)[0])
-    still = np.zeros_like(point.value)
-    normal = shooting.normal(point)
-    for _ in range(START_ITERATIONS):
-        moved = shooting.moved(point, shooting.settled(point, normal), still)
-        if not shooting.costs([moved])[0] < normal.cost * (1 - CONVERGED):
+    shooting = Shooting(problem, length)
+    point = shooting.start(theta, latency_s, states)
+    if shooting.contacts:
+        point = settle(shooting, point, START_ITERATIONS)[0]
+        normal = shooting.normal(point)
+    else:
+        point, normal = settled(shooting, point, shooting.normal(point), START_ITERATIONS)
+    free = len(problem.space) + (problem.fixed_latency_s is None)
+    chi2 = normal.cost / max(normal.count - free, 1)
+    return Polished(theta, latency_s, chi2, normal, point, shooting, 0)
+
+
+def _samples(problem: Problem, seconds: float) -> int:
+    """Return the samples of a window: at least one from exact states, more where start states are unknown."""
+    return (
+        max(round(seconds / problem.episodes[0].period_s), 1)
+        if problem.exact
+        else samples_in(problem, seconds)
+    )
+
+
+def _whole_step(
+    problem: Problem, theta: FloatArray, latency_s: float, seconds: float
+) -> tuple[FloatArray, float]:
+    """Return the whole step of latency that explains most of the shortest windows, and parameters there.
+
+    A search may end beside it.
+    """
+    step_s = problem.episodes[0].step_s
+    low, high = (round(v / step_s) for v in problem.latency_range_s)
+    nearest = round(latency_s / step_s)
+    beside = sorted((nearest - 1, nearest + 1), key=lambda tick: abs(tick * step_s - latency_s))
+    shooting = Shooting(problem, _samples(problem, seconds))
+    best, least = (theta, nearest * step_s), np.inf
+    for tick in (nearest, *(t for t in beside if low <= t <= high)):
+        start = shooting.start(theta, tick * step_s)
+        point, normal, _ = _from_exact(shooting, start, SolverSettings().iterations, 1)
+        if _most(normal) < least:
+            best, least = (shooting.theta(point), tick * step_s), _most(normal)
+        if least < SETTINGS.given_right:
             break
-        point, normal = moved, shooting.normal(moved)
-    return normal
+    return best
 
 
-def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Return the least and greatest parameters in their own scale, the latency [s] last, (K + 1,) each."""
-    space = problem.space
-    low, high = problem.latency_range_s
-    return np.append(space.to_scale(space.low), low), np.append(space.to_scale(space.high), high)
+def _most(normal: Normal) -> float:
+    """Return the chi2 that most windows stay below."""
+    each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in normal.residual])
+    return float(np.quantile(each, MOST_WINDOWS))
 
 
-def _solve_shaken(
+def _from_exact(plain: Shooting, point: Point, iterations: int, rounds: int) -> tuple[Point, Normal, int]:
+    """Solve from exact states: most windows are predicted to rounding, so what others miss is a kink.
+
+    A window in which feet slip at another moment than they did has a residual that no small step mends, and
+    least squares would bend the parameters to it. So after a first, plain round each window weighs less the
+    more it exceeds the median (Cauchy's weights), which leaves the solution to those that can be explained.
+    """
+    settings = SETTINGS
+    point, normal, used = solve(plain, point, SolverSettings(iterations=iterations), fixed_latency=True)
+    for _ in range(rounds):
+        if _most(normal) < settings.given_chi2:
+            break
+        weighed, before = plain.on(cauchy_windows(plain.data, normal.residual)), point.value
+        solver = SolverSettings(iterations=settings.round_iterations)
+        point, _, more = solve(weighed, point, solver, fixed_latency=True)
+        used += more
+        normal = plain.normal(point)
+        if np.max(np.abs(point.value - before)) < settings.given_still:
+            break
+    return point, normal, used
+
+
+def _with_contacts(
     shooting: Shooting,
     point: Point,
     iterations: int,
     fixed_latency: bool,
-    free: int,
+    shake: bool,
     rng: np.random.Generator,
-    spreads: Sequence[float],
 ) -> tuple[Point, Normal, int]:
-    """Solve; while the residual is unexplained, search other start states and solve again."""
-    point, normal, used = _solve(shooting, point, iterations, fixed_latency)
-    if shooting.problem.robot.base is None or shooting.problem.exact:
-        return point, normal, used
-    for spread in spreads:
-        if normal.cost / max(normal.count - free, 1) < EXPLAINED:
+    """Solve; while the residual is unexplained, draw other start states and solve again."""
+    settings = SETTINGS
+    free = len(shooting.problem.space) + (0 if fixed_latency else 1)
+    point, normal, used = solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
+    for spread in settings.shakes if shake else ():
+        if normal.cost / max(normal.count - free, 1) < settings.explained:
             break
         before = normal.cost
-        point = shooting.shaken(point, spread, SHAKE_COUNT, rng)
-        point, normal, more = _solve(shooting, point, iterations, fixed_latency)
+        point = shooting.shaken(point, spread, settings.shake_count, rng)
+        point, normal, more = solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
         used += more
-        if normal.cost > SHAKEN * before:
+        if normal.cost > settings.shaken * before:
             break
     return point, normal, used
-
-
-def _solve(
-    shooting: Shooting, point: Point, iterations: int, fixed_latency: bool, enough: float = 0.0
-) -> tuple[Point, Normal, int]:
-    """Solve until nothing is gained, or until most windows' chi2 is below ``enough``."""
-    low, high = value_bounds(shooting.problem)
-    if shooting.problem.robot.base is not None and not shooting.problem.exact:
-        return solve_contacts(
-            shooting, point, iterations,
-            lambda value, gradient, hessian, damping: damped_step(
-                value, gradient, hessian, damping, low, high, fixed_latency
-            ),
-        )  # fmt: skip
-    normal = shooting.normal(point)
-    used = 0
-    for _ in range(iterations):
-        if enough and _most(normal) < enough:
-            break
-        used += 1
-        steps = [
-            damped_step(point.value, normal.gradient, normal.hessian, damping, low, high, fixed_latency)
-            for damping in DAMPINGS
-        ]
-        settled = shooting.settled(point, normal)
-        candidates = [shooting.moved(point, settled, step) for step in steps]
-        costs = shooting.costs(candidates)
-        best = int(np.argmin(costs))
-        if not costs[best] < normal.cost:
-            break
-        gain = normal.cost - costs[best]
-        point = candidates[best]
-        normal = shooting.normal(point)
-        if gain < CONVERGED * normal.cost and gain < 0.1:
-            break
-    return point, normal, used
-
-
-def damped_step(
-    value: FloatArray,
-    gradient: FloatArray,
-    hessian: FloatArray,
-    damping: float,
-    low: FloatArray,
-    high: FloatArray,
-    fixed_latency: bool,
-) -> FloatArray:
-    """Return the Levenberg-Marquardt step inside the range, (K + 1,).
-
-    Args:
-        value: Parameters in their own scale, then the latency [s], (K + 1,).
-        gradient: Half the cost's gradient there, (K + 1,).
-        hessian: Half its Gauss-Newton Hessian, (K + 1, K + 1).
-        damping: How much shorter than the Gauss-Newton step.
-        low: Least values, (K + 1,).
-        high: Greatest values, (K + 1,).
-        fixed_latency: Keep the latency.
-    """
-    free = np.ones(len(value), dtype=bool)
-    free[-1] = not fixed_latency
-    # A parameter at its bound that wants to leave the range stays; the others are solved without it.
-    free &= ~((value <= low) & (gradient > 0)) & ~((value >= high) & (gradient < 0))
-    step = np.zeros(len(value))
-    if not free.any():
-        return step
-    scale = np.append(np.ones(len(step) - 1), 100.0)  # 10 ms of latency count like a factor e.
-    limit = np.append(np.full(len(step) - 1, STEP_LIMIT), LATENCY_STEP_LIMIT_S)
-    H = hessian[np.ix_(free, free)]
-    # Levenberg's damping in units of the parameters' scale beside Marquardt's relative one: a parameter
-    # that the data cannot see (a limit never reached) must not run away.
-    weight = np.diag(H) + np.max(np.diag(H) / scale[free] ** 2) * 1e-9 * scale[free] ** 2 + scale[free] ** 2
-    step[free] = -np.linalg.solve(H + damping * np.diag(weight), gradient[free])
-    shrink = np.max(np.abs(step) / limit)
-    if shrink > 1:
-        step = step / shrink
-    return np.asarray(np.clip(value + step, low, high) - value)

@@ -7,7 +7,6 @@ it.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -100,7 +99,10 @@ class Shooting:
         length: Samples a window predicts.
         offset: First sample that may start a window.
         data: The windows, where they are not all that the recordings hold.
-        settle: Move start states only where that helps their window; see :meth:`settled`.
+        given: Take the smoothed start states as they are; otherwise each is an unknown of its own. Exact
+            states are always given.
+        prior_share: Spread of parameters around their nominal values as a share of their range, in their own
+            scale; infinite for no more than what their own priors say.
     """
 
     def __init__(
@@ -109,23 +111,40 @@ class Shooting:
         length: int,
         offset: int = 0,
         data: Sequence[WindowData] | None = None,
-        settle: bool = True,
+        *,
+        given: bool = False,
+        prior_share: float = np.inf,
     ) -> None:
         self.problem = problem
-        self._settle = settle and problem.robot.base is None and not problem.exact
+        self.given = given or problem.exact
+        self.prior_share = prior_share
         self.data: Sequence[WindowData] = problem.windows(length, offset=offset) if data is None else data
         self.length = length
-        mean, std = problem.space.prior
+        space = problem.space
+        mean, std = space.prior
+        own, around = 1 / std**2, 1 / (prior_share * space.width) ** 2
         # The latency has no prior.
-        self._prior_mean = np.append(problem.space.to_scale(mean), 0.0)
-        self._prior_information = np.append(1 / std**2, 0.0)
+        self.prior_information = np.append(own + around, 0.0)
+        centre = own * space.to_scale(mean) + around * space.to_scale(space.nominal)
+        self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
-        self._start_information = [1 / d.prior_std**2 for d in self.data]
+        self.start_information = [1 / d.prior_std**2 for d in self.data]
         self._parameter_step = EXACT_STEP if problem.exact else PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
-        if problem.robot.base is not None and not problem.exact:
+        if self.contacts:
             self._parameter_step = CONTACT_STEP
             self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
+
+    @property
+    def contacts(self) -> bool:
+        """Whether feet that stick and slip kink what start states change."""
+        return self.problem.robot.base is not None and not self.given
+
+    def on(self, data: Sequence[WindowData], length: int | None = None) -> Shooting:
+        """Return the same fit of other windows, such as a part of these, or weighed ones."""
+        return Shooting(
+            self.problem, length or self.length, data=data, given=self.given, prior_share=self.prior_share
+        )
 
     def start(self, theta: FloatArray, latency_s: float, states: States | None = None) -> Point:
         """Return the point at parameters (K,) and latency.
@@ -180,15 +199,21 @@ class Shooting:
                 information where there is none.
         """
         K, C = len(point.value) - 1, self.problem.coordinates
-        moved = 0 if self.problem.exact else C
+        moved = 0 if self.given else C
         members = 1 + K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
         steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
         steps = stretch * steps[: members - 1]
+        # A latency or a friction below nothing is no model: there differences are taken inwards.
+        low, high = value_bounds(self.problem)
+        outside = (point.value + steps[: K + 1] < low) | (point.value + steps[: K + 1] > high)
+        steps[: K + 1] *= np.where(outside, -1.0, 1.0)
+        before = point.value - steps[: K + 1]
+        one_sided = np.concatenate([outside | (before < low) | (before > high), np.zeros(2 * moved, bool)])
         values[1 : K + 2] += np.diag(steps[: K + 1])
-        expected = point.value - self._prior_mean
-        hessian, gradient = np.diag(self._prior_information), self._prior_information * expected
-        cost, count = float(np.sum(self._prior_information * expected**2)), 0
+        expected = point.value - self.prior_mean
+        hessian, gradient = np.diag(self.prior_information), self.prior_information * expected
+        cost, count = float(np.sum(self.prior_information * expected**2)), 0
         rows: list[WindowRows] = []
         back: list[tuple[FloatArray, FloatArray]] = []
         residuals: list[FloatArray] = []
@@ -202,11 +227,13 @@ class Shooting:
             r = (predicted[0] - data.measured) / data.std
             difference = predicted[1:] - predicted[:1]
             if central:
-                before = self._predict(2 * values[:1] - values, data, 2 * x[:1] - x, 2 * v[:1] - v).observed
-                # A command cannot act before it was sent: there the forward difference has to do.
-                told = np.arange(members - 1) != K if values[0, K] < steps[K] else slice(None)
-                difference[told] = (predicted[1:] - before[1:])[told] / 2
+                other = self._predict(2 * values[:1] - values, data, 2 * x[:1] - x, 2 * v[:1] - v).observed
+                two = ~one_sided
+                difference[two] = (predicted[1:] - other[1:])[two] / 2
             jac = np.moveaxis(difference / data.std, 0, -1) / steps
+            if np.isfinite(r).all():
+                # A column that diverges where its base does not says nothing about the way to go.
+                jac = np.nan_to_num(jac, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
             W = len(data.windows)
             r_flat, jac = r.reshape(W, -1), jac.reshape(W, -1, len(steps))
             jp, js = jac[..., : K + 1], jac[..., K + 1 :]
@@ -215,13 +242,13 @@ class Shooting:
             gradient += np.einsum("wri,wr->i", jp, r_flat)
             cost += float(np.sum(r_flat**2))
             count += r_flat.size
-            if self.problem.exact:
+            if self.given:
                 back.append((np.zeros((W, 2 * C, K + 1)), np.zeros((W, 2 * C))))
                 if keep:
                     rows.append(WindowRows(data.episode, r_flat, jp, js))
                 continue
             start = np.concatenate([point.position[e], point.velocity[e]], axis=1) - data.prior_mean
-            information = self._start_information[e]
+            information = self.start_information[e]
             if keep:
                 rows.append(_rows(data.episode, r_flat, jp, js, np.sqrt(information), start))
             mss = np.einsum("wri,wrj->wij", js, js) + information[:, :, None] * np.eye(2 * C)
@@ -240,37 +267,56 @@ class Shooting:
             gradient,
             tuple(back),
             tuple(residuals),
-            self._prior_information,
+            self.prior_information,
             tuple(rows),
         )
 
-    def moved(self, point: Point, normal: Normal, step: FloatArray) -> Point:
-        """Return the point after a parameter step, (K + 1,), start states following it to first order."""
-        C = self.problem.coordinates
-        position, velocity = [], []
-        for e, (gain, shift) in enumerate(normal.back):
-            state = -(shift + gain @ step)
-            position.append(point.position[e] + state[:, :C])
-            velocity.append(point.velocity[e] + state[:, C:])
-        return Point(point.value + step, tuple(position), tuple(velocity))
-
-    def settled(self, point: Point, normal: Normal) -> Normal:
-        """Return the normal equations with only those start-state steps that help.
+    def followed(self, point: Point, normal: Normal, step: FloatArray) -> Point:
+        """Return the point after a parameter step, (K + 1,), each window's start state moved as suits it.
 
         Next to a kink (stick-slip, a pole that passes the top) the derivative of a window's start state may
-        lead uphill, and without this one such window would hold up all parameters.
+        lead uphill, and one such window would hold up all parameters. So each takes the best of four ways: to
+        stay, to go where the last parameters had it best, to follow the step, or both.
         """
-        # Where feet touch the floor nearly all windows have kinks; parameters that step without their start
-        # states end in another basin (17 % off in damping on one tuning seed). There states are drawn anew.
-        if not self._settle:
-            return normal
-        C, values, back = self.problem.coordinates, np.repeat(point.value[None], 2, axis=0), []
+        value, C = point.value + step, self.problem.coordinates
+        if self.given:
+            return Point(value, point.position, point.velocity)
+        position, velocity = [], []
         for e, (gain, shift) in enumerate(normal.back):
-            x = np.stack([point.position[e], point.position[e] - shift[:, :C]])
-            v = np.stack([point.velocity[e], point.velocity[e] - shift[:, C:]])
-            before, after = self._window_costs(e, values, x, v)
-            back.append((gain, np.where((after <= before)[:, None], shift, 0.0)))
-        return dataclasses.replace(normal, back=tuple(back))
+            follow = gain @ step
+            ways = -np.stack([np.zeros_like(shift), shift, follow, shift + follow])
+            x, v = point.position[e] + ways[..., :C], point.velocity[e] + ways[..., C:]
+            costs = self._window_costs(e, np.repeat(value[None], len(ways), axis=0), x, v)
+            best, window = np.argmin(costs, axis=0), np.arange(len(shift))
+            position.append(x[best, window])
+            velocity.append(v[best, window])
+        return Point(value, tuple(position), tuple(velocity))
+
+    def vector(self, point: Point) -> FloatArray:
+        """Return all whitened residuals at a point, those of what is known beforehand last, (M,)."""
+        found = []
+        for e, residual in enumerate(self.residuals(point)):
+            flat = residual.reshape(len(residual), -1)
+            if not self.given:
+                start = np.concatenate([point.position[e], point.velocity[e]], axis=1)
+                known = np.sqrt(self.start_information[e]) * (start - self.data[e].prior_mean)
+                flat = np.concatenate([flat, known], axis=1)
+            found.append(flat.ravel())
+        return np.concatenate([*found, np.sqrt(self.prior_information) * (point.value - self.prior_mean)])
+
+    def derivative(self, normal: Normal) -> FloatArray:
+        """Return the derivative of :meth:`vector` while start states follow, (M, K + 1).
+
+        Args:
+            normal: Normal equations at the point, with their rows.
+        """
+        found = []
+        for rows, (gain, _) in zip(normal.rows, normal.back, strict=True):
+            by = rows.parameter
+            if not self.given:
+                by = by - np.einsum("wrs,wsp->wrp", rows.start, gain)
+            found.append(by.reshape(-1, by.shape[-1]))
+        return np.concatenate([*found, np.diag(np.sqrt(self.prior_information))])
 
     @property
     def state_std(self) -> FloatArray:
@@ -287,7 +333,7 @@ class Shooting:
     def prior_costs(self, points: Sequence[Point]) -> FloatArray:
         """Return what the parameters' priors add to the cost at each of several points, (N,)."""
         values = np.stack([p.value for p in points])
-        return np.asarray((values - self._prior_mean) ** 2 @ self._prior_information)
+        return np.asarray((values - self.prior_mean) ** 2 @ self.prior_information)
 
     def each_cost(self, points: Sequence[Point]) -> list[FloatArray]:
         """Return the cost of each window at each of several points, in one batch, (N, W) an episode."""
@@ -304,9 +350,9 @@ class Shooting:
         data = self.data[e]
         predicted = self._predict(values, data, x, v).observed
         cost = np.sum(((predicted - data.measured) / data.std) ** 2, axis=(2, 3))
-        if not self.problem.exact:
+        if not self.given:
             start = np.concatenate([x, v], axis=2) - data.prior_mean
-            cost = cost + np.sum(self._start_information[e] * start**2, axis=2)
+            cost = cost + np.sum(self.start_information[e] * start**2, axis=2)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def residuals(self, point: Point) -> list[FloatArray]:
@@ -349,6 +395,13 @@ class Shooting:
     def _predict(self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray) -> Prediction:
         theta = self.problem.space.from_scale(values[:, :-1])
         return self.problem.predict(theta, np.maximum(values[:, -1], 0.0), data, x, v)
+
+
+def value_bounds(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Return the least and greatest parameters in their own scale, the latency [s] last, (K + 1,) each."""
+    space = problem.space
+    low, high = problem.latency_range_s
+    return np.append(space.to_scale(space.low), low), np.append(space.to_scale(space.high), high)
 
 
 def _rows(

@@ -1,4 +1,4 @@
-"""A loss that a few wild residuals do not rule: Huber's, by weights that are computed anew a few times."""
+"""Weights with which a few wild residuals do not rule a fit, and what measures residuals of a wrong model."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish_windows
-from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.data.problem import WindowData
 from deal_hw.types import FloatArray
 
 HUBER = 1.345
 """Residuals beyond this many standard deviations weigh less; 95 % as efficient as least squares on noise."""
 
-ROUNDS = 3
-ITERATIONS = 4
 HEAVY_TAILS = 6.0
 """Kurtosis (noise: 3) from which the robust polish is worth a trial."""
 
-_MAD_TO_STD = 1.4826022185056018
+MAD_TO_STD = 1.4826022185056018
+"""Standard deviation of normal noise over the median of its absolute values."""
+
+LEAST_SCALE = 1e-9
+"""Residuals of a noise-free recording that the model explains are rounding [rad or m]."""
 
 
 def huber_weights(residual: FloatArray) -> FloatArray:
@@ -30,8 +30,23 @@ def huber_weights(residual: FloatArray) -> FloatArray:
     small noise in a model that explains nothing.
     """
     size = np.abs(residual)
-    spread = max(_MAD_TO_STD * float(np.median(size)), 1.0)
+    spread = max(MAD_TO_STD * float(np.median(size)), 1.0)
     return np.asarray(np.minimum(1.0, HUBER * spread / np.maximum(size, 1e-300)))
+
+
+def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) -> list[WindowData]:
+    """Return windows that weigh less the more their residual exceeds the median's (Cauchy's weights).
+
+    Args:
+        data: The windows of each episode.
+        residuals: Their whitened residuals, (W, H, M) each.
+    """
+    costs = [np.sum(r**2, axis=(1, 2)) for r in residuals]
+    median = max(float(np.median(np.concatenate(costs))), 1e-12)
+    return [
+        dataclasses.replace(d, std=d.std * np.sqrt(1.0 + c / median)[:, None, None])
+        for d, c in zip(data, costs, strict=True)
+    ]
 
 
 def kurtosis(residuals: Sequence[FloatArray]) -> float:
@@ -40,31 +55,42 @@ def kurtosis(residuals: Sequence[FloatArray]) -> float:
     return float(np.mean(values**4) / max(float(np.mean(values**2)) ** 2, 1e-300))
 
 
-def robust_polish(problem: Problem, polished: Polished, fixed_latency: bool) -> Polished:
-    """Polish on from where a polish ended, large residuals weighing less.
-
-    The windows' standard deviations are divided by the weights' roots, so that normal equations, intervals
-    and start states all see the same weights. ``chi2`` stays that of all residuals alike, or the loss would
-    hide that the model is wrong.
+def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robust: bool) -> FloatArray:
+    """Return what measures each channel's errors where no sensor's noise does, (M,).
 
     Args:
-        problem: The problem.
-        polished: Where to start; its windows are kept.
-        fixed_latency: Keep the latency.
+        errors: Prediction minus measurement of each episode, (W, H, M).
+        seen: Whether each was reported, likewise.
+        robust: Measure by the median, or a channel that fails somewhere counts nowhere.
     """
-    plain, point, normal, iterations = polished.shooting, polished.point, polished.normal, polished.iterations
-    found = polished
-    ratio = [np.ones_like(d.std) for d in plain.data]
-    for _ in range(ROUNDS):
-        # Residuals are whitened with the last weights in them.
-        raw = [r / np.sqrt(w) for r, w in zip(normal.residual, ratio, strict=True)]
-        ratio = [huber_weights(r) for r in raw]
-        data = [
-            dataclasses.replace(d, std=d.std / np.sqrt(w)) for d, w in zip(plain.data, ratio, strict=True)
-        ]
-        shooting = Shooting(problem, plain.length, data=data)
-        found = polish_windows(shooting, point, ITERATIONS, fixed_latency)
-        point, normal, iterations = found.point, found.normal, iterations + found.iterations
-    free = len(problem.space) + (0 if fixed_latency else 1)
-    chi2 = float(plain.costs([point])[0]) / max(normal.count - free, 1)
-    return dataclasses.replace(found, chi2=chi2, iterations=iterations)
+    squares = np.sum(
+        [np.sum(np.where(s, r, 0.0) ** 2, axis=(0, 1)) for r, s in zip(errors, seen, strict=True)], axis=0
+    )
+    counts = np.sum([np.sum(s, axis=(0, 1)) for s in seen], axis=0)
+    scale = np.sqrt(squares / np.maximum(counts, 1))
+    if robust:
+        size = np.concatenate([np.abs(r).reshape(-1, r.shape[-1]) for r in errors])
+        scale = np.minimum(scale, MAD_TO_STD * np.median(size, axis=0))
+    return np.asarray(np.maximum(scale, LEAST_SCALE))
+
+
+def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
+    """Return one plus twice the sum of the residuals' correlations up to their first zero, at least 1.
+
+    Args:
+        residuals: Whitened residuals of each episode, (W, H, M).
+        longest: Longest lag that is looked at [samples].
+    """
+    longest = min(longest, max(r.shape[1] for r in residuals) - 1)
+    total = sum(float(np.sum(r**2)) for r in residuals)
+    worth, count = 1.0, sum(r.size for r in residuals)
+    for lag in range(1, longest + 1):
+        product, pairs = 0.0, 0
+        for r in residuals:
+            product += float(np.sum(r[:, lag:] * r[:, :-lag]))
+            pairs += r[:, lag:].size
+        correlation = product / max(pairs, 1) / max(total / max(count, 1), 1e-300)
+        if correlation <= 0:
+            break
+        worth += 2 * correlation
+    return worth

@@ -16,9 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish
-from deal_hw.calib.fit.residual import Shooting, States
-from deal_hw.calib.fit.robust import robust_polish
+from deal_hw.calib.fit.refinement import Polished, polish, polish_robust
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.episode import Episode
@@ -32,8 +30,6 @@ BLOCKS = 2
 
 MOST_STEPS = 3e9
 """More physics steps than this are not spent on folds."""
-
-SETTLING = 5
 
 Fit = Callable[[Problem, CalibrationResult], tuple[FloatArray, float]]
 
@@ -195,27 +191,6 @@ def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]],
     return np.asarray(np.sqrt(total / max(count, 1)))
 
 
-def at_estimate(problem: Problem, searched: CalibrationResult, length: int, states: States) -> Polished:
-    """Return a search's estimate with start states fitted to it, as if the polish had ended there.
-
-    Args:
-        problem: The problem.
-        searched: What the search found.
-        length: Samples of a window.
-        states: Where start states begin.
-    """
-    shooting = Shooting(problem, length)
-    point = shooting.start(searched.estimate, searched.latency_s, states)
-    normal = shooting.normal(point)
-    still = np.zeros(len(point.value))
-    for _ in range(SETTLING):
-        point = shooting.moved(point, shooting.settled(point, normal), still)
-        normal = shooting.normal(point)
-    free = len(problem.space) + (problem.fixed_latency_s is None)
-    chi2 = normal.cost / max(normal.count - free, 1)
-    return Polished(searched.estimate, searched.latency_s, chi2, normal, point, shooting, 0)
-
-
 def _searched(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
     return searched.estimate, searched.latency_s
 
@@ -226,7 +201,7 @@ def _polished(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray
 
 
 def _robust(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    found = robust_polish(problem, _polish(problem, searched), problem.fixed_latency_s is not None)
+    found = polish_robust(_polish(problem, searched), problem.fixed_latency_s is not None)
     return found.theta, found.latency_s
 
 

@@ -187,8 +187,7 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
             data.append(take(of_episode, mine))
             position.append(point.position[e][mine])
             velocity.append(point.velocity[e][mine])
-    part = Shooting(shooting.problem, shooting.length, data=data)
-    return part, Point(point.value, tuple(position), tuple(velocity))
+    return shooting.on(data), Point(point.value, tuple(position), tuple(velocity))
 
 
 def take(data: WindowData, chosen: npt.NDArray[np.bool_]) -> WindowData:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish, polish_windows
+from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust, polish_windows
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.fit.robust import huber_weights, kurtosis, robust_polish
+from deal_hw.calib.fit.robust import huber_weights, kurtosis
 from deal_hw.calib.pipeline import PolishedMethod
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.validation.checks import Validation, unexplained
-from deal_hw.calib.validation.cross_validation import at_estimate, choose, fold_masks, prediction_error
+from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,
@@ -102,7 +102,7 @@ def test_a_search_that_is_kept_gets_start_states_and_intervals(case: Case, probl
     searched = At(case.theta, case.latency_s).run(problem, Budget(), np.random.default_rng(0))
     shooting = Shooting(problem, 40)
     smoothed = shooting.smoothed()
-    there = at_estimate(problem, searched, 40, smoothed)
+    there = at_parameters(problem, searched.estimate, searched.latency_s, 40, smoothed)
     assert there.theta == pytest.approx(case.theta)
     assert there.normal.cost < shooting.costs([shooting.start(case.theta, case.latency_s, smoothed)])[0]
     assert there.chi2 < 1.3 and not unexplained(there)
@@ -162,7 +162,7 @@ def test_robust_polish_shrugs_off_wild_samples(case: Case, problem: Problem, pol
     point = shooting.start(polished.theta, case.latency_s, polished.shooting.states(polished.point))
     plain = polish_windows(shooting, point, 6, fixed_latency=True)
     assert kurtosis(plain.normal.residual) > 6.0
-    robust = robust_polish(spoilt, plain, fixed_latency=True)
+    robust = polish_robust(plain, fixed_latency=True)
     scaled = [spoilt.space.to_scale(p.theta) for p in (polished, plain, robust)]
     assert np.linalg.norm(scaled[2] - scaled[0]) < 0.5 * np.linalg.norm(scaled[1] - scaled[0])
     # What it leaves out of the loss it does not leave out of the verdict.

@@ -14,6 +14,7 @@ from deal_hw.calib.pipeline import LatencyScan, PolishedMethod
 from deal_hw.calib.uncertainty.at_fit import NEAR
 from deal_hw.calib.uncertainty.intervals import correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
+from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import error_percent, interval_score, log_error_x100
 from deal_hw.calib.validation.normalised_error import heldout_nrmse
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
@@ -86,14 +87,14 @@ def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) ->
     def watch(p: Progress) -> None:
         stages.append(p.stage)
 
-    method = PolishedMethod(Near(noisy.theta, noisy.truth.latency_s))
+    method = PolishedMethod(Near(noisy.theta, noisy.truth.latency_s), settings=Validation(local_first=False))
     result = method.run(problem, Budget(), np.random.default_rng(0), watch)
     assert error_percent(result.estimate, noisy.theta) < 3.0
     assert abs(result.latency_s - noisy.truth.latency_s) < 1.1e-3
     inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
     assert inside.sum() >= 7
     assert result.alarms == ()
-    assert set(stages) == {"local fit", "polish", "latency"}
+    assert set(stages) == {"polish", "latency"}
     assert result.provenance["latency_scan"]["ticks"]
 
 

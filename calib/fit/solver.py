@@ -1,0 +1,195 @@
+"""The one solver of all fits: scipy's bounded least squares over the parameters and the latency.
+
+Where windows' start states are unknowns they follow the parameters (variable projection, Golub and Pereyra
+1973), so the solver sees the parameters alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
+from deal_hw.types import FloatArray
+
+SETTLED = 1e-4
+"""A step of start states that gains a smaller share of the cost is the last."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolverSettings:
+    """Settings of :func:`minimise`.
+
+    Attributes:
+        iterations: Most steps.
+        first_step: Size of the first trust region in the parameters' own scale; 0.7 is about a factor two.
+        latency_unit_s: A latency of this length counts like a factor e of a parameter [s].
+        converged: A step that gains a smaller share of the cost is the last.
+        smallest_step: A step that is smaller, as a share of the way so far, is the last.
+        reach: Width of a prior around the start, in the parameters' own scale: what the residual hardly sees
+            stays where it was. It is as wide as a range of ratio 5; each new start moves it along.
+        gain: The solver is started again from where it ended while that gains a larger share of the cost.
+    """
+
+    iterations: int = 12
+    first_step: float = 0.7
+    latency_unit_s: float = 0.007
+    converged: float = 1e-4
+    smallest_step: float = 1e-5
+    reach: float = 1.0
+    gain: float = 3e-3
+
+
+class LeastSquares(Protocol):
+    """What the solver needs of a fit."""
+
+    def residual(self, value: FloatArray) -> FloatArray:
+        """Return the whitened residuals, (M,), at parameters in their own scale and latency, (K + 1,)."""
+
+    def jacobian(self, value: FloatArray) -> FloatArray:
+        """Return their derivatives, (M, K + 1)."""
+
+
+def minimise(
+    fit: LeastSquares,
+    value: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    settings: SolverSettings,
+    *,
+    fixed_latency: bool,
+) -> tuple[FloatArray, int]:
+    """Minimise the sum of squared residuals inside bounds.
+
+    Args:
+        fit: Residual and derivative.
+        value: Start: parameters in their own scale, then the latency [s], (K + 1,).
+        bounds: Least and greatest values, (K + 1,) each.
+        settings: How.
+        fixed_latency: Keep the latency.
+
+    Returns:
+        Where it ended, (K + 1,), and the derivatives that were computed.
+    """
+    low, high = bounds
+    free = high > low
+    free[-1] &= not fixed_latency
+    start: FloatArray = np.where(free, np.clip(value, low, high), value)
+    if settings.iterations < 1 or not free.any() or not np.isfinite(fit.residual(start)).all():
+        return start, 0
+    unit = np.full(len(value), settings.first_step)
+    unit[-1] *= settings.latency_unit_s
+    used, hold = 0, settings.first_step / settings.reach
+
+    def at(step: FloatArray) -> FloatArray:
+        found: FloatArray = start.copy()
+        found[free] = np.clip(start[free] + step * unit[free], low[free], high[free])
+        return found
+
+    def residual(step: FloatArray) -> FloatArray:
+        return np.concatenate([fit.residual(at(step)), hold * step])
+
+    def jacobian(step: FloatArray) -> FloatArray:
+        nonlocal used
+        used += 1
+        return np.concatenate([fit.jacobian(at(step))[:, free] * unit[free], hold * np.eye(len(step))])
+
+    # The trust region begins with radius 1 because the start is at 0. A rectangular one (dogbox) follows
+    # parameters that end at their bound without slowing down before it, as an interior method does.
+    found = least_squares(
+        residual,
+        np.zeros(int(free.sum())),
+        jacobian,
+        bounds=((low - start)[free] / unit[free], (high - start)[free] / unit[free]),
+        method="dogbox",
+        ftol=settings.converged,
+        xtol=settings.smallest_step,
+        gtol=1e-10,
+        max_nfev=1 + settings.iterations,
+    )
+    return at(found.x), used
+
+
+def solve(
+    shooting: Shooting, point: Point, settings: SolverSettings, *, fixed_latency: bool
+) -> tuple[Point, Normal, int]:
+    """Solve for parameters and start states.
+
+    Args:
+        shooting: The windows.
+        point: Where to start.
+        settings: How.
+        fixed_latency: Keep the latency.
+
+    Returns:
+        Where it ended, the normal equations there, and the derivatives that were computed.
+    """
+    bounds, used, before = value_bounds(shooting.problem), 0, np.inf
+    # Next to a kink steps shrink to nothing. A new trust region around start states that have settled since
+    # leads on, or shows that this is the end.
+    while used < settings.iterations:
+        fit = _Following(shooting, point)
+        value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
+        point, normal = settled(shooting, fit.at(value), fit.normal_at(value), 1)
+        used += max(more, 1)
+        if not normal.cost < before * (1 - settings.gain):
+            break
+        before = normal.cost
+    return point, normal, used
+
+
+def settled(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
+    """Fit start states alone where nothing kinks; parameters stay, and no window's cost grows.
+
+    Args:
+        shooting: The windows.
+        point: Where to start.
+        normal: Normal equations there.
+        iterations: Most steps.
+    """
+    for _ in range(0 if shooting.given else iterations):
+        moved = shooting.followed(point, normal, np.zeros_like(point.value))
+        if not shooting.costs([moved])[0] < normal.cost * (1 - SETTLED):
+            break
+        point, normal = moved, shooting.normal(moved)
+    return point, normal
+
+
+class _Following:
+    """The residual as a function of the parameters alone, start states following.
+
+    Args:
+        shooting: The windows.
+        point: Where to start.
+    """
+
+    def __init__(self, shooting: Shooting, point: Point) -> None:
+        self._shooting, self._here = shooting, point
+        self._normal: Normal | None = None
+        self._last = point
+
+    def at(self, value: FloatArray) -> Point:
+        """Return the point at parameters and latency, (K + 1,)."""
+        if not np.array_equal(self._last.value, value):
+            if self._normal is None:
+                self._last = Point(value, self._here.position, self._here.velocity)
+            else:
+                self._last = self._shooting.followed(self._here, self._normal, value - self._here.value)
+        return self._last
+
+    def residual(self, value: FloatArray) -> FloatArray:
+        """See :class:`LeastSquares`."""
+        return self._shooting.vector(self.at(value))
+
+    def jacobian(self, value: FloatArray) -> FloatArray:
+        """See :class:`LeastSquares`."""
+        return self._shooting.derivative(self.normal_at(value))
+
+    def normal_at(self, value: FloatArray) -> Normal:
+        """Return the normal equations at parameters and latency, (K + 1,); kept for the last ones."""
+        point = self.at(value)
+        if self._normal is None or point is not self._here:
+            self._normal, self._here = self._shooting.normal(point, keep=True), point
+        return self._normal
