@@ -39,10 +39,10 @@ from fault_table import main
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.posture import PostureConfig
 from deal_hw.drivers import make_topic_transport
-from deal_hw.drivers.go2.command_log import DAMPING, OFF, STIFF
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.topics import LOW_COMMAND
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, OFF, STIFF
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
+from deal_hw.drivers.go2.messages.topics import LOW_COMMAND
 from deal_hw.transport import Message, WireOptions
 
 POSTURE = PostureConfig(fold_s=0.3, rise_s=0.6, settle_s=0.2, lie_s=0.6)

@@ -12,14 +12,14 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.cli.bench import describe_machine, write_rows
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.fake import ScriptedGo2
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.scripted import ScriptedGo2
 
 BATCHES: Final = 200
 BATCH: Final = 200

@@ -24,9 +24,9 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.control.leg_checks import UNIT_TOLERANCE, tilt
-from deal_hw.drivers.go2.driven import HELD_TILT_RAD
-from deal_hw.drivers.go2.leg_geometry import WEIGHT_N, foot_loads, foot_positions
-from deal_hw.drivers.go2.low_state import LowState, LowStateFrame
+from deal_hw.drivers.go2.descriptions.driver import HELD_TILT_RAD
+from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_loads, foot_positions
+from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame
 from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
 from deal_hw.types import FloatArray
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
-from deal_hw.drivers.go2.description import DESCRIPTION
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim import chart

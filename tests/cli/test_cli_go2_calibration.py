@@ -24,13 +24,13 @@ from deal_hw.data.dataset import Dataset
 from deal_hw.data.record import CycleRecord
 from deal_hw.data.recorder import EpisodeRecorder
 from deal_hw.drivers import parameter_spaces
-from deal_hw.drivers.go2.description import DESCRIPTION as SIMULATED
-from deal_hw.drivers.go2.description import LEGS
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as SIMULATED
+from deal_hw.drivers.go2.descriptions.floor import LEGS
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth
 from deal_hw.drivers.go2.robot import Go2HungRobot
-from deal_hw.drivers.go2.truth import Truth, draw_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError
 
@@ -206,7 +206,7 @@ def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
     code = (
         "import json, sys\n"
         "from deal_hw.cli.run_plan import RunPlan, make_behaviour\n"
-        "from deal_hw.drivers.go2.driven import DRIVEN\n"
+        "from deal_hw.drivers.go2.descriptions.driver import DRIVEN\n"
         f"plan = RunPlan(robot='go2', profile='excite', excite={str(path)!r}, seconds=1.0)\n"
         "make_behaviour(plan, DRIVEN)\n"
         "print(json.dumps([n for n in ('mujoco', 'torch', 'scipy') if n in sys.modules]))\n"

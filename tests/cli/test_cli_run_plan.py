@@ -15,7 +15,7 @@ from deal_hw.control.excitation import RichConfig, Segment
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.velocity import FixedVelocity, KeyboardVelocity, RemoteVelocity, ScriptVelocity
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
 from deal_hw.types import RobotState, Status

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError
 from deal_hw.policy import (
     MAX_SPEC_CHARACTERS,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.control.velocity import FixedVelocity
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
 from deal_hw.errors import PolicyError, PolicyMismatchError
 from deal_hw.policy import Observation, ObservationBuilder, ObservationTerm, PolicySpec
 from deal_hw.testing.linear_policy import feedback_spec

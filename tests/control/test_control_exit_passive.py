@@ -20,12 +20,12 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import nominal_truth as go2_truth
+from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.robot import Go2HungRobot
-from deal_hw.drivers.go2.truth import nominal_truth as go2_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError

@@ -18,20 +18,20 @@ from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.safety import CycleInput, Safety, Verdict
 from deal_hw.data.record import CycleRecord, encode
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF, kind_of
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.faults import FaultPlan
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF, kind_of
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.faults import FaultPlan
+from deal_hw.drivers.go2.emulator.truth import nominal_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowState,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.transport import Message
 from deal_hw.types import JointCommand, RobotState, Status

@@ -20,7 +20,7 @@ from deal_hw.data.record import CycleRecord, decode, encode
 from deal_hw.data.recorder import EpisodeRecorder
 from deal_hw.data.repair import repair, verify
 from deal_hw.data.schemas import CHANNELS
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
 from deal_hw.types import BodyState, BodyTrajectory, RobotState, Status, Trajectory
 
 STATES_EACH = 10

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from deal_hw.description import LegLimits, RobotDescription
-from deal_hw.drivers.go2 import hung, suspended
-from deal_hw.drivers.go2.description import DESCRIPTION
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions import on_stand, on_stand_recording
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.model import load_model
 
-BOTH = pytest.mark.parametrize("driven", [DRIVEN, hung.DESCRIPTION], ids=lambda d: d.name)
+BOTH = pytest.mark.parametrize("driven", [DRIVEN, on_stand.DESCRIPTION], ids=lambda d: d.name)
 
 
 @BOTH
@@ -53,8 +53,8 @@ def test_the_models_step_is_the_drives_period(driven: RobotDescription) -> None:
 
 def test_the_suspended_recording_keeps_its_own_step() -> None:
     """The same file, 400 Hz."""
-    assert hung.DESCRIPTION.mjcf == suspended.DESCRIPTION.mjcf
-    assert load_model(suspended.DESCRIPTION).step_s == 0.0025
+    assert on_stand.DESCRIPTION.mjcf == on_stand_recording.DESCRIPTION.mjcf
+    assert load_model(on_stand_recording.DESCRIPTION).step_s == 0.0025
 
 
 def test_the_shipped_policy_fits_the_driven_robot() -> None:
@@ -70,7 +70,7 @@ def test_the_shipped_policy_fits_the_driven_robot() -> None:
 
 def test_the_hung_robot_stays_level() -> None:
     """Its stand is level, as the model's base; free fall does not trip it, everything else does."""
-    legs, floor = hung.DESCRIPTION.limits.legs, DRIVEN.limits.legs
+    legs, floor = on_stand.DESCRIPTION.limits.legs, DRIVEN.limits.legs
     assert legs is not None and floor is not None
     assert (legs.tilt, legs.free_fall) == (0.35, 0.0)
     assert dataclasses.replace(legs, tilt=floor.tilt, free_fall=floor.free_fall) == floor

@@ -10,16 +10,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as SUSPENDED
+from deal_hw.drivers.go2.descriptions.on_stand_recording import parameter_space
+from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowStateFrame,
 )
-from deal_hw.drivers.go2.sport_controller import LYING, STANDING
-from deal_hw.drivers.go2.sport_state import decode_sport_state
-from deal_hw.drivers.go2.suspended import DESCRIPTION as SUSPENDED
-from deal_hw.drivers.go2.suspended import parameter_space
-from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.messages.sport_state import decode_sport_state
 from deal_hw.sim.model import load_model, model_with
 from deal_hw.types import FloatArray
 
@@ -170,7 +170,7 @@ def test_bad_commands_are_not_obeyed(make_go2: Any, what: str) -> None:
 
 
 def _with_nan(payload: bytes) -> bytes:
-    from deal_hw.drivers.go2.wire import low_command_image, words_crc
+    from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
 
     changed = bytearray(payload)
     changed[28:32] = np.float32(np.nan).tobytes()

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.description import JOINTS
-from deal_hw.drivers.go2.faults import MOMENTS, FaultPlan
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.drivers.go2.emulator.faults import MOMENTS, FaultPlan
+from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
+from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
 )
-from deal_hw.drivers.go2.remote import Remote, button_mask, decode_remote, decode_wireless
-from deal_hw.drivers.go2.remote_script import RemoteMoment
-from deal_hw.drivers.go2.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.messages.remote import Remote, button_mask, decode_remote, decode_wireless
 from deal_hw.types import FloatArray
 
 ZERO = np.zeros(12)

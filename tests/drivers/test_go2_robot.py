@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.protocol import decode_low_command, decode_low_state, encode_low_state
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.fake import RESTING, STIFF, ScriptedBench, ScriptedGo2
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import decode_low_command, decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import RESTING, STIFF, ScriptedBench, ScriptedGo2
 from deal_hw.errors import (
     FrameError,
     SafetyError,

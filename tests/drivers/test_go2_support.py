@@ -14,21 +14,21 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.description import DESCRIPTION, JOINTS, LEGS, joint_ranges
-from deal_hw.drivers.go2.device import HANGING, Go2Device
-from deal_hw.drivers.go2.leg_geometry import (
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, joint_ranges
+from deal_hw.drivers.go2.descriptions.leg_geometry import (
     WEIGHT_N,
     efforts_under,
     foot_jacobians,
     foot_loads,
     foot_positions,
 )
-from deal_hw.drivers.go2.low_state import LowState, decode_low_state
+from deal_hw.drivers.go2.emulator.device import HANGING, Go2Device
+from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.fake import RESTING, STANDING, ScriptedBench, ScriptedGo2
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import RESTING, STANDING, ScriptedBench, ScriptedGo2
 from deal_hw.drivers.go2.support import Support, SupportConfig, read_support
-from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.remote import Remote, parse_combination
+from deal_hw.drivers.go2.fake import STANDING, STIFF, ScriptedBench
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
+from deal_hw.drivers.go2.messages.rpc import Response, encode_response
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.rpc import Response, encode_response
-from deal_hw.drivers.go2.scripted import STANDING, STIFF, ScriptedBench
 from deal_hw.errors import (
     ProtocolError,
     SafetyError,

@@ -29,9 +29,9 @@ BASE_MODULES = (
     "deal_hw.drivers.cartpole.description",
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
-    "deal_hw.drivers.go2.checkup",
-    "deal_hw.drivers.go2.driven",
-    "deal_hw.drivers.go2.hung",
+    "deal_hw.drivers.go2.doctor",
+    "deal_hw.drivers.go2.descriptions.driver",
+    "deal_hw.drivers.go2.descriptions.on_stand",
     "deal_hw.drivers.go2.robot",
 )
 EXTRAS = (

@@ -42,15 +42,15 @@ from deal_hw.data.importing.load import load_tables
 from deal_hw.data.recorder import LIBRARY, METADATA_NAME
 from deal_hw.data.repair import verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.checkup import Checkup
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
-from deal_hw.drivers.go2.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.doctor import Checkup
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.fake import ScriptedBench
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import ScriptedBench
-from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, DatasetError, PortBusyError, SafetyError
 from deal_hw.findings import Finding, Level

@@ -44,7 +44,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.loop import ControlLoop, LoopConfig
 from deal_hw.control.safety import Safety
 from deal_hw.drivers import make_robot, make_transport
-from deal_hw.drivers.go2.checkup import Checkup
+from deal_hw.drivers.go2.doctor import Checkup
 from deal_hw.errors import DealHwError
 from deal_hw.transport import WireOptions
 

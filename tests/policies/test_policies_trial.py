@@ -22,8 +22,8 @@ from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.ant.description import DESCRIPTION as ANT
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as HUNG
 from deal_hw.errors import PolicyError, PolicyMismatchError
 from deal_hw.policies import onnx_runtime
 from deal_hw.policies.onnx_export import write_policy

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2.suspended import DESCRIPTION, parameter_space
+from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION, parameter_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.batch import ServoBatch

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from deal_hw.drivers.go2.description import (
+from deal_hw.drivers.go2.descriptions.floor import (
     DESCRIPTION,
     GYRO_NOISE_RAD_S,
     ORIENTATION_NOISE_RAD,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.description import SPACES
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.floor import SPACES
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as HUNG
 from deal_hw.drivers.go2.motions import sway
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.model import RobotModel, load_model

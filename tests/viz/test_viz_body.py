@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from deal_hw.drivers.go2.description import SPACES
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.floor import SPACES
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as HUNG
 from deal_hw.sim.model import load_model
 from deal_hw.sim.overlay import Overlay, compute_overlay
 from deal_hw.sim.standing import sensed_base
