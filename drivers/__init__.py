@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
     "go2": "deal_hw.drivers.go2.robot:Go2Robot",
-    "go2_hung": "deal_hw.drivers.go2.robot:Go2HungRobot",
+    "go2_hung": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
 }
 DESCRIPTIONS: Final = {
     "ant": "deal_hw.drivers.ant.description:DESCRIPTION",

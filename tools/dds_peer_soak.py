@@ -26,7 +26,7 @@ import tyro
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
-from deal_hw.drivers.go2.fake import ScriptedGo2
+from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,
@@ -164,7 +164,7 @@ def command_bytes() -> Callable[[int], bytes]:
 
 def state_bytes() -> Callable[[int], bytes]:
     """Return what gives the state of a cycle: a robot at rest."""
-    robot = ScriptedGo2()
+    robot = FakeGo2()
 
     def message(cycle: int) -> bytes:
         robot.tick_ms = 2 * cycle

@@ -23,9 +23,9 @@ SITUATIONS = {
     "lying, limp": {"sport": ""},
     "lying, sport mode": {"sport": "normal"},
     "standing, sport mode": {"start": "standing"},
-    "hanging, limp": {"suspended": True, "sport": ""},
-    "hanging, sport mode damps": {"suspended": True},
-    "hanging, sport mode stands": {"suspended": True, "start": "standing"},
+    "on a stand, limp": {"on_stand": True, "sport": ""},
+    "on a stand, sport mode damps": {"on_stand": True},
+    "on a stand, sport mode stands": {"on_stand": True, "start": "standing"},
 }
 WINDOW_MS = 300
 

@@ -221,7 +221,7 @@ def _device(config: Emulate, truth: Truth) -> Go2Device:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")
     script = () if own.remote_script is None else read_remote_script(own.remote_script)
     return Go2Device(
-        truth, suspended=own.suspended, start=own.start, sport="" if own.sport == "off" else own.sport,
+        truth, on_stand=own.suspended, start=own.start, sport="" if own.sport == "off" else own.sport,
         sport_on_wire=not own.sport_silent, plan=plan, remote=None if own.no_remote else script,
         tick_ms=own.tick_start_ms,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from deal_hw.errors import TransportTimeoutError, WrongDeviceError
 from deal_hw.transport import TopicTransport
 
 CONNECT_TIMEOUT_S: Final = 5.0
-_GREETING: Final = 20
+_FIRST_STATES: Final = 20
 """Sound states with a running clock that make a Go2."""
 _ONE_ROBOT: Final = 0.4
 """A larger share of states that are not new, and two robots send them."""
@@ -39,12 +39,12 @@ def await_robot(
         VersionMismatchError: The robot's firmware makes other checksums.
     """
     deadline_ns = clock.now_ns() + round(CONNECT_TIMEOUT_S * 1e9)
-    while stream.accepted < _GREETING and (left_ns := deadline_ns - clock.now_ns()) > 0:
+    while stream.accepted < _FIRST_STATES and (left_ns := deadline_ns - clock.now_ns()) > 0:
         if stream.errors >= _TOO_MANY and (error := stream.complaint()) is not None:
             raise error
         with contextlib.suppress(TransportTimeoutError):
             pump(left_ns * 1e-9)
-    if stream.accepted < _GREETING:
+    if stream.accepted < _FIRST_STATES:
         raise stream.complaint() or TransportTimeoutError(_why_silent(transport, stream))
     if stream.stale > _ONE_ROBOT * stream.accepted:
         raise WrongDeviceError(

@@ -44,7 +44,7 @@ class _Heard:
     commands: int = 0
 
 
-class Checkup:
+class Doctor:
     """Listens to a Go2 and asks its motion switcher.
 
     Args:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, efforts_under
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import (
@@ -30,10 +30,10 @@ from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports.virtual_topics import TopicCore, VirtualTopics
 from deal_hw.types import FloatArray
 
-RESTING: Final = np.array(DRIVEN.rest_position)
-STANDING: Final = np.array(DRIVEN.default_position)
+RESTING: Final = np.array(DRIVER.rest_position)
+STANDING: Final = np.array(DRIVER.default_position)
 STANDING_EFFORT: Final = efforts_under(STANDING, np.array([[0.0, 0.0, WEIGHT_N / 4]] * 4))
-"""What the drives of a standing robot give [N·m]."""
+"""What the motors of a standing robot give [N·m]."""
 ANSWER_NS: Final = 3_000_000
 STIFF: Final = LowCommandEncoder().encode(
     LowCommand(STANDING, np.zeros(12), np.full(12, 60.0), np.full(12, 5.0), np.zeros(12))
@@ -41,8 +41,8 @@ STIFF: Final = LowCommandEncoder().encode(
 """What sport mode commands."""
 
 
-class ScriptedGo2:
-    """Drives, sport mode and services, one tick a millisecond, a state every two.
+class FakeGo2:
+    """Motors, sport mode and services, one tick a millisecond, a state every two.
 
     Attributes:
         device_ns: Device time at which the next tick runs [ns].
@@ -53,7 +53,7 @@ class ScriptedGo2:
         tick_step: By how much that advances with each state; 0: it stands still.
         remote: What the operator holds; None: nothing is heard.
         changes: Fields of the state that are otherwise, by name.
-        hangs: Whether its body is held, so that its legs carry nothing where they stand.
+        on_stand: Whether its body is on a stand, so that its legs carry nothing where they stand.
         talks: Whether it sends states.
         hears: Whether commands reach the motors.
         deaf: Services that do not answer.
@@ -65,14 +65,16 @@ class ScriptedGo2:
 
     Args:
         mode: The active mode at the beginning.
-        pose: The pose, (12,) [rad]; by default at rest, or the legs down where it hangs.
-        hangs: As the attribute.
+        pose: The pose, (12,) [rad]; by default at rest, or the legs down on a stand.
+        on_stand: As the attribute.
     """
 
-    def __init__(self, mode: str = "normal", pose: FloatArray | None = None, *, hangs: bool = False) -> None:
+    def __init__(
+        self, mode: str = "normal", pose: FloatArray | None = None, *, on_stand: bool = False
+    ) -> None:
         self.device_ns = 0
-        self.mode, self.hangs, self.velocity = mode, hangs, np.zeros(12)
-        self.pose = (STANDING if hangs else RESTING).copy() if pose is None else pose.copy()
+        self.mode, self.on_stand, self.velocity = mode, on_stand, np.zeros(12)
+        self.pose = (STANDING if on_stand else RESTING).copy() if pose is None else pose.copy()
         self.tick_ms, self.tick_step = 1000, 2
         self.remote: Remote | None = None
         self.changes: dict[str, Any] = {}
@@ -136,9 +138,9 @@ class ScriptedGo2:
         return out
 
     def effort(self) -> FloatArray:
-        """Return what the drives do with the command in force, (12,) [N·m]."""
+        """Return what the motors do with the command in force, (12,) [N·m]."""
         if (c := self.command) is None:
-            stands = not self.hangs and np.array_equal(self.pose, STANDING)
+            stands = not self.on_stand and np.array_equal(self.pose, STANDING)
             return STANDING_EFFORT if stands else np.zeros(12)
         return np.asarray(
             c.stiffness * (c.position - self.pose) + c.damping * (c.velocity - self.velocity) + c.effort
@@ -160,7 +162,7 @@ class ScriptedGo2:
         return LowState(**{**values, **self.changes})
 
 
-class ScriptedTopics(VirtualTopics):
+class FakeTopics(VirtualTopics):
     """A virtual wire with other participants, on which things go wrong.
 
     Attributes:
@@ -198,8 +200,8 @@ class ScriptedTopics(VirtualTopics):
                 self._arrive(topic, arrived, tick_ns)
 
 
-class ScriptedBench:
-    """A scripted robot, its driver, and the topics between them.
+class FakeBench:
+    """A fake robot, its driver, and the topics between them.
 
     Attributes:
         clock: The clock that everybody shares.
@@ -209,13 +211,13 @@ class ScriptedBench:
 
     Args:
         kind: The driver.
-        settings: Arguments of :class:`ScriptedGo2`.
+        settings: Arguments of :class:`FakeGo2`.
     """
 
     def __init__(self, kind: type[Go2Robot] = Go2Robot, **settings: Any) -> None:
         self.clock = VirtualClock(5_000_000_000)
-        self.device = ScriptedGo2(**{"hangs": kind.description.floating_base is None, **settings})
-        self.topics = ScriptedTopics(self.device, self.clock)
+        self.device = FakeGo2(**{"on_stand": kind.description.floating_base is None, **settings})
+        self.topics = FakeTopics(self.device, self.clock)
         self.robot = kind(self.topics, self.clock)
 
     def armed(self) -> Go2Robot:

@@ -14,7 +14,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.command_sender import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.go2.connect import await_robot
 from deal_hw.drivers.go2.descriptions import on_stand
-from deal_hw.drivers.go2.descriptions.driver import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.body import body_state, is_damped
 from deal_hw.drivers.go2.messages.protocol import LowStateFrame
@@ -82,7 +82,7 @@ class Go2Robot(Robot):
             description says.
     """
 
-    description: ClassVar[RobotDescription] = DRIVEN
+    description: ClassVar[RobotDescription] = DRIVER
     homes_by_motor: ClassVar[bool] = False
 
     def __init__(
@@ -345,7 +345,7 @@ class Go2Robot(Robot):
             raise SafetyError("go2: not connected; call connect() first")
 
 
-class Go2HungRobot(Go2Robot):
-    """The same robot with its base held in the air."""
+class Go2OnStandRobot(Go2Robot):
+    """The same robot with its base on a stand."""
 
     description: ClassVar[RobotDescription] = on_stand.DESCRIPTION

@@ -2,7 +2,7 @@
 
 The two are different robots to deal-hw (``go2``, ``go2_hung``), and commands for one are dangerous to the
 other. No sensor tells which it is. Two quantities do: how far the feet reach below the base, along gravity,
-and the force that the legs carry, by the drives' estimated efforts.
+and the force that the legs carry, by the motors' estimated efforts.
 
 - Legs that carry half of the weight stand on the floor.
 - Folded legs are those of a robot that lies. Legs that were folded when the robot was lifted look the same.

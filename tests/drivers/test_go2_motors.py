@@ -14,7 +14,7 @@ from deal_hw.drivers.go2.descriptions.floor import JOINTS
 from deal_hw.drivers.go2.descriptions.on_stand_recording import biased_space
 from deal_hw.drivers.go2.emulator.command_log import kind_of
 from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, StateFaults
-from deal_hw.drivers.go2.emulator.motors import AMBIENT_C, Drives
+from deal_hw.drivers.go2.emulator.motors import AMBIENT_C, Motors
 from deal_hw.drivers.go2.emulator.profiles import profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment, read_remote_script
 from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth, nominal_truth
@@ -36,24 +36,24 @@ def command(
 
 def test_effort_is_p_d_with_feed_forward() -> None:
     """40 * (0.3 - 0.1) - 2 * 1.5 + 0.5 = 5.5 N·m."""
-    drives = Drives(nominal_truth(), profile("ideal"))
-    drives.accept(command(40.0, 2.0, 0.5, 0.3))
-    drives.update(np.full(12, 0.1), np.full(12, 1.5))
-    assert np.allclose(drives.effort, 5.5)
-    assert np.allclose(drives.constant, 8.5)
-    assert np.allclose(drives.brake, 2.0)
+    motors = Motors(nominal_truth(), profile("ideal"))
+    motors.accept(command(40.0, 2.0, 0.5, 0.3))
+    motors.update(np.full(12, 0.1), np.full(12, 1.5))
+    assert np.allclose(motors.effort, 5.5)
+    assert np.allclose(motors.constant, 8.5)
+    assert np.allclose(motors.brake, 2.0)
 
 
 def test_effort_is_limited_by_part() -> None:
     """Hips and thighs stop at 23.7 N·m, calves at 45.43, either way."""
-    drives = Drives(nominal_truth(), profile("ideal"))
-    drives.accept(command(effort=100.0))
-    drives.update(ZERO, ZERO)
-    assert drives.effort.reshape(4, 3).tolist() == [[23.7, 23.7, 45.43]] * 4
-    drives.accept(command(effort=-100.0, damping=3.0))
-    drives.update(ZERO, ZERO)
-    assert drives.constant.reshape(4, 3).tolist() == [[-23.7, -23.7, -45.43]] * 4
-    assert not drives.brake.any()
+    motors = Motors(nominal_truth(), profile("ideal"))
+    motors.accept(command(effort=100.0))
+    motors.update(ZERO, ZERO)
+    assert motors.effort.reshape(4, 3).tolist() == [[23.7, 23.7, 45.43]] * 4
+    motors.accept(command(effort=-100.0, damping=3.0))
+    motors.update(ZERO, ZERO)
+    assert motors.constant.reshape(4, 3).tolist() == [[-23.7, -23.7, -45.43]] * 4
+    assert not motors.brake.any()
 
 
 @pytest.mark.parametrize(
@@ -62,21 +62,21 @@ def test_effort_is_limited_by_part() -> None:
     [(0.0, 23.7), (0.6, 23.7), (0.8, 11.85), (1.0, 0.0), (1.2, 0.0), (-1.0, 23.7)],
 )
 def test_the_torque_speed_limit_spares_braking(share: float, effort: float) -> None:
-    """A realistic drive weakens towards its no-load speed, and brakes with all it has."""
-    drives = Drives(nominal_truth(), profile("realistic"))
-    drives.accept(command(effort=100.0))
-    drives.update(ZERO, np.full(12, share * 30.1))
-    assert drives.effort[0] == pytest.approx(effort)
+    """A realistic motor weakens towards its no-load speed, and brakes with all it has."""
+    motors = Motors(nominal_truth(), profile("realistic"))
+    motors.accept(command(effort=100.0))
+    motors.update(ZERO, np.full(12, share * 30.1))
+    assert motors.effort[0] == pytest.approx(effort)
 
 
 def test_motors_warm_up_towards_the_square_of_the_torque() -> None:
     """10 N·m end at 28 + 0.25 * 100 = 53 °C; after one time constant of 150 s, 63 % of the way."""
-    drives = Drives(nominal_truth(), profile("ideal"))
-    drives.accept(command(effort=10.0))
-    drives.update(ZERO, ZERO)
+    motors = Motors(nominal_truth(), profile("ideal"))
+    motors.accept(command(effort=10.0))
+    motors.update(ZERO, ZERO)
     for _ in range(1500):
-        drives.warm(0.1)
-    assert drives.temperature[0] == pytest.approx(AMBIENT_C + 25.0 * (1 - np.exp(-1.0)), abs=0.05)
+        motors.warm(0.1)
+    assert motors.temperature[0] == pytest.approx(AMBIENT_C + 25.0 * (1 - np.exp(-1.0)), abs=0.05)
 
 
 def test_kinds_of_commands() -> None:

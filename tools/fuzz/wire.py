@@ -16,7 +16,7 @@ from deal_hw.data.record import encode as encode_record
 from deal_hw.data.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
 from deal_hw.drivers.cartpole import protocol as serial
 from deal_hw.drivers.go2.emulator.sport_service import Services, SportMode
-from deal_hw.drivers.go2.fake import ScriptedGo2
+from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.remote import (
@@ -83,7 +83,7 @@ def _mend_words(image_of: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
 
 
 def _low_states() -> list[bytes]:
-    robot = ScriptedGo2()
+    robot = FakeGo2()
     quiet = encode_low_state(robot.state())
     robot.remote = Remote(0x220, left_x=0.5)
     return [quiet, encode_low_state(robot.state())]

@@ -50,7 +50,7 @@ LEG_SOURCES: Final[Mapping[str, str]] = {
     ),
     "legs.free_fall": "assumed: a fifth of gravity; a standing or trotting robot is pressed harder",
     "legs.free_fall_s": "a fall of 0.11 m takes 0.15 s; flight phases of a trot are shorter than 0.1 s",
-    "legs.flail_velocity": "two thirds of the drives' speed",
+    "legs.flail_velocity": "two thirds of the motors' speed",
     "legs.flail_s": "at that speed a joint crosses half its range in this time",
     "legs.temperature": "unitree_rl_lab @ e72a072, protections of the G1: 85 °C at the motor's casing",
     "legs.lost_rate": "assumed: 4 % of the commands at 500 Hz",
@@ -62,11 +62,11 @@ LEG_SOURCES: Final[Mapping[str, str]] = {
 }
 
 
-def driven_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyLimits:
+def driver_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyLimits:
     """Return limits with those for legs, and with room for a robot that lies on its stops.
 
     The calves of a lying robot were seen at -2.81 rad, 0.09 beyond the mechanical range of the models. The
-    wire carries no effort limit, so none is asked for below the drives' own: the predicted effort is limited
+    wire carries no effort limit, so none is asked for below the motors' own: the predicted effort is limited
     instead.
     """
     trip = tuple((low - TRIP_MARGIN_RAD, high + TRIP_MARGIN_RAD) for low, high in limits.trip_position)
@@ -80,14 +80,14 @@ def driven_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyL
     )
 
 
-DRIVEN: Final[RobotDescription] = dataclasses.replace(
+DRIVER: Final[RobotDescription] = dataclasses.replace(
     floor.DESCRIPTION,
     state_rate_hz=WIRE_HZ,
     repeat_rate_hz=WIRE_HZ,
     passive_damping=(PASSIVE_DAMPING_NMS_RAD,) * 12,
     rest_position=floor.per_joint(RESTING_RAD),
     feet=tuple(f"{leg}_foot" for leg in floor.LEGS),
-    limits=driven_limits(floor.DESCRIPTION.limits),
+    limits=driver_limits(floor.DESCRIPTION.limits),
     sources={
         **floor.DESCRIPTION.sources,
         "state_rate_hz": "rt/lowstate comes at 500 Hz, its tick counts 2 ms",
@@ -106,6 +106,6 @@ DRIVEN: Final[RobotDescription] = dataclasses.replace(
 )
 
 
-def hung_legs() -> LegLimits:
-    """Return the limits for a robot whose base is held in the air: level, and it cannot fall."""
+def legs_on_stand() -> LegLimits:
+    """Return the limits for a robot whose base is on a stand: level, and it cannot fall."""
     return dataclasses.replace(LEG_LIMITS, tilt=HELD_TILT_RAD, free_fall=0.0)

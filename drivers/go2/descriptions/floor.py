@@ -49,7 +49,7 @@ def joint_ranges() -> tuple[tuple[float, float], ...]:
 
 
 def safety_limits() -> SafetyLimits:
-    """Return limits for the 12 joints: targets stay 0.05 rad inside the range, half the drives' effort."""
+    """Return limits for the 12 joints: targets stay 0.05 rad inside the range, half the motors' effort."""
     margin = 0.05
     return SafetyLimits(
         target=tuple((low + margin, high - margin) for low, high in joint_ranges()),
@@ -90,7 +90,7 @@ DESCRIPTION: Final = RobotDescription(
         "stiffness": "upper end of what deployed Go2 policies use (20 to 40); DEAL's Table 9 prints 0.5",
         "damping": "upper end of what deployed Go2 policies use (0.5 to 1); DEAL's Table 9 prints 20",
         "effort_limit": "ctrlrange of the same go2.xml: 23.7 N·m hip and thigh, 45.43 N·m calf",
-        "speed_limit": "the drives follow the set-point as it comes: there is no set-point generator",
+        "speed_limit": "the motors follow the set-point as it comes: there is no set-point generator",
         "control_rate_hz": "DEAL, section 4.4: targets at 50 Hz",
         "device_rate_hz": "low-level commands and states of the robot come at 500 Hz",
         "state_rate_hz": "one state a control step, as in DEAL's environments; the robot sends 500 Hz",
@@ -102,10 +102,10 @@ DESCRIPTION: Final = RobotDescription(
 
 
 def parameter_space(stiffness: float = STIFFNESS_NM_RAD, damping: float = DAMPING_NMS_RAD) -> ParameterSpace:
-    """Return the 24 parameters of DEAL's Table 9: stiffness and damping of each joint's drive.
+    """Return the 24 parameters of DEAL's Table 9: stiffness and damping of each joint's motor.
 
-    They are what the drives do when sent the description's default gains. The joints' own viscous friction
-    (0.6 N·m·s/rad) adds to the drive's damping and stays as it is: no motion tells the two apart.
+    They are what the motors do when sent the description's default gains. The joints' own viscous friction
+    (0.6 N·m·s/rad) adds to the motor's damping and stays as it is: no motion tells the two apart.
     """
     return ParameterSpace(
         [

@@ -1,4 +1,4 @@
-"""Where a Go2's feet are, and what its legs carry by its drives' efforts; closed form, no simulator.
+"""Where a Go2's feet are, and what its legs carry by its motors' efforts; closed form, no simulator.
 
 Lengths as in ``assets/go2.xml``. Arrays follow model order (legs FL, FR, RL, RR; hip, thigh, calf); vectors
 are in the base's frame: x ahead, y left, z up.
@@ -55,14 +55,14 @@ def foot_jacobians(position: FloatArray) -> FloatArray:
 
 
 def foot_loads(position: FloatArray, effort: FloatArray) -> FloatArray:
-    """Return the force of the floor on each foot by which the drives' efforts are in balance, (4, 3) [N].
+    """Return the force of the floor on each foot by which the motors' efforts are in balance, (4, 3) [N].
 
     The legs' own weight is left out: in the air, a leg that is held shows it as a small negative load. The
     calves' range keeps the equations regular.
 
     Args:
         position: Joint positions, (12,) [rad].
-        effort: Efforts of the drives, (12,) [N·m].
+        effort: Efforts of the motors, (12,) [N·m].
     """
     transposed = np.swapaxes(foot_jacobians(position), 1, 2)
     return np.asarray(-np.linalg.solve(transposed, effort.reshape(4, 3, 1))[:, :, 0])

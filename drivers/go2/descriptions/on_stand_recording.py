@@ -1,4 +1,4 @@
-"""Facts about the Unitree Go2 with its base held in the air, as in the public recording of iit-DLSLab.
+"""Facts about the Unitree Go2 with its base on a stand, as in the public recording of iit-DLSLab.
 
 Twelve joints follow set-points at 200 Hz; no floor, no contact, a base that does not move.
 """
@@ -40,7 +40,7 @@ DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
         "stiffness": "configuration of iit-DLSLab/sim2real-robot-identification: kp 20",
         "damping": "the same: kd 1.5",
         "control_rate_hz": "sampling rate of that project's recording",
-        "device_rate_hz": "twice that; the drive's own rate is higher and not published",
+        "device_rate_hz": "twice that; the motor's own rate is higher and not published",
         "state_rate_hz": "sampling rate of that project's recording",
     },
 )
@@ -75,7 +75,7 @@ _EACH: Final = tuple((joint, (joint,)) for joint in floor.JOINTS)
 def parameter_space() -> ParameterSpace:
     """Return 48 parameters: stiffness, damping, frictionloss and armature of each joint.
 
-    Damping is what acts at the joint when the drive is sent kd = 1.5: the drive's own and the joint's viscous
+    Damping is what acts at the joint when the motor is sent kd = 1.5: the motor's own and the joint's viscous
     friction (0.6 in the source's model) together, as no recording can tell them apart. Delay and armature are
     confounded in this recording: read both with the report's correlation.
     """

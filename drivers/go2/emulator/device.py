@@ -1,4 +1,4 @@
-"""The emulated Go2: mechanics, drives, firmware and services in virtual time. Messages in, messages out."""
+"""The emulated Go2: mechanics, motors, firmware and services in virtual time. Messages in, messages out."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS
-from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as SUSPENDED
+from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as RECORDED
 from deal_hw.drivers.go2.emulator.command_log import CommandLog
 from deal_hw.drivers.go2.emulator.faults import FaultPlan, StateFaults
-from deal_hw.drivers.go2.emulator.motors import Drives
+from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
 from deal_hw.drivers.go2.emulator.sensing import Sensing
@@ -43,7 +43,7 @@ WIRELESS_MS: Final = 10
 PUSH_MS: Final = 100
 SETTLE_TICKS: Final = 1500
 STOP_COMBINATION: Final = "L2+B"
-HANGING: Final = np.tile((0.0, 0.34, -0.85), 4)
+LEGS_DOWN: Final = np.tile((0.0, 0.34, -0.85), 4)
 """Where limp legs come to rest in the air, but for the hips: the calf's weight opens the knee to its stop."""
 
 Outgoing = tuple[str, bytes]
@@ -52,8 +52,8 @@ Outgoing = tuple[str, bytes]
 class Go2Device:
     """Everything of an emulated Go2 but time and wire.
 
-    Tick k, at device time k ms: what was received is handled and commands that are due reach the drives; the
-    drives find their torques from the state at the start of the tick; at even ticks a LowState reports that
+    Tick k, at device time k ms: what was received is handled and commands that are due reach the motors; the
+    motors find their torques from the state at the start of the tick; at even ticks a LowState reports that
     state; one physics step of 1 ms follows. What comes at k ms sharp is handled in tick k + 1.
 
     Attributes:
@@ -63,7 +63,7 @@ class Go2Device:
 
     Args:
         truth: Hidden parameters, profile, seed.
-        suspended: Whether the base is held in the air.
+        on_stand: Whether the base is on a stand.
         start: Limp, lying or with its legs hanging down, or standing with sport mode in control.
         sport: Name of the sport mode that is active at power-up; "" for none.
         sport_on_wire: Whether sport mode's own commands are seen on ``rt/lowcmd``.
@@ -76,7 +76,7 @@ class Go2Device:
         self,
         truth: Truth,
         *,
-        suspended: bool = False,
+        on_stand: bool = False,
         start: Literal["lying", "standing"] = "lying",
         sport: str = "normal",
         sport_on_wire: bool = True,
@@ -89,7 +89,7 @@ class Go2Device:
         self._plan = plan or FaultPlan()
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0x602]).spawn(4)]
         sensor_rng, self._jitter_rng, self._drop_rng, fault_rng = streams
-        mjcf = (SUSPENDED if suspended else DESCRIPTION).mjcf
+        mjcf = (RECORDED if on_stand else DESCRIPTION).mjcf
         self._sim = LeggedSimulation(mjcf, JOINTS, [f"{leg}_foot" for leg in LEGS], TICK_NS * 1e-9)
         self._friction = np.array(truth.frictionloss)
         self._joint_damping = np.array(truth.joint_damping)
@@ -97,8 +97,8 @@ class Go2Device:
             damping=self._joint_damping, frictionloss=self._friction, armature=np.array(truth.armature)
         )
         self._bias = np.array(truth.encoder_bias)
-        self._drives = Drives(truth, profile)
-        self._sensing = Sensing(self._sim, self._drives, truth, profile, sensor_rng)
+        self._motors = Motors(truth, profile)
+        self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng)
         self._sport = SportMode(sport)
         self._services = Services(self._sport)
         self._service_of = {topics.request(name): name for name in topics.SERVICES}
@@ -122,7 +122,7 @@ class Go2Device:
         self._bad_requests = 0
         self._largest_tilt = 0.0
         self.log = CommandLog()
-        self._begin(start, HANGING if suspended else LYING)
+        self._begin(start, LEGS_DOWN if on_stand else LYING)
 
     @property
     def device_ns(self) -> int:
@@ -183,10 +183,10 @@ class Go2Device:
         self._let_time_pass(now)
         out += self._command_drives(now)
         velocity = self._sim.velocity()
-        self._drives.update(self._sim.position(), velocity)
+        self._motors.update(self._sim.position(), velocity)
         if now % STATE_MS == 0:
-            self._drives.warm(STATE_MS * 1e-3)
-            self._sensing.battery.drain(self._drives.effort, velocity, STATE_MS * 1e-3)
+            self._motors.warm(STATE_MS * 1e-3)
+            self._sensing.battery.drain(self._motors.effort, velocity, STATE_MS * 1e-3)
         out += self._reports(now)
         self._move(velocity)
         self._tick = now + 1
@@ -231,7 +231,7 @@ class Go2Device:
             case "stale":
                 self._stale = encode_low_state(self._last or self._state(self._tick))
             case "lost":
-                self._drives.lose(JOINTS.index(plan.lost_joint))
+                self._motors.lose(JOINTS.index(plan.lost_joint))
             case "sport":
                 self._sport.select("normal", self._sim.position() + self._bias, self._tick)
             case "battery":
@@ -254,25 +254,25 @@ class Go2Device:
 
     def _begin(self, start: str, limp: FloatArray) -> None:
         """Settle in the start posture; device time does not move."""
-        sim, drives, controller = self._sim, self._drives, self._sport.controller
+        sim, motors, controller = self._sim, self._motors, self._sport.controller
         sim.set_pose(STANDING if start == "standing" else limp, 0.34 if start == "standing" else 0.13)
         if start == "standing":
             controller.take(Posture.STANDING, STANDING, -10_000)
-        drives.accept(controller.command(0))
+        motors.accept(controller.command(0))
         for _ in range(SETTLE_TICKS):
             velocity = sim.velocity()
-            drives.update(sim.position(), velocity)
+            motors.update(sim.position(), velocity)
             self._move(velocity)
         if not self._sport.name and start == "lying":
-            self._drives = self._sensing.drives = Drives(self._truth, self._profile)
+            self._motors = self._sensing.motors = Motors(self._truth, self._profile)
 
     def _move(self, velocity: FloatArray) -> None:
-        """Run a physics step with the drives as they are, from these velocities (12,)."""
+        """Run a physics step with the motors as they are, from these velocities (12,)."""
         if self._profile.stribeck_ratio:
             slow = np.exp(-np.square(velocity / self._profile.stribeck_rad_s))
             self._sim.set_frictionloss(self._friction * (1.0 + self._profile.stribeck_ratio * slow))
-        self._sim.set_damping(self._joint_damping + self._drives.brake)
-        self._sim.step(self._drives.constant)
+        self._sim.set_damping(self._joint_damping + self._motors.brake)
+        self._sim.step(self._motors.constant)
 
     def _handle(self, topic: str, payload: bytes, stamp_ns: int) -> list[Outgoing]:
         if topic == topics.LOW_COMMAND:
@@ -324,7 +324,7 @@ class Go2Device:
         while self._commands and self._commands[0][0] <= now:
             user = self._commands.popleft()[1]
         if user is not None:
-            self._drives.accept(user)
+            self._motors.accept(user)
         self._sport.update(now)
         if not self._sport.name:
             self._sport_waits = False
@@ -338,7 +338,7 @@ class Go2Device:
             return []
         self._sport_waits = False
         command = self._sport.controller.command(now)
-        self._drives.accept(command)
+        self._motors.accept(command)
         return [(topics.LOW_COMMAND, self._encoder.encode(command))] if self.sport_on_wire else []
 
     def _reports(self, now: int) -> list[Outgoing]:

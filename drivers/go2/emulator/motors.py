@@ -18,14 +18,14 @@ _HEAT_K_PER_NM2: Final = 0.25
 _WARMING_S: Final = 150.0
 
 
-class Drives:
-    """Twelve drives in model order. There is no watchdog: the last command holds until the next.
+class Motors:
+    """Twelve motors in model order. There is no watchdog: the last command holds until the next.
 
     Until the first command they are off, as after power-up.
 
     Attributes:
-        mode: Mode of each drive as commanded last, (12,).
-        lost: Commands that each drive missed, (12,).
+        mode: Mode of each motor as commanded last, (12,).
+        lost: Commands that each motor missed, (12,).
         temperature: (12,) [°C].
         effort: What they give at the start of a step, (12,) [N·m].
         constant: The part of it that holds through the step, (12,) [N·m].
@@ -63,7 +63,7 @@ class Drives:
         self.mode = command.mode
 
     def lose(self, joint: int) -> None:
-        """Cut a drive off: it gives nothing and misses every command from now on."""
+        """Cut a motor off: it gives nothing and misses every command from now on."""
         self._alive[joint] = 0.0
         self._any_dead = True
 
@@ -71,7 +71,7 @@ class Drives:
         """Find the efforts for true positions and velocities, (12,).
 
         The D gain is handed on as damping, to be integrated implicitly: held through a step of 1 ms, the high
-        gains that a real drive takes would shake the light joints apart.
+        gains that a real motor takes would shake the light joints apart.
         """
         constant = self._kp * (self._q - position - self._bias) + self._kd * self._dq + self._tau
         wish = constant - self._kd * velocity

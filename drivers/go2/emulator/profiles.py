@@ -29,7 +29,7 @@ class Profile:
         jitter_ms: A command acts up to this much later, uniformly [ms].
         stribeck_ratio: Gear friction at standstill over friction in motion, less 1.
         stribeck_rad_s: Speed at which that excess has fallen to 1/e [rad/s].
-        knee: Share of the no-load speed up to which a drive gives full torque; from there it falls linearly.
+        knee: Share of the no-load speed up to which a motor gives full torque; from there it falls linearly.
             1: full torque at any speed.
         drop: Share of states that are never sent.
     """

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.emulator.motors import Drives
+from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import Profile
 from deal_hw.drivers.go2.emulator.truth import Truth
 from deal_hw.drivers.go2.messages.protocol import LowState
@@ -58,25 +58,25 @@ class Sensing:
 
     Attributes:
         battery: The battery.
-        drives: The motors.
+        motors: The motors.
         hot: Joint whose motor reports 95 °C; None for none.
         broken: Joint whose encoder reports NaN; None for none.
 
     Args:
         sim: The mechanics.
-        drives: The motors.
+        motors: The motors.
         truth: Encoder biases.
         profile: Noise and resolution.
         rng: Source of the noise.
     """
 
     def __init__(
-        self, sim: LeggedSimulation, drives: Drives, truth: Truth, profile: Profile, rng: np.random.Generator
+        self, sim: LeggedSimulation, motors: Motors, truth: Truth, profile: Profile, rng: np.random.Generator
     ) -> None:
         self.battery = Battery()
         self.hot: int | None = None
         self.broken: int | None = None
-        self._sim, self.drives, self._rng = sim, drives, rng
+        self._sim, self.motors, self._rng = sim, motors, rng
         self._bias = np.array(truth.encoder_bias)
         self._resolution = profile.position_resolution
         p = profile
@@ -98,13 +98,13 @@ class Sensing:
             tick_ms: The robot's clock.
             remote: What the remote control sent, 40 bytes.
         """
-        sim, drives, battery = self._sim, self.drives, self.battery
+        sim, motors, battery = self._sim, self.motors, self.battery
         noise = self._noise * self._rng.standard_normal(57)
         position = sim.position() + self._bias + noise[0:12]
         if self._resolution:
             position = np.rint(position / self._resolution) * self._resolution
         velocity = sim.velocity() + noise[12:24]
-        temperature = drives.temperature.astype(np.int64)
+        temperature = motors.temperature.astype(np.int64)
         if self.hot is not None:
             temperature[self.hot] = _HOT_C
         if self.broken is not None:
@@ -114,7 +114,7 @@ class Sensing:
         self._cells[:CELLS] = battery.cell_mv
         return LowState(
             position=position, velocity=velocity, acceleration=sim.acceleration() + noise[24:36],
-            effort=drives.effort + noise[36:48], temperature=temperature, lost=drives.lost, mode=drives.mode,
+            effort=motors.effort + noise[36:48], temperature=temperature, lost=motors.lost, mode=motors.mode,
             orientation=orientation, angular_velocity=sim.angular_velocity() + noise[51:54],
             specific_force=sim.specific_force() + noise[54:57], rpy=_roll_pitch_yaw(w, x, y, z),
             imu_temperature=IMU_TEMPERATURE_C, foot_force=force, foot_force_estimate=force,

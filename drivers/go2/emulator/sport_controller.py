@@ -1,6 +1,6 @@
 """The vendor's sport mode, as far as an emulator needs it: it stands up, lies down, damps, and never lets go.
 
-It commands the drives every 2 ms, whoever else does. It does not walk: a Move is answered, and the robot
+It commands the motors every 2 ms, whoever else does. It does not walk: a Move is answered, and the robot
 stays where it stands.
 """
 
@@ -80,7 +80,7 @@ class SportController:
         return min(1.0, (now_ms - self._begin_ms) * 1e-3 / total_s) if total_s else 1.0
 
     def command(self, now_ms: int) -> LowCommand:
-        """Return what the drives get now."""
+        """Return what the motors get now."""
         if self.posture is Posture.DAMPING:
             return LowCommand(_ZEROS, _ZEROS, _ZEROS, _RELEASED, _ZEROS)
         since_s = (now_ms - self._begin_ms) * 1e-3

@@ -2,7 +2,7 @@
 
 Names, numbers and answers: unitree_sdk2_python @ 37116c5 and unitree_sdk2 @ 21d0a3b (motion switcher, sport,
 robot state, RPC errors). Not published, so assumed: a release takes 0.3 s, and waits for a movement under
-way; sport mode that is selected stands the robot up; released, the drives keep the last command.
+way; sport mode that is selected stands the robot up; released, the motors keep the last command.
 """
 
 from __future__ import annotations

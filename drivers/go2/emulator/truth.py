@@ -28,12 +28,12 @@ class Truth:
     Attributes:
         profile: Name of the profile.
         seed: Seed of the draw, of noise and of jitter.
-        stiffness: What the drive does over what it is told, kp.
+        stiffness: What the motor does over what it is told, kp.
         damping: The same, kd.
         joint_damping: Viscous friction [N·m·s/rad].
         frictionloss: Coulomb friction of the gears [N·m].
         armature: Inertia of the rotors at the joint [kg·m²].
-        encoder_bias: Reported minus true position [rad]; a drive closes its loop on the reported one.
+        encoder_bias: Reported minus true position [rad]; a motor closes its loop on the reported one.
         latency_ms: A command acts that long after it was received, jitter aside [ms].
     """
 
@@ -55,16 +55,16 @@ class Truth:
                 )
 
     def parameters(self, stiffness: float, damping: float) -> dict[str, float]:
-        """Return the true values under the names of the suspended robot's parameter sets.
+        """Return the true values under the names in the parameter sets of the robot on a stand.
 
         Args:
-            stiffness: kp that the drives are sent [N·m/rad].
+            stiffness: kp that the motors are sent [N·m/rad].
             damping: kd that they are sent [N·m·s/rad]; the joint's own viscous friction adds to it.
         """
-        drive = np.array(self.damping) * damping + self.joint_damping
+        motor = np.array(self.damping) * damping + self.joint_damping
         rows = {
             "stiffness": np.array(self.stiffness) * stiffness,
-            "damping": drive,
+            "damping": motor,
             "frictionloss": np.array(self.frictionloss),
             "armature": np.array(self.armature),
             "encoder_bias": np.array(self.encoder_bias),

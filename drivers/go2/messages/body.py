@@ -12,7 +12,7 @@ from deal_hw.types import BodyState, FloatArray
 
 DAMPED_TOLERANCE_NM: Final = 1.5
 DAMPED_TOLERANCE_SHARE: Final = 0.3
-"""How far estimated efforts may be from damping: the drives' noise, and what a moving joint's speed changes
+"""How far estimated efforts may be from damping: the motors' noise, and what a moving joint's speed changes
 within a sample."""
 
 
@@ -42,14 +42,14 @@ def body_state(frame: LowStateFrame, remote: Remote | None) -> BodyState:
 
 
 def is_damped(frame: LowStateFrame, damping: FloatArray, effort_limit: FloatArray) -> bool:
-    """Return whether the drives' estimated efforts are those of pure damping.
+    """Return whether the motors' estimated efforts are those of pure damping.
 
     A joint whose sensor gives no number is left out, unless none gives one.
 
     Args:
         frame: The state.
         damping: kd of each joint, (J,) [N·m·s/rad].
-        effort_limit: What each drive can give, (J,) [N·m].
+        effort_limit: What each motor can give, (J,) [N·m].
     """
     braking = np.clip(-damping * frame.velocity, -effort_limit, effort_limit)
     allowed = DAMPED_TOLERANCE_NM + DAMPED_TOLERANCE_SHARE * np.abs(braking)

@@ -31,7 +31,7 @@ class LowState:
         position: q, (12,) [rad].
         velocity: dq, (12,) [rad/s].
         acceleration: ddq, (12,) [rad/s²].
-        effort: tau_est, the drives' estimate, (12,) [N·m].
+        effort: tau_est, the motors' estimate, (12,) [N·m].
         temperature: Of each motor, (12,) [°C].
         lost: Commands that each motor missed so far, (12,).
         mode: Of each motor, (12,).
@@ -128,7 +128,7 @@ class LowStateFrame:
 
     @property
     def effort(self) -> FloatArray:
-        """The drives' tau_est, (12,) [N·m]."""
+        """The motors' tau_est, (12,) [N·m]."""
         return self._hot[36:48]
 
     @property
