@@ -21,7 +21,7 @@ from deal_hw.calib.fit.residual import Shooting, States
 from deal_hw.calib.fit.robust import robust_polish
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import CalibrationError, InsufficientDataError
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 FOLDS = 2

@@ -19,9 +19,9 @@ from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align, fill_gaps
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.target import Behaviour, Sensing, TargetRecording, record_target
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.recordings.episode import Episode, align, fill_gaps
+from deal_hw.sim.recordings.target import Behaviour, Sensing, TargetRecording, record_target
 from deal_hw.types import FloatArray
 
 DEMONSTRATION_S = 4.0

@@ -32,8 +32,8 @@ from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
     from deal_hw.data.dataset import Dataset
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import Episode
 
 __all__ = [
     "Calibrate", "CalibrateReport", "calibrate", "calibrate_episodes", "calibrate_or_write_parameters",
@@ -382,9 +382,9 @@ def _simulation(
     dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
 ) -> tuple[RobotModel, dict[int, Episode]]:
     try:
-        from deal_hw.sim.episode import align, thin
-        from deal_hw.sim.model import load_model
-        from deal_hw.sim.standing import with_sensed_base
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.recordings.episode import align, thin
+        from deal_hw.sim.recordings.standing import with_sensed_base
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 

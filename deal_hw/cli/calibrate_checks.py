@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from deal_hw.data.checks import Verdict
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.joint_facts import JointFacts
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
+    from deal_hw.sim.recordings.episode import Episode
 
 DROOP_EXPLAINED, DROOP_LEAST = 0.5, 0.01
 """A droop is believed where the model's gravity explains this share of it, and it is this large [rad, m]."""
@@ -30,7 +30,7 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
         ConfigurationError: There is no IMU in a recording, or no feet are named, or the base is fixed.
         UnknownNameError: A foot is no geom of the model.
     """
-    from deal_hw.sim.fields import element_id
+    from deal_hw.sim.parameters.fields import element_id
 
     free = robot.description.floating_base
     if free is None:
@@ -101,7 +101,7 @@ def warn_of_gravity(
     robot: RobotModel, space: ParameterSpace, episodes: list[Episode], say: Callable[[str], None]
 ) -> None:
     """Warn where gravity contradicts a joint's sign or a servo's gain."""
-    from deal_hw.sim.droop import droop
+    from deal_hw.sim.recordings.gravity_gain import droop
 
     found = droop(robot, episodes)
     if found is None:

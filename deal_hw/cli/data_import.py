@@ -16,7 +16,7 @@ from deal_hw.reading import number, read_json, reading
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
-    from deal_hw.sim.joint_facts import JointFacts
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +154,7 @@ def _say(text: str) -> None:
 def _joint_facts(model: Path | None) -> JointFacts | None:
     if model is None:
         return None
-    from deal_hw.sim.joint_facts import joint_facts
+    from deal_hw.sim.mjcf.joint_facts import joint_facts
 
     facts = joint_facts(model)
     if facts.left_out:

@@ -18,7 +18,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers import recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
-from deal_hw.sim.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
+from deal_hw.sim.recordings.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
 from deal_hw.viz.episode_log import write_episode
 from deal_hw.viz.screenshot import save_screenshot
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web

@@ -26,7 +26,7 @@ from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, Trajectory
 
 _START_NS = 10**9

@@ -27,8 +27,8 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.episode import align, fill_gaps
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align, fill_gaps
 
 
 def shown(truth: Truth) -> tuple[VirtualEpisode, VigorSearch]:

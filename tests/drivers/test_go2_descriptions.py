@@ -15,7 +15,7 @@ from deal_hw.drivers.go2.descriptions import on_stand, on_stand_recording
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
 
 BOTH = pytest.mark.parametrize("description", [DRIVER, on_stand.DESCRIPTION], ids=lambda d: d.name)
 

@@ -20,7 +20,7 @@ from deal_hw.drivers.go2.messages.protocol import (
     LowStateFrame,
 )
 from deal_hw.drivers.go2.messages.sport_state import decode_sport_state
-from deal_hw.sim.model import load_model, model_with
+from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.types import FloatArray
 
 ZERO = np.zeros(12)

@@ -42,6 +42,7 @@ ROOMS = {
         {"robot"},
         {"fake"},
     ),
+    "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings"}),
 }
 """Rooms of a package, the lowest first: a room may import rooms of the sets before its own, and itself."""
 

@@ -11,13 +11,13 @@ import pytest
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.compiling import load_mjcf
-from deal_hw.sim.describe import describe, sampling
-from deal_hw.sim.droop import droop
-from deal_hw.sim.episode import SENT, Episode
-from deal_hw.sim.episode_parts import joined, part, split_last, spread, stretches
-from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.mjcf.describe import describe, sampling
+from deal_hw.sim.recordings.episode import SENT, Episode
+from deal_hw.sim.recordings.gravity_gain import droop
+from deal_hw.sim.recordings.parts import joined, part, split_last, spread, stretches
 
 ARM = """
 <mujoco>

@@ -14,10 +14,10 @@ from deal_hw.drivers.go2.descriptions.floor import SPACES
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.go2.motions import sway
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.overlay import Overlay, compute_overlay
-from deal_hw.sim.scene import body_poses, read_scene
-from deal_hw.sim.standing import chart_base, sensed_base
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.scene import body_poses, read_scene
+from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
+from deal_hw.sim.recordings.standing import chart_base, sensed_base
 from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import SPACES
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
-from deal_hw.sim.model import load_model
-from deal_hw.sim.overlay import Overlay, compute_overlay
-from deal_hw.sim.standing import sensed_base
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
+from deal_hw.sim.recordings.standing import sensed_base
 from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, Trajectory
 from deal_hw.viz.blueprint import inspect_blueprint

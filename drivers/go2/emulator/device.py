@@ -31,7 +31,7 @@ from deal_hw.drivers.go2.messages.protocol import (
 from deal_hw.drivers.go2.messages.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.drivers.go2.messages.sport_state import POINTS, SportState, encode_sport_state
 from deal_hw.errors import FrameError
-from deal_hw.sim.legged import LeggedSimulation
+from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 
 TICK_NS: Final = 1_000_000

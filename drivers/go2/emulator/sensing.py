@@ -11,7 +11,7 @@ from deal_hw.drivers.go2.emulator.motors import Motors
 from deal_hw.drivers.go2.emulator.profiles import Profile
 from deal_hw.drivers.go2.emulator.truth import Truth
 from deal_hw.drivers.go2.messages.protocol import LowState
-from deal_hw.sim.legged import LeggedSimulation
+from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 
 CELLS: Final = 8

@@ -7,7 +7,7 @@ import hashlib
 import mujoco
 import numpy as np
 
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
 
 
 def model_digest(robot: RobotModel) -> str:

@@ -8,8 +8,8 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from deal_hw.sim.fields import element_names
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.parameters.fields import element_names
 from deal_hw.types import FloatArray, IntArray
 
 ShapeKind = Literal["box", "sphere", "ellipsoid", "capsule", "cylinder", "mesh"]

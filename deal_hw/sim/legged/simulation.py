@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from deal_hw.sim.fields import element_id
+from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
 _TOUCH = 1.5

@@ -1,6 +1,6 @@
 """The calibrated model as a change of the user's own MJCF: his text, includes and meshes are kept.
 
-Only attributes that hold a changed value are touched; :mod:`deal_hw.sim.mjcf_text` says how.
+Only attributes that hold a changed value are touched; :mod:`deal_hw.sim.mjcf.text` says how.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError, short
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim import mjcf_tables as tables
-from deal_hw.sim.mjcf_changes import MjcfChanges, differences, numbers
-from deal_hw.sim.mjcf_paths import Relocation
-from deal_hw.sim.mjcf_text import Element, SourceFile, read_files
-from deal_hw.sim.model import RobotModel, model_with
+from deal_hw.sim.engine.model import RobotModel, model_with
+from deal_hw.sim.mjcf import tables
+from deal_hw.sim.mjcf.changes import MjcfChanges, differences, numbers
+from deal_hw.sim.mjcf.paths import Relocation
+from deal_hw.sim.mjcf.text import Element, SourceFile, read_files
 from deal_hw.sim.parameters import DEVICE_KINDS, check_kinds
 from deal_hw.types import FloatArray
 

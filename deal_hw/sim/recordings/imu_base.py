@@ -9,10 +9,10 @@ import numpy as np
 from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim import chart
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.leg_odometry import HEIGHT_STD, VELOCITY_STD, leg_odometry, smooth_orientation
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_vector
+from deal_hw.sim.legged.leg_odometry import HEIGHT_STD, VELOCITY_STD, leg_odometry, smooth_orientation
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 ORIENTATION_SMOOTHER: Final = (7, 3)
@@ -78,7 +78,7 @@ def base_states(
     C = 6 + J
     position, velocity = np.zeros((T, C)), np.zeros((T, C))
     position[:, 2], position[:, robot.joints] = legs.height, joints
-    position[:, robot.rotation] = chart.to_vector(orientation, reference)
+    position[:, robot.rotation] = to_vector(orientation, reference)
     velocity[:, :3], velocity[:, robot.rotation] = legs.velocity, gyro
     velocity[:, robot.joints] = joint_velocity
     spread = np.full(2 * C, np.inf)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.compiling import compile_mjcf
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.fields import element_id
-from deal_hw.sim.model import actuator_of
+from deal_hw.sim.engine.model import actuator_of
+from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.kind import HINGE, SLIDE
 
 WINDOW_TICKS = 20

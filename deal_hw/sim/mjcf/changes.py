@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim import mjcf_tables as tables
-from deal_hw.sim.mjcf_tables import Attribute
-from deal_hw.sim.mjcf_text import Element
+from deal_hw.sim.mjcf import tables
+from deal_hw.sim.mjcf.tables import Attribute
+from deal_hw.sim.mjcf.text import Element
 
 Mask = npt.NDArray[np.bool_]
 SAME = 1e-12

@@ -15,11 +15,11 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
-from deal_hw.sim.standing import chart_base, with_sensed_base
-from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.standing import chart_base, with_sensed_base
+from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
 DEFAULT_WINDOW_S = 0.2

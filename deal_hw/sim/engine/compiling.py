@@ -67,7 +67,7 @@ def _try(path: Path) -> None:
     Raises:
         ConfigurationError: It did not go well.
     """
-    words = [sys.executable, "-m", "deal_hw.sim.compiling", os.path.abspath(path)]
+    words = [sys.executable, "-m", "deal_hw.sim.engine.compiling", os.path.abspath(path)]
     # MuJoCo leaves its log where it works; that shall not be the user's folder.
     with tempfile.TemporaryDirectory(prefix="deal-hw-") as folder:
         try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.sim.episode import SENT, Episode
+from deal_hw.sim.recordings.episode import SENT, Episode
 
 LEAD_S = 0.1
 """Commands kept before a part's first sample: as long as any latency reaches back [s]."""

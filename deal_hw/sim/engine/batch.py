@@ -1,6 +1,6 @@
 """Batched simulation of one robot: N members with their own parameters on one thread pool.
 
-States are chart coordinates (:mod:`deal_hw.sim.chart`), (N, C): for a floating base position, rotation vector
+States are tangent coordinates (module of this name), (N, C): for a floating base position, rotation vector
 and then the joints, for a fixed base the joints alone; velocities are MuJoCo's, in the same order. Joint
 positions are as the robot reports them: each member's encoder bias is added to what comes out and taken from
 what goes in.
@@ -18,10 +18,10 @@ from mujoco.batch import Batch
 
 from deal_hw.errors import CalibrationError, short
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim import chart
-from deal_hw.sim.fields import BatchFields
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
+from deal_hw.sim.parameters.fields import BatchFields
 from deal_hw.types import FloatArray
 
 ENCODER_BIAS = "encoder_bias"
@@ -171,9 +171,7 @@ class ServoBatch:
         if self.robot.base is not None:
             at = self.robot.base[0]
             self._qpos[rows, [at, at + 1, at + 2]] = position[..., :3]
-            orientation = chart.to_quaternion(
-                position[..., 3:6], chart.IDENTITY if reference is None else reference
-            )
+            orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
             self._qpos[rows, [at + 3, at + 4, at + 5, at + 6]] = orientation
         self._qvel[rows, self._dof] = velocity
         # A warm start left by another episode would make results depend on history in the last digits.
@@ -197,9 +195,7 @@ class ServoBatch:
         if self.robot.base is None:
             return np.asarray(joints)
         at = self.robot.base[0]
-        turned = chart.to_vector(
-            qpos[..., at + 3 : at + 7], chart.IDENTITY if reference is None else reference
-        )
+        turned = to_vector(qpos[..., at + 3 : at + 7], IDENTITY if reference is None else reference)
         return np.concatenate([qpos[..., at : at + 3], turned, joints], axis=-1)
 
     def advance(

@@ -25,12 +25,12 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import ServoBatch, default_threads
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.fields import BatchFields, ModelFields
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.batch import ServoBatch, default_threads
+from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import KINDS, apply_parameters
-from deal_hw.sim.windows import Windows, setpoints
+from deal_hw.sim.parameters.fields import BatchFields, ModelFields
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.windows import Windows, setpoints
 from deal_hw.types import FloatArray
 
 SPEED_LIMIT = "servo_speed_limit"

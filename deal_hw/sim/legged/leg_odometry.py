@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim import chart
-from deal_hw.sim.fields import element_id
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
+from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
 STANCE_M = 0.008
@@ -98,6 +98,6 @@ def smooth_orientation(orientation: FloatArray, weights: FloatArray) -> FloatArr
     half = len(weights) // 2
     smooth = orientation.copy()
     for t in range(half, len(orientation) - half):
-        near = chart.to_vector(orientation[t - half : t + half + 1], orientation[t])
-        smooth[t] = chart.to_quaternion(weights @ near, orientation[t])
+        near = to_vector(orientation[t - half : t + half + 1], orientation[t])
+        smooth[t] = to_quaternion(weights @ near, orientation[t])
     return smooth

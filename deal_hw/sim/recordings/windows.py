@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.servo import delay, slew
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, IntArray
 
 SETPOINT_MARGIN_S = 0.15

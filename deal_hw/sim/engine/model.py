@@ -11,9 +11,9 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.compiling import load_mjcf
-from deal_hw.sim.fields import ModelFields, element_id, element_names
+from deal_hw.sim.engine.compiling import load_mjcf
 from deal_hw.sim.parameters import apply_parameters
+from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.fields import element_id
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
 _ITERATIONS = 20

@@ -5,11 +5,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from deal_hw.sim import chart
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.fields import element_id
-from deal_hw.sim.imu_base import with_base
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion
+from deal_hw.sim.parameters.fields import element_id
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.imu_base import with_base
 from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 
 
@@ -36,11 +36,11 @@ def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
 
 
 def with_sensed_base(episode: Episode, robot: RobotModel, body: BodyTrajectory) -> Episode:
-    """Return an episode of joints with the base from the body's sensors (:mod:`deal_hw.sim.imu_base`)."""
+    """Return an episode of joints with the base from the body's sensors, as ``imu_base`` finds it."""
     return with_base(episode, robot, robot.description.feet, body.orientation, body.angular_velocity)
 
 
 def chart_base(position: FloatArray, reference: FloatArray) -> FloatArray:
     """Return base poses, (..., 7), of chart coordinates, (..., >= 6), around references, (..., 4)."""
-    quaternion = chart.to_quaternion(position[..., 3:6], reference)
+    quaternion = to_quaternion(position[..., 3:6], reference)
     return np.concatenate([position[..., :3], quaternion], axis=-1)

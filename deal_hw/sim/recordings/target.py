@@ -1,7 +1,7 @@
 """Sim-to-sim targets: a robot whose parameters are hidden, recorded as a sensor would see it.
 
 The stand-in for a real robot in benches of robots that have no emulator on a wire: it gives an
-:class:`~deal_hw.sim.episode.Episode` on the device's grid, as aligning a recording would, and the
+:class:`~deal_hw.sim.recordings.episode.Episode` on the device's grid, as aligning a recording would, and the
 truth beside.
 """
 
@@ -15,12 +15,12 @@ import numpy as np
 
 from deal_hw.errors import CalibrationError, ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim import chart
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.imu_base import base_states
-from deal_hw.sim.model import RobotModel
-from deal_hw.sim.servo import delay
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.servo import delay
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.imu_base import base_states
 from deal_hw.types import FloatArray
 
 Behaviour = Callable[[FloatArray, FloatArray, float], FloatArray]
@@ -166,7 +166,7 @@ class _Sensor:
         position, velocity = self.joints(true_x), true_v.copy()
         measured = estimate = reference = None
         if robot.base is not None:
-            orientation = chart.to_quaternion(true_x[:, robot.rotation], chart.IDENTITY)
+            orientation = to_quaternion(true_x[:, robot.rotation], IDENTITY)
         if self._sensing.joint_std is not None:
             velocity[:, robot.joints] = np.nan
             measured = np.zeros(2 * C, dtype=bool)
@@ -180,7 +180,7 @@ class _Sensor:
             position[:, robot.rotation] = 0.0
         truth = true_x.copy()
         if orientation is not None and reference is not None:
-            truth[:, robot.rotation] = chart.to_vector(orientation, reference)
+            truth[:, robot.rotation] = to_vector(orientation, reference)
         as_rows = np.ones((len(target), 1))
         description = robot.description
         episode = Episode(
@@ -208,7 +208,7 @@ class _Sensor:
         """Return position, velocity, reference and spread with the base as an IMU and the legs give it."""
         robot, sensing, rng = self._robot, self._sensing, self._rng
         T = len(position)
-        reported = chart.to_quaternion(rng.standard_normal((T, 3)) * sensing.orientation_std, orientation)
+        reported = to_quaternion(rng.standard_normal((T, 3)) * sensing.orientation_std, orientation)
         gyro = velocity[:, robot.rotation] + rng.standard_normal((T, 3)) * sensing.gyro_std
         joints, speed = position[:, robot.joints], velocity[:, robot.joints]
         found = base_states(robot, sensing.feet, reported, gyro, joints, speed, stride * robot.step_s)

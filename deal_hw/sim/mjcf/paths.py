@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from deal_hw.sim.mjcf_text import Element, SourceFile
+from deal_hw.sim.mjcf.text import Element, SourceFile
 
 _MESH_DIR = ("mesh", "hfield", "skin", "flexcomp")
 """Elements whose file lies in the compiler's meshdir."""
