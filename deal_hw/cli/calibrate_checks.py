@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from deal_hw.sim.mjcf.joint_facts import JointFacts
     from deal_hw.sim.recordings.episode import Episode
 
-DROOP_EXPLAINED, DROOP_LEAST = 0.5, 0.01
-"""A droop is believed where the model's gravity explains this share of it, and it is this large [rad, m]."""
+GRAVITY_EXPLAINED, GRAVITY_LEAST = 0.5, 0.01
+"""Gravity must explain this share of a deviation of at least this size, or no gain is told [rad, m]."""
 MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation", "actuation")
 """Checks that mean something where commands are efforts and not positions."""
 
@@ -101,15 +101,15 @@ def warn_of_gravity(
     robot: RobotModel, space: ParameterSpace, episodes: list[Episode], say: Callable[[str], None]
 ) -> None:
     """Warn where gravity contradicts a joint's sign or a servo's gain."""
-    from deal_hw.sim.recordings.gravity_gain import droop
+    from deal_hw.sim.recordings.gravity_gain import gravity_gain
 
-    found = droop(robot, episodes)
+    found = gravity_gain(robot, episodes)
     if found is None:
         return
     searched = {p.elements: p for p in space if p.kind == "servo_stiffness"}
     names = robot.actuator_names
     for a, joint in enumerate(robot.description.actuated):
-        if found.explained[a] < DROOP_EXPLAINED or found.deviation[a] < DROOP_LEAST:
+        if found.explained[a] < GRAVITY_EXPLAINED or found.deviation[a] < GRAVITY_LEAST:
             continue
         gain, own = float(found.gain[a]), robot.description.stiffness[a]
         parameter = next((p for elements, p in searched.items() if names[a] in elements), None)

@@ -21,7 +21,7 @@ BLOCK_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Droop:
+class GravityGain:
     """Static gains of the A servos.
 
     Attributes:
@@ -38,7 +38,7 @@ class Droop:
     deviation: FloatArray
 
 
-def droop(robot: RobotModel, episodes: list[Episode]) -> Droop | None:
+def gravity_gain(robot: RobotModel, episodes: list[Episode]) -> GravityGain | None:
     """Estimate static gains from how far joints hang; None for motors and floating bases.
 
     Args:
@@ -68,9 +68,9 @@ def droop(robot: RobotModel, episodes: list[Episode]) -> Droop | None:
     compliance = both / np.where(power > 0, power, 1.0)
     square = np.sum(off**2, axis=0)
     left = np.sum((off - compliance * load) ** 2, axis=0)
-    # A joint that carries nothing has no droop: its gain stays open.
+    # A joint that carries nothing does not hang: its gain stays open.
     with np.errstate(divide="ignore"):
         gain = np.where(compliance != 0, 1.0 / compliance, np.inf)
     explained = np.where(square > 0, 1 - left / np.where(square > 0, square, 1.0), 0.0)
     count = max(len(load), 1)
-    return Droop(gain, explained, np.sqrt(power / count), np.sqrt(square / count))
+    return GravityGain(gain, explained, np.sqrt(power / count), np.sqrt(square / count))
