@@ -31,7 +31,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.recording.dataset import Dataset
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import Episode
 
@@ -281,8 +281,8 @@ def prepare_dataset(config: Calibrate) -> Work:
     Raises:
         DealHwError: A setting or a recording is unusable.
     """
-    from deal_hw.data.checks import Severity, check
-    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.telemetry_checks import Severity, check
     from deal_hw.errors import InsufficientDataError
 
     if config.dataset is None:

@@ -10,9 +10,9 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.data.checks import Verdict
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
+    from deal_hw.data.recording.telemetry_checks import Verdict
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.joint_facts import JointFacts
     from deal_hw.sim.recordings.episode import Episode
@@ -71,9 +71,9 @@ def examine_recording(
     Raises:
         DatasetError: A check failed, and that is not to be overlooked.
     """
-    from deal_hw.data.checks import Severity
-    from deal_hw.data.command_kind import command_kind
-    from deal_hw.data.plausibility import examine, require
+    from deal_hw.data.checks.command_kind import command_kind
+    from deal_hw.data.checks.plausibility import examine, require
+    from deal_hw.data.recording.telemetry_checks import Severity
     from deal_hw.errors import DatasetError
 
     limits = None

@@ -48,8 +48,8 @@ def common_rates(
         ConfigurationError: They have different joints, or a setting cannot be used.
         DatasetError: A clock is no clock, or rates differ.
     """
+    from deal_hw.data.checks.plausibility import examine, require
     from deal_hw.data.importing.grid import common_period
-    from deal_hw.data.plausibility import examine, require
     from deal_hw.sim.mjcf.describe import sampling
 
     first = tables[0]

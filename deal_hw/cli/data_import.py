@@ -131,9 +131,9 @@ def export_recordings(config: Export) -> int:
         DatasetError: It cannot be read, or the folder cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
-    from deal_hw.data.dataset import Dataset
-    from deal_hw.data.export_lerobot import export_lerobot
-    from deal_hw.data.reader import read_trajectory
+    from deal_hw.data.export.lerobot import export_lerobot
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.reader import read_trajectory
 
     if config.path.is_dir():
         dataset = Dataset.open(config.path, _say)
@@ -166,7 +166,7 @@ def _joint_facts(model: Path | None) -> JointFacts | None:
 
 
 def _description(path: Path) -> dict[str, Any]:
-    from deal_hw.data.reader import check_description
+    from deal_hw.data.recording.reader import check_description
 
     what, advice = "a robot's description", "see `description` in a dataset.json"
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)

@@ -13,7 +13,7 @@ import tyro
 
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.cli.options import Range, check_ranges, refuse
-from deal_hw.data.reader import Episode, read_episode
+from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError

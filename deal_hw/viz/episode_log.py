@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from deal_hw.calibration import CalibrationResult
-from deal_hw.data.reader import CycleTable
+from deal_hw.data.recording.reader import CycleTable
 from deal_hw.description import RobotDescription
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.scene import body_poses, read_scene

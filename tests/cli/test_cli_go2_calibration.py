@@ -20,9 +20,9 @@ from deal_hw.control.excitation_limits import room
 from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.safety import Safety
-from deal_hw.data.dataset import Dataset
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers import parameter_spaces
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as SIMULATED

@@ -17,7 +17,7 @@ from deal_hw.control.handover import RUNNING
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.safety import CycleInput, Safety, Verdict
-from deal_hw.data.record import CycleRecord, encode
+from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF, kind_of

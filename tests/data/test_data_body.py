@@ -13,13 +13,13 @@ from mcap.records import Channel, Chunk
 from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.clock import VirtualClock
-from deal_hw.data import recorder as recorder_module
-from deal_hw.data.mcap_scan import Found, messages, scan
-from deal_hw.data.reader import read_episode, read_trajectory
-from deal_hw.data.record import CycleRecord, decode, encode
-from deal_hw.data.recorder import EpisodeRecorder
-from deal_hw.data.repair import repair, verify
-from deal_hw.data.schemas import CHANNELS
+from deal_hw.data.recording import recorder as recorder_module
+from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.reader import read_episode, read_trajectory
+from deal_hw.data.recording.record import CycleRecord, decode, encode
+from deal_hw.data.recording.recorder import EpisodeRecorder
+from deal_hw.data.recording.repair import repair, verify
+from deal_hw.data.recording.schemas import CHANNELS
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.types import BodyState, BodyTrajectory, RobotState, Status, Trajectory
 

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from deal_hw.data.checks import Severity, Verdict, worst
+from deal_hw.data.checks.joint_match import best_assignment
+from deal_hw.data.checks.plausibility import examine, require
 from deal_hw.data.importing.table import Table
-from deal_hw.data.joint_match import best_assignment
-from deal_hw.data.plausibility import examine, require
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict, worst
 from deal_hw.errors import DatasetError
 
 MakeTable = Callable[..., Table]

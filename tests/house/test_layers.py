@@ -42,6 +42,7 @@ ROOMS = {
         {"robot"},
         {"fake"},
     ),
+    "data": ({"files"}, {"recording", "run_folder"}, {"importing"}, {"checks", "export"}),
     "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings"}),
 }
 """Rooms of a package, the lowest first: a room may import rooms of the sets before its own, and itself."""

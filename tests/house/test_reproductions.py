@@ -37,10 +37,10 @@ from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.handover import Beat
 from deal_hw.control.loop import ControlLoop, LoopConfig
 from deal_hw.control.safety import Safety
-from deal_hw.data.dataset import Dataset
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.recorder import LIBRARY, METADATA_NAME
-from deal_hw.data.repair import verify
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
+from deal_hw.data.recording.repair import verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.go2.doctor import Doctor
@@ -435,7 +435,7 @@ def test_zeros_are_said_in_one_line(tmp_path: Path) -> None:
 
 def test_zeros_are_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each nine bytes of them were a reason to search the rest of the file again."""
-    from deal_hw.data import mcap_scan
+    from deal_hw.data.recording import mcap_scan
 
     looked = 0
 

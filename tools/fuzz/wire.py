@@ -11,9 +11,9 @@ import numpy as np
 from cobs import cobs
 from fastcrc import crc16
 
-from deal_hw.data.record import decode as decode_record
-from deal_hw.data.record import encode as encode_record
-from deal_hw.data.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
+from deal_hw.data.recording.record import decode as decode_record
+from deal_hw.data.recording.record import encode as encode_record
+from deal_hw.data.recording.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
 from deal_hw.drivers.cartpole import protocol as serial
 from deal_hw.drivers.go2.emulator.sport_service import Services, SportMode
 from deal_hw.drivers.go2.fake import FakeGo2

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from deal_hw.data.episode_info import EpisodeInfo, summarize
 from deal_hw.data.files import write_json
-from deal_hw.data.reader import Episode, check_description, read_episode
-from deal_hw.data.repair import repair
+from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
+from deal_hw.data.recording.reader import Episode, check_description, read_episode
+from deal_hw.data.recording.repair import repair
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
 from deal_hw.reading import MIB, read_json
@@ -184,7 +184,7 @@ class Dataset:
         return self.folder / self.episodes[index].file
 
     def read(self, index: int) -> Episode:
-        """Read an episode; errors as :func:`~deal_hw.data.reader.read_episode` and :meth:`path`."""
+        """Read an episode; errors as :func:`~deal_hw.data.recording.reader.read_episode` and :meth:`path`."""
         return read_episode(self.path(index))
 
     def next_episode_path(self) -> Path:

@@ -133,7 +133,7 @@ def start_recorder(
         json.dump({"description": description, "metadata": metadata}, file)
     os.lseek(config, 0, os.SEEK_SET)
     inherited = (recorder_end.fileno(), config, status_write)
-    command = [sys.executable, "-m", "deal_hw.data.recorder_process", "--fd", str(inherited[0])]
+    command = [sys.executable, "-m", "deal_hw.data.recording.recorder_process", "--fd", str(inherited[0])]
     command += ["--path", str(path), "--config-fd", str(config), "--status-fd", str(status_write)]
     try:
         # A process group of its own keeps the terminal's Ctrl-C away even while the interpreter starts.

@@ -1,7 +1,7 @@
 """The recorder process: receives one datagram per control cycle and writes the episode until the peer closes.
 
-Started by :mod:`deal_hw.data.recorder_launch` as ``python -m deal_hw.data.recorder_process``. Whatever
-happens here, the socket is drained to its end: a control loop must never feel its recorder.
+``recorder_launch`` starts it as ``python -m deal_hw.data.recording.recorder_process``. Whatever happens here,
+the socket is drained to its end: a control loop must never feel its recorder.
 
 It reports on ``--status-fd``, one JSON object a line with a key ``kind``: "ready", "error" (with
 ``message``), and "finished" (with ``complete``, ``cycles``, ``states``, ``unreadable``). Exit codes: 0 all
@@ -23,8 +23,8 @@ from types import FrameType
 from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.data.record import MAX_DATAGRAM_BYTES, decode
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.record import MAX_DATAGRAM_BYTES, decode
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import DealHwError, ProtocolError
 
 EXIT_OK, EXIT_INCOMPLETE = 0, 3
@@ -145,7 +145,9 @@ def _write_quietly(descriptor: int, data: bytes) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the recorder process; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m deal_hw.data.recorder_process", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m deal_hw.data.recording.recorder_process", description=__doc__
+    )
     parser.add_argument("--fd", type=int, required=True, help="the recorder's end of the socket pair")
     parser.add_argument("--path", type=Path, required=True, help="the file to create")
     parser.add_argument(

@@ -13,9 +13,9 @@ from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
 
 from deal_hw.data.files import read_episode_bytes
-from deal_hw.data.mcap_scan import Found, Lost, messages, scan
-from deal_hw.data.recorder import METADATA_NAME
-from deal_hw.data.schemas import CHANNELS, message_type
+from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.data.recording.schemas import CHANNELS, message_type
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -38,7 +38,7 @@ class CycleTable:
         deadline_s: When each should have started, (N,) [s].
         start_s: When each started, (N,) [s].
         state_age_s: Age of the newest state when the action was computed, (N,) [s]; NaN where there was none.
-        flags: :class:`~deal_hw.data.record.CycleFlag` bits, (N,).
+        flags: :class:`~deal_hw.data.recording.record.CycleFlag` bits, (N,).
         lost: Hand-overs to the recorder refused so far, (N,).
         safety_state: Name of the safety filter's state, N entries.
         action: What the policy returned, (N, K); NaN where nothing.

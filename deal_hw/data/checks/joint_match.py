@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.data.checks import Severity, Verdict
 from deal_hw.data.importing.table import Table
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
 from deal_hw.types import FloatArray, IntArray
 
 WINDOW_S = 0.1

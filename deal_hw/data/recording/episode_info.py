@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from deal_hw.data.checks import Severity, Verdict, check
-from deal_hw.data.clock_sync import synchronize
-from deal_hw.data.excitation import excitation
-from deal_hw.data.reader import Episode, read_episode
+from deal_hw.data.recording.clock_sync import synchronize
+from deal_hw.data.recording.excitation import excitation
+from deal_hw.data.recording.reader import Episode, read_episode
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict, check
 from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
 from deal_hw.schema import STRICT
 
@@ -33,9 +33,9 @@ class EpisodeInfo:
         states: State samples.
         commands: Commands sent.
         cycles: Control cycles.
-        verdicts: The telemetry checks, as :meth:`deal_hw.data.checks.Verdict.to_json` writes them.
-        excitation: Movement, as :meth:`deal_hw.data.excitation.Excitation.to_json` writes it.
-        clock: Relation of the clocks, as :meth:`deal_hw.data.clock_sync.ClockSync.to_json` writes it, with 20
+        verdicts: The telemetry checks, as ``telemetry_checks.Verdict.to_json`` writes them.
+        excitation: Movement, as ``excitation.Excitation.to_json`` writes it.
+        clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20
             jumps at most; None where it cannot be told.
         note: What the operator should know, such as a repair.
         facts: What the collector adds: outcome, cadence, task, ...

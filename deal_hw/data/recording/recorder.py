@@ -1,7 +1,7 @@
 """Writes an episode as MCAP, in small chunks that are on their way to the disk every 50 ms.
 
 A chunk goes to the kernel in one piece and is never touched again, so that a killed recorder loses the chunk
-in progress and nothing else. What remains has no footer: :mod:`deal_hw.data.repair` writes one.
+in progress and nothing else. What remains has no footer: :mod:`deal_hw.data.recording.repair` writes one.
 """
 
 from __future__ import annotations
@@ -20,8 +20,18 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 import deal_hw
 from deal_hw.clock import Clock
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.schemas import BODY, CHANNELS, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE, message_type
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.schemas import (
+    BODY,
+    CHANNELS,
+    COMMAND,
+    CYCLE,
+    EVENT,
+    ROBOT,
+    STATE,
+    WIRE,
+    message_type,
+)
 from deal_hw.errors import DatasetError
 from deal_hw.types import JointCommand, RobotState
 

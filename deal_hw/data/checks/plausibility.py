@@ -1,9 +1,9 @@
 """Checks of a recording of unknown origin, before any long work: clock, units, joints, commands.
 
-:mod:`deal_hw.data.checks` looks at what our own recorder wrote; these look for what goes wrong on the way
+``recording/telemetry_checks`` looks at what our own recorder wrote; these look for what goes wrong on the way
 from somebody else's log: a clock in the wrong unit or going backwards, degrees for radians, joints in another
 order or with another sign, a target that is a copy of the measurement, and the like. A check returns one
-:class:`~deal_hw.data.checks.Verdict`; "fail" is a refusal.
+:class:`~deal_hw.data.recording.telemetry_checks.Verdict`; "fail" is a refusal.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.data.checks import Severity, Verdict
+from deal_hw.data.checks.joint_match import match
+from deal_hw.data.checks.slip import slip_verdict
 from deal_hw.data.importing.table import Table
-from deal_hw.data.joint_match import match
-from deal_hw.data.slip import slip_verdict
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
 

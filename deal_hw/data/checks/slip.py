@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.data.checks import Severity, Verdict
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
 from deal_hw.types import FloatArray, IntArray
 
 AHEAD_S: Final = 0.1

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.data.clock_sync import find_jumps
+from deal_hw.data.recording.clock_sync import find_jumps
 from deal_hw.types import Status, Trajectory
 
 MIN_DURATION_S = 2.0

@@ -17,9 +17,9 @@ from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Sc
 from mcap.writer import CompressionType, Writer
 
 from deal_hw.data.files import read_episode_bytes
-from deal_hw.data.mcap_scan import Found, Lost, messages, scan
-from deal_hw.data.recorder import LIBRARY
-from deal_hw.data.schemas import CHANNELS
+from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.recorder import LIBRARY
+from deal_hw.data.recording.schemas import CHANNELS
 from deal_hw.errors import DatasetError
 
 REPAIR_NAME = "deal-hw.repair"
