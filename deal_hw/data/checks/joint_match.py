@@ -14,6 +14,7 @@ import numpy as np
 
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
 WINDOW_S = 0.1
@@ -216,37 +217,15 @@ def _delay(found: _Match, own: FloatArray) -> Verdict:
 def best_assignment(score: FloatArray) -> IntArray:
     """Return for each row the column that makes the total score greatest, each column once, (M,).
 
-    The Hungarian method with potentials, by shortest augmenting paths: rows enter one by one.
-
     Args:
         score: (M, M).
+
+    Raises:
+        MissingExtraError: scipy is not installed.
     """
-    M = score.shape[0]
-    cost = -np.asarray(score, dtype=np.float64)
-    u, v = np.zeros(M + 1), np.zeros(M + 1)
-    row_of = np.full(M + 1, -1)  # Row that holds each column; the last column is the entrance.
-    for row in range(M):
-        row_of[M] = row
-        column = M
-        distance = np.full(M, np.inf)
-        came_from = np.full(M, M)
-        done = np.zeros(M + 1, dtype=bool)
-        while row_of[column] >= 0:
-            done[column] = True
-            i = row_of[column]
-            slack = cost[i] - u[i] - v[:M]
-            better = ~done[:M] & (slack < distance)
-            distance[better], came_from[better] = slack[better], column
-            following = int(np.argmin(np.where(done[:M], np.inf, distance)))
-            delta = distance[following]
-            held = np.flatnonzero(done)
-            u[row_of[held]] += delta
-            v[held] -= delta
-            distance[~done[:M]] -= delta
-            column = following
-        while column != M:
-            row_of[column] = row_of[came_from[column]]
-            column = int(came_from[column])
-    order = np.empty(M, dtype=np.int64)
-    order[row_of[:M]] = np.arange(M)
-    return order
+    # Not at the top: the base install has no scipy, and checks what it recorded itself.
+    try:
+        from scipy.optimize import linear_sum_assignment
+    except ImportError as err:
+        raise MissingExtraError("scipy", "sim") from err
+    return np.asarray(linear_sum_assignment(score, maximize=True)[1], dtype=np.int64)
