@@ -46,7 +46,7 @@ from deal_hw.calibration import (
     StateStore,
 )
 from deal_hw.errors import CalibrationError, InsufficientDataError
-from deal_hw.sim.episode_parts import joined, spread, stretches
+from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
 LONG_S = 2.0

@@ -299,7 +299,8 @@ class ObservationBuilder:
 
         Args:
             position: Joint positions, (..., J); with a floating base, which then comes first, (..., 6 + J):
-                position in the world and rotation vector (:mod:`deal_hw.sim.chart`, around the identity).
+                position in the world and rotation vector around the identity
+                (:mod:`deal_hw.sim.engine.tangent_coordinates`).
             velocity: Their velocities: linear in the world, angular in the base's frame, joints.
 
         Raises:

@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
     "go2": "deal_hw.drivers.go2.robot:Go2Robot",
-    "go2_hung": "deal_hw.drivers.go2.robot:Go2HungRobot",
+    "go2_hung": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
 }
 DESCRIPTIONS: Final = {
     "ant": "deal_hw.drivers.ant.description:DESCRIPTION",
-    "go2": "deal_hw.drivers.go2.description:DESCRIPTION",
-    "go2_suspended": "deal_hw.drivers.go2.suspended:DESCRIPTION",
+    "go2": "deal_hw.drivers.go2.descriptions.floor:DESCRIPTION",
+    "go2_suspended": "deal_hw.drivers.go2.descriptions.on_stand_recording:DESCRIPTION",
     "so101": "deal_hw.drivers.so101.description:DESCRIPTION",
 }
 """Robots as they are simulated and calibrated, where that is not the driver's own description."""
 SPACES: Final = {
     "ant": "deal_hw.drivers.ant.description:SPACES",
     "cartpole": "deal_hw.drivers.cartpole.description:SPACES",
-    "go2": "deal_hw.drivers.go2.description:SPACES",
-    "go2_hung": "deal_hw.drivers.go2.hung:SPACES",
-    "go2_suspended": "deal_hw.drivers.go2.suspended:SPACES",
+    "go2": "deal_hw.drivers.go2.descriptions.floor:SPACES",
+    "go2_hung": "deal_hw.drivers.go2.descriptions.on_stand:SPACES",
+    "go2_suspended": "deal_hw.drivers.go2.descriptions.on_stand_recording:SPACES",
     "so101": "deal_hw.drivers.so101.description:SPACES",
 }
 """Tables of parameter sets, name -> function; the first of each is the default."""

@@ -1,8 +1,8 @@
 """pi_0 in the loop of a target or of a population: policies as plain functions of the state.
 
-Needs numpy only. The callables fit :data:`deal_hw.sim.target.Behaviour` and the calibrator's population
-policies without knowing either: states are those of :class:`deal_hw.sim.batch.ServoBatch`, joints after a
-floating base.
+Needs numpy only. The callables fit :data:`deal_hw.sim.recordings.target.Behaviour` and the calibrator's
+population policies without knowing either: states are those of :class:`deal_hw.sim.engine.batch.ServoBatch`,
+joints after a floating base.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """N simulated robots as a host sees them at the control rate: late targets, slow set-points, noisy reports.
 
 The environments of training and the evaluation stand on this one class. It does, batched, what the emulated
-device does frame by frame; the calibrator's :class:`~deal_hw.sim.batch.ServoBatch` is the physics below.
+device does frame by frame; :class:`~deal_hw.sim.engine.batch.ServoBatch`, the calibrator's, is the physics.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy.typing as npt
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import COMMAND_DELAY, ServoBatch
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.batch import COMMAND_DELAY, ServoBatch
+from deal_hw.sim.engine.model import load_model
 from deal_hw.types import FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -31,8 +31,8 @@ def delayed_setpoints(
     """Return the set-point at each step of one control period, in closed form.
 
     A latency is a whole number of steps, so within a period the target changes at most once; towards a
-    constant target the slewed set-point is a clipped ramp. Equal to :func:`deal_hw.sim.servo.slew` on the
-    same targets.
+    constant target the slewed set-point is a clipped ramp. Equal to
+    :func:`deal_hw.sim.engine.servo.slew` on the same targets.
 
     Args:
         start: Set-point before the first step, (N, A).

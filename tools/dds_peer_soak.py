@@ -26,15 +26,15 @@ import tyro
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.fake import FakeGo2
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.scripted import ScriptedGo2
-from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE, TYPES
+from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
 from deal_hw.errors import TransportTimeoutError
@@ -164,7 +164,7 @@ def command_bytes() -> Callable[[int], bytes]:
 
 def state_bytes() -> Callable[[int], bytes]:
     """Return what gives the state of a cycle: a robot at rest."""
-    robot = ScriptedGo2()
+    robot = FakeGo2()
 
     def message(cycle: int) -> bytes:
         robot.tick_ms = 2 * cycle

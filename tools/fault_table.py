@@ -28,7 +28,7 @@ from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case,
 from deal_hw.cli.bench import describe_machine
 from deal_hw.cli.witness import witnesses
 from deal_hw.control.realtime import priority
-from deal_hw.data.dataset import Dataset
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.errors import DealHwError
 
 FORMAT = "deal_hw.faults/2"

@@ -30,8 +30,8 @@ import tyro
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.witness import Account, witnesses
-from deal_hw.data.dataset import Dataset
-from deal_hw.data.reader import Episode
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.reader import Episode
 
 RATE_HZ = 50.0
 

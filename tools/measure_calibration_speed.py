@@ -26,8 +26,8 @@ from deal_hw.calib.methods import make_method
 from deal_hw.calibration import Budget
 from deal_hw.cli.bench_loop import demonstrate
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.sim.batch import bare_steps_per_second
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.batch import bare_steps_per_second
+from deal_hw.sim.engine.model import load_model
 
 PAPER_STEP_S = 0.005
 BARE_STEPS = 4000

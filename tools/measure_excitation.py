@@ -23,8 +23,8 @@ from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.sim.episode import align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align
 
 XI = 5.0
 

@@ -30,8 +30,8 @@ import numpy as np
 
 from deal_hw.cli.bench import describe_machine
 from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.drivers.go2.hung import DESCRIPTION
-from deal_hw.drivers.go2.truth import Truth
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
+from deal_hw.drivers.go2.emulator.truth import Truth
 
 PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
 PATIENCE_S = 1800.0

@@ -39,10 +39,10 @@ from fault_table import main
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.posture import PostureConfig
 from deal_hw.drivers import make_topic_transport
-from deal_hw.drivers.go2.command_log import DAMPING, OFF, STIFF
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.topics import LOW_COMMAND
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, OFF, STIFF
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
+from deal_hw.drivers.go2.messages.topics import LOW_COMMAND
 from deal_hw.transport import Message, WireOptions
 
 POSTURE = PostureConfig(fold_s=0.3, rise_s=0.6, settle_s=0.2, lie_s=0.6)
@@ -55,7 +55,7 @@ class Go2Rig(Rig):
     """A Go2 that stands up, holds, and lies down."""
 
     robot = "go2"
-    description = DRIVEN
+    description = DRIVER
     phases = ANY
     wires = ("zenoh", "dds")
     longest_s = 1.5
@@ -132,7 +132,7 @@ def second_controller(rig: Rig) -> None:
     options = WireOptions(domain=_DOMAIN + rig.slot)
     transport = make_topic_transport(rig.wire, rig.port, MonotonicClock(), options)
     transport.declare(publish=[LOW_COMMAND])
-    pose = list(DRIVEN.rest_position)
+    pose = list(DRIVER.rest_position)
     zeros = [0.0] * 12
     payload = LowCommandEncoder().encode(LowCommand(pose, zeros, [20.0] * 12, [1.0] * 12, zeros))  # type: ignore[arg-type]
     with transport:

@@ -12,20 +12,20 @@ import itertools
 
 import numpy as np
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.leg_geometry import foot_loads, foot_positions
-from deal_hw.drivers.go2.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.descriptions.leg_geometry import foot_loads, foot_positions
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import draw_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.support import read_support
-from deal_hw.drivers.go2.truth import draw_truth
 
 SITUATIONS = {
     "lying, limp": {"sport": ""},
     "lying, sport mode": {"sport": "normal"},
     "standing, sport mode": {"start": "standing"},
-    "hanging, limp": {"suspended": True, "sport": ""},
-    "hanging, sport mode damps": {"suspended": True},
-    "hanging, sport mode stands": {"suspended": True, "start": "standing"},
+    "on a stand, limp": {"on_stand": True, "sport": ""},
+    "on a stand, sport mode damps": {"on_stand": True},
+    "on a stand, sport mode stands": {"on_stand": True, "start": "standing"},
 }
 WINDOW_MS = 300
 

@@ -32,8 +32,8 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.sim.episode import align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 Unit = Literal["generation", "run"]

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.data.reader import read_episode
-from deal_hw.data.record import CycleRecord, encode
-from deal_hw.data.recorder_launch import start_recorder
-from deal_hw.data.repair import repair
+from deal_hw.data.recording.reader import read_episode
+from deal_hw.data.recording.record import CycleRecord, encode
+from deal_hw.data.recording.recorder_launch import start_recorder
+from deal_hw.data.recording.repair import repair
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.transport import Message
 from deal_hw.types import JointCommand, RobotState, Status

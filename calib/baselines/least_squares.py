@@ -31,7 +31,7 @@ from deal_hw.calib.uncertainty.intervals import intervals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode_parts import spread, stretches
+from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
 
 EXPLAINED_TICKS = 10

@@ -18,7 +18,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.sysid_adapter import Recording, check_space, identify, require_sysid
+from deal_hw.sim.recordings.sysid_adapter import Recording, check_space, identify, require_sysid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

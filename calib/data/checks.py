@@ -7,7 +7,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.sim.batch import COMMAND_DELAY
+from deal_hw.sim.engine.batch import COMMAND_DELAY
 
 LEAST_NOISE_RATIO = 20.0
 LEAST_CHOSEN_RATIO = 5.0

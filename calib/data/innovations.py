@@ -15,7 +15,7 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.problem import NOISE_FREE_STD, SMOOTHING_S, Prediction, Problem, WindowData
-from deal_hw.sim.windows import setpoints
+from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
 ADVANCE_S = 0.008

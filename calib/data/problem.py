@@ -20,11 +20,11 @@ from deal_hw.calib.data.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartState
 from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import BatchPool, ServoBatch
-from deal_hw.sim.episode import Episode, fill_gaps
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.batch import BatchPool, ServoBatch
+from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
-from deal_hw.sim.windows import Windows, cut_windows, predict_windows, setpoints
+from deal_hw.sim.recordings.episode import Episode, fill_gaps
+from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray
 
 __all__ = [

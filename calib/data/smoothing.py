@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 SMOOTHING_S = 0.1

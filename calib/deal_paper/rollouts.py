@@ -12,11 +12,11 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import ADVANCE_S
 from deal_hw.calib.data.problem import Problem
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.chart import IDENTITY, to_quaternion, to_vector
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.servo import delay, slew
-from deal_hw.sim.windows import setpoints
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray, IntArray
 
 INPUT_LIMIT = 5.0

@@ -27,7 +27,7 @@ from deal_hw.control.excitation_plan import (
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray
 
 WORTH = 0.7

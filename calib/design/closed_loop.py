@@ -18,9 +18,9 @@ from deal_hw.control.safety_filter import SafetyFilter, is_finite
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
 TRIP_SHARE = 0.85

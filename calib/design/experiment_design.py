@@ -20,7 +20,7 @@ from deal_hw.control.behaviours import Behaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray
 
 MakeBehaviour = Callable[[], Behaviour]

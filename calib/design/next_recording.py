@@ -13,8 +13,8 @@ from deal_hw.calibration import CalibrationResult
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import DealHwError
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 BEYOND = 0.25

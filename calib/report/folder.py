@@ -11,8 +11,8 @@ from deal_hw.calib.report.inputs import ReportInputs
 from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
-from deal_hw.sim.calibrated_mjcf import require_other, write_calibrated_mjcf
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 
 DISTRIBUTION = "distribution.json"
 MODEL = "calibrated.xml"

@@ -14,8 +14,8 @@ from deal_hw.calib.validation.normalised_error import HELDOUT_WINDOW_S
 from deal_hw.calib.validation.split_half import HalvesRow, halves_rows
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 PANELS = 24

@@ -15,7 +15,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.checkpoint import generator_state
 from deal_hw.calibration import Budget, CalibrationMethod
-from deal_hw.sim.digest import model_digest
+from deal_hw.sim.engine.digest import model_digest
 
 PACKAGES = ("deal-hw", "mujoco", "numpy", "scipy", "torch")
 OPTIONAL = ("botorch", "cma", "gpytorch")

@@ -19,7 +19,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, polish, polish_robust
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import CalibrationError, InsufficientDataError
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 FOLDS = 2

@@ -10,8 +10,8 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.chart import to_vector
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_vector
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, IntArray
 
 HELDOUT_WINDOW_S = 0.2

@@ -20,7 +20,7 @@ from deal_hw.calib.fit.refinement import Polished, polish_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.uncertainty.at_fit import statement, widened_to, with_rows
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
-from deal_hw.sim.windows import Windows
+from deal_hw.sim.recordings.windows import Windows
 from deal_hw.types import FloatArray
 
 ITERATIONS = 6

@@ -12,14 +12,14 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.cli.bench import describe_machine, write_rows
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.fake import FakeGo2
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.scripted import ScriptedGo2
 
 BATCHES: Final = 200
 BATCH: Final = 200
@@ -63,7 +63,7 @@ def _calls() -> dict[str, Callable[[], object]]:
     rng = np.random.default_rng(0)
     parts = rng.normal(size=(5, 12))
     command = LowCommand(*parts)
-    encoder, state = LowCommandEncoder(), ScriptedGo2(pose=rng.normal(size=12)).state()
+    encoder, state = LowCommandEncoder(), FakeGo2(pose=rng.normal(size=12)).state()
     command_bytes, state_bytes = encoder.encode(command), encode_low_state(state)
     return {
         "encode LowCmd with CRC": lambda: encoder.encode(command),

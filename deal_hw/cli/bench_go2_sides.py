@@ -22,7 +22,7 @@ from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.cadence import Cadence, Spread
 from deal_hw.control.realtime import become_realtime, die_with_parent
 from deal_hw.drivers import make_topic_transport
-from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE
+from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import DealHwError, TransportError, TransportLostError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport, WireOptions
 

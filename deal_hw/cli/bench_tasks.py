@@ -19,9 +19,9 @@ from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align, fill_gaps
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.target import Behaviour, Sensing, TargetRecording, record_target
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.recordings.episode import Episode, align, fill_gaps
+from deal_hw.sim.recordings.target import Behaviour, Sensing, TargetRecording, record_target
 from deal_hw.types import FloatArray
 
 DEMONSTRATION_S = 4.0
@@ -162,24 +162,24 @@ def _ant(ask: _Ask) -> Case:
 
 
 def _go2(ask: _Ask) -> Case:
-    from deal_hw.drivers.go2 import description as go2
+    from deal_hw.drivers.go2.descriptions import floor
     from deal_hw.drivers.go2.motions import FEET, sway
 
     if ask.profile == "realistic":
         raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
-    robot = load_model(go2.DESCRIPTION)
+    robot = load_model(floor.DESCRIPTION)
     sensing = Sensing(
-        joint_std=go2.DESCRIPTION.sensor.noise, joint_resolution=go2.DESCRIPTION.sensor.resolution,
-        orientation_std=go2.ORIENTATION_NOISE_RAD, gyro_std=go2.GYRO_NOISE_RAD_S, feet=FEET,
+        joint_std=floor.DESCRIPTION.sensor.noise, joint_resolution=floor.DESCRIPTION.sensor.resolution,
+        orientation_std=floor.ORIENTATION_NOISE_RAD, gyro_std=floor.GYRO_NOISE_RAD_S, feet=FEET,
     )  # fmt: skip
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
         fast = sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
         if ask.by_policy:
-            return _policy("go2", go2.DESCRIPTION), fast
+            return _policy("go2", floor.DESCRIPTION), fast
         return sway(robot, rng, DEMONSTRATION_S), fast
 
-    space = ask.ranges(go2.SPACES)
+    space = ask.ranges(floor.SPACES)
     return _target("go2", robot, space, ask, motions, None if ask.profile == "ideal" else sensing)
 
 

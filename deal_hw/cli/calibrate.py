@@ -31,9 +31,9 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.data.dataset import Dataset
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import Episode
 
 __all__ = [
     "Calibrate", "CalibrateReport", "calibrate", "calibrate_episodes", "calibrate_or_write_parameters",
@@ -281,8 +281,8 @@ def prepare_dataset(config: Calibrate) -> Work:
     Raises:
         DealHwError: A setting or a recording is unusable.
     """
-    from deal_hw.data.checks import Severity, check
-    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.telemetry_checks import Severity, check
     from deal_hw.errors import InsufficientDataError
 
     if config.dataset is None:
@@ -382,9 +382,9 @@ def _simulation(
     dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
 ) -> tuple[RobotModel, dict[int, Episode]]:
     try:
-        from deal_hw.sim.episode import align, thin
-        from deal_hw.sim.model import load_model
-        from deal_hw.sim.standing import with_sensed_base
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.recordings.episode import align, thin
+        from deal_hw.sim.recordings.standing import with_sensed_base
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 

@@ -10,15 +10,15 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.data.checks import Verdict
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.joint_facts import JointFacts
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.data.recording.telemetry_checks import Verdict
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
+    from deal_hw.sim.recordings.episode import Episode
 
-DROOP_EXPLAINED, DROOP_LEAST = 0.5, 0.01
-"""A droop is believed where the model's gravity explains this share of it, and it is this large [rad, m]."""
+GRAVITY_EXPLAINED, GRAVITY_LEAST = 0.5, 0.01
+"""Gravity must explain this share of a deviation of at least this size, or no gain is told [rad, m]."""
 MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation", "actuation")
 """Checks that mean something where commands are efforts and not positions."""
 
@@ -30,7 +30,7 @@ def require_base(robot: RobotModel, feet: Sequence[str], recordings: Sequence[Re
         ConfigurationError: There is no IMU in a recording, or no feet are named, or the base is fixed.
         UnknownNameError: A foot is no geom of the model.
     """
-    from deal_hw.sim.fields import element_id
+    from deal_hw.sim.parameters.fields import element_id
 
     free = robot.description.floating_base
     if free is None:
@@ -71,9 +71,9 @@ def examine_recording(
     Raises:
         DatasetError: A check failed, and that is not to be overlooked.
     """
-    from deal_hw.data.checks import Severity
-    from deal_hw.data.command_kind import command_kind
-    from deal_hw.data.plausibility import examine, require
+    from deal_hw.data.checks.command_kind import command_kind
+    from deal_hw.data.checks.plausibility import examine, require
+    from deal_hw.data.recording.telemetry_checks import Severity
     from deal_hw.errors import DatasetError
 
     limits = None
@@ -101,15 +101,15 @@ def warn_of_gravity(
     robot: RobotModel, space: ParameterSpace, episodes: list[Episode], say: Callable[[str], None]
 ) -> None:
     """Warn where gravity contradicts a joint's sign or a servo's gain."""
-    from deal_hw.sim.droop import droop
+    from deal_hw.sim.recordings.gravity_gain import gravity_gain
 
-    found = droop(robot, episodes)
+    found = gravity_gain(robot, episodes)
     if found is None:
         return
     searched = {p.elements: p for p in space if p.kind == "servo_stiffness"}
     names = robot.actuator_names
     for a, joint in enumerate(robot.description.actuated):
-        if found.explained[a] < DROOP_EXPLAINED or found.deviation[a] < DROOP_LEAST:
+        if found.explained[a] < GRAVITY_EXPLAINED or found.deviation[a] < GRAVITY_LEAST:
             continue
         gain, own = float(found.gain[a]), robot.description.stiffness[a]
         parameter = next((p for elements, p in searched.items() if names[a] in elements), None)

@@ -19,7 +19,7 @@ from deal_hw.types import FloatArray, Trajectory
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.search.checkpoint import Checkpoint
-    from deal_hw.sim.overlay import Overlay
+    from deal_hw.sim.recordings.overlay import Overlay
 
 CHECKPOINT = "checkpoint.npz"
 """Beside the results while the calibration runs; gone when it is over."""
@@ -108,7 +108,7 @@ def watching(
         from deal_hw.viz.population_view import MEAN, population_view
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "viz") from err
-    from deal_hw.sim.overlay import compute_overlay
+    from deal_hw.sim.recordings.overlay import compute_overlay
 
     def predict(mean: FloatArray, population_latency_s: float) -> Overlay:
         latency = population_latency_s if latency_s is None else latency_s

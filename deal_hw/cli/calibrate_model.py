@@ -32,7 +32,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.sim.engine.model import RobotModel
 
 HELDOUT_PART = 0.25
 
@@ -93,7 +93,7 @@ def write_parameters(config: Recordings) -> int:
         raise ConfigurationError("--write-parameters needs --model robot.xml")
     if path.exists():
         raise ConfigurationError(f"{path} exists; name another file, or remove it")
-    from deal_hw.sim.compiling import compile_mjcf
+    from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.parameters.template import template
 
     text = template(compile_mjcf(config.model), config.model.name)
@@ -129,10 +129,10 @@ def prepare_model(
     """
     try:
         from deal_hw.data.importing.columns import read_column_map
-        from deal_hw.sim.compiling import compile_mjcf
-        from deal_hw.sim.describe import describe
-        from deal_hw.sim.joint_facts import joint_facts
-        from deal_hw.sim.model import load_model
+        from deal_hw.sim.engine.compiling import compile_mjcf
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.mjcf.describe import describe
+        from deal_hw.sim.mjcf.joint_facts import joint_facts
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 

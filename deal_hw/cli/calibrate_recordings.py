@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from deal_hw.data.importing.columns import ColumnMap
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
-    from deal_hw.sim.describe import Sampling
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.mjcf.describe import Sampling
+    from deal_hw.sim.recordings.episode import Episode
 
 STRETCH_S = 2.5
 """Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
@@ -48,9 +48,9 @@ def common_rates(
         ConfigurationError: They have different joints, or a setting cannot be used.
         DatasetError: A clock is no clock, or rates differ.
     """
+    from deal_hw.data.checks.plausibility import examine, require
     from deal_hw.data.importing.grid import common_period
-    from deal_hw.data.plausibility import examine, require
-    from deal_hw.sim.describe import sampling
+    from deal_hw.sim.mjcf.describe import sampling
 
     first = tables[0]
     for table in tables:
@@ -131,8 +131,8 @@ def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]
 
 def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...]) -> Episode:
     """Return a recording on the physics grid, with the base where the robot floats."""
-    from deal_hw.sim.episode import align, fill_gaps
-    from deal_hw.sim.imu_base import with_base
+    from deal_hw.sim.recordings.episode import align, fill_gaps
+    from deal_hw.sim.recordings.imu_base import with_base
 
     episode = align(recording.trajectory, robot.description)
     if recording.orientation is not None and recording.gyro is not None and robot.base is not None:
@@ -158,7 +158,7 @@ def divide(
         window_s: Length of a search's longest windows [s].
         say: Told where not all is fitted.
     """
-    from deal_hw.sim.episode_parts import split_last, spread, stretches
+    from deal_hw.sim.recordings.parts import split_last, spread, stretches
 
     fit, held = list(episodes), list(judge)
     if share > 0:

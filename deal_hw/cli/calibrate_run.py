@@ -24,8 +24,8 @@ from deal_hw.types import FloatArray, Trajectory
 if TYPE_CHECKING:
     from deal_hw.calib.report.inputs import ReportInputs
     from deal_hw.control.behaviours import Behaviour
-    from deal_hw.sim.episode import Episode
-    from deal_hw.sim.model import RobotModel
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import Episode
 
 TABLE_WIDTH = 100
 HELDOUT_WINDOW_S = 0.2
@@ -193,8 +193,8 @@ def _require_windows(holdout: Sequence[Episode], window_s: float) -> None:
     Raises:
         InsufficientDataError: None of them holds a window.
     """
-    from deal_hw.sim.episode import fill_gaps
-    from deal_hw.sim.windows import cut_windows
+    from deal_hw.sim.recordings.episode import fill_gaps
+    from deal_hw.sim.recordings.windows import cut_windows
 
     problem: InsufficientDataError | None = None
     for episode in map(fill_gaps, holdout):

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from deal_hw.cli.data_import import Export, Import, export_recordings, import_recordings
-from deal_hw.data.dataset import INDEX_NAME, Dataset
-from deal_hw.data.episode_info import EpisodeInfo, summarize
-from deal_hw.data.repair import RepairReport, repair, verify
+from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
+from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
+from deal_hw.data.recording.repair import RepairReport, repair, verify
 from deal_hw.errors import DatasetError
 
 if TYPE_CHECKING:

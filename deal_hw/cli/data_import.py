@@ -16,7 +16,7 @@ from deal_hw.reading import number, read_json, reading
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
-    from deal_hw.sim.joint_facts import JointFacts
+    from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,9 +131,9 @@ def export_recordings(config: Export) -> int:
         DatasetError: It cannot be read, or the folder cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
-    from deal_hw.data.dataset import Dataset
-    from deal_hw.data.export_lerobot import export_lerobot
-    from deal_hw.data.reader import read_trajectory
+    from deal_hw.data.export.lerobot import export_lerobot
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.reader import read_trajectory
 
     if config.path.is_dir():
         dataset = Dataset.open(config.path, _say)
@@ -154,7 +154,7 @@ def _say(text: str) -> None:
 def _joint_facts(model: Path | None) -> JointFacts | None:
     if model is None:
         return None
-    from deal_hw.sim.joint_facts import joint_facts
+    from deal_hw.sim.mjcf.joint_facts import joint_facts
 
     facts = joint_facts(model)
     if facts.left_out:
@@ -166,7 +166,7 @@ def _joint_facts(model: Path | None) -> JointFacts | None:
 
 
 def _description(path: Path) -> dict[str, Any]:
-    from deal_hw.data.reader import check_description
+    from deal_hw.data.recording.reader import check_description
 
     what, advice = "a robot's description", "see `description` in a dataset.json"
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)

@@ -124,10 +124,10 @@ def _examine(config: Doctor) -> Iterator[Finding]:
             robot = make_robot(config.robot, name, config.port, clock, config.wire)
             yield from examine_robot(config.robot, robot, clock, config.seconds)
             return
-        from deal_hw.drivers.go2.checkup import Checkup
+        from deal_hw.drivers.go2.doctor import Doctor
 
         link = make_topic_transport(name, config.port, clock, config.wire)
-        yield from Checkup(link, clock, config.seconds, config.state_check).run()
+        yield from Doctor(link, clock, config.seconds, config.state_check).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
 

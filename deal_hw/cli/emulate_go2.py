@@ -22,14 +22,14 @@ from deal_hw.cli.emulate_common import (
     stop_on_signals,
 )
 from deal_hw.cli.options import Range, check_ranges
-from deal_hw.drivers.go2.faults import FaultPlan, Go2Faults
+from deal_hw.drivers.go2.emulator.faults import FaultPlan, Go2Faults
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.transport import TopicTransport, WireOptions
 
 if TYPE_CHECKING:
     from deal_hw.cli.emulate import Emulate
-    from deal_hw.drivers.go2.device import Go2Device
-    from deal_hw.drivers.go2.truth import Truth
+    from deal_hw.drivers.go2.emulator.device import Go2Device
+    from deal_hw.drivers.go2.emulator.truth import Truth
 
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 """Transports of the Go2, and where its emulator is by default: on this machine alone."""
@@ -124,7 +124,7 @@ def emulate_go2(config: Emulate) -> int:
     The first line on standard output is ``port PORT``.
     """
     try:
-        from deal_hw.drivers.go2.emulator import Go2Emulator
+        from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
     except ModuleNotFoundError as error:
         if error.name == "mujoco":
             raise MissingExtraError(error.name, "sim") from error
@@ -198,7 +198,7 @@ def free_port(port: str) -> str:
 
 
 def _truth(config: Emulate) -> Truth:
-    from deal_hw.drivers.go2.truth import DEFAULT_XI, Truth, draw_truth, nominal_truth
+    from deal_hw.drivers.go2.emulator.truth import DEFAULT_XI, Truth, draw_truth, nominal_truth
 
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
@@ -208,8 +208,8 @@ def _truth(config: Emulate) -> Truth:
 
 
 def _device(config: Emulate, truth: Truth) -> Go2Device:
-    from deal_hw.drivers.go2.device import Go2Device
-    from deal_hw.drivers.go2.remote_script import read_remote_script
+    from deal_hw.drivers.go2.emulator.device import Go2Device
+    from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
 
     own = config.go2
     plan = FaultPlan(
@@ -221,7 +221,7 @@ def _device(config: Emulate, truth: Truth) -> Go2Device:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")
     script = () if own.remote_script is None else read_remote_script(own.remote_script)
     return Go2Device(
-        truth, suspended=own.suspended, start=own.start, sport="" if own.sport == "off" else own.sport,
+        truth, on_stand=own.suspended, start=own.start, sport="" if own.sport == "off" else own.sport,
         sport_on_wire=not own.sport_silent, plan=plan, remote=None if own.no_remote else script,
         tick_ms=own.tick_start_ms,
     )  # fmt: skip

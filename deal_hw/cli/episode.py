@@ -16,13 +16,13 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.handover import CONNECTING, HANDING_BACK, HOMING, LOADING, MAKING_PASSIVE, STARTING, Beat
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.supervisor import OPERATOR, Supervisor
-from deal_hw.data.excitation import Excitation
-from deal_hw.data.recorder_launch import start_recorder
+from deal_hw.data.recording.excitation import Excitation
+from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
 
 if TYPE_CHECKING:
-    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.recording.dataset import Dataset
 
 _IN_VAIN = PassiveConfig(timeout_s=1.0)
 """Where the control process tried for its whole time, the supervisor's own path gets this chance."""

@@ -14,7 +14,7 @@ from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.control.cadence import CadenceReport
 from deal_hw.control.handover import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.control.loop import Outcome
-from deal_hw.data.excitation import Excitation
+from deal_hw.data.recording.excitation import Excitation
 
 _EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
 

@@ -172,7 +172,7 @@ def _sway(config: Excite, description: RobotDescription) -> ExcitationPlan:
         )
     try:
         from deal_hw.drivers.go2.motions import sway_plan
-        from deal_hw.sim.model import load_model
+        from deal_hw.sim.engine.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
     return sway_plan(
@@ -221,7 +221,7 @@ def _search(
     try:
         from deal_hw.calib.design.excitation_search import SearchSettings, search_excitation
         from deal_hw.calib.design.experiment_design import Experiment
-        from deal_hw.sim.model import load_model
+        from deal_hw.sim.engine.model import load_model
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
     settings = SearchSettings(

@@ -13,12 +13,12 @@ import tyro
 
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.cli.options import Range, check_ranges, refuse
-from deal_hw.data.reader import Episode, read_episode
+from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
-from deal_hw.sim.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
+from deal_hw.sim.recordings.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
 from deal_hw.viz.episode_log import write_episode
 from deal_hw.viz.screenshot import save_screenshot
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web

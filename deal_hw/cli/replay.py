@@ -12,7 +12,7 @@ from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import dataset_folder, run_episodes
 from deal_hw.control.behaviours import ReplayBehaviour
-from deal_hw.data.reader import read_trajectory
+from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.drivers import driver_description
 
 

@@ -196,7 +196,7 @@ def _inner_behaviour(
     if plan.profile == "chirp":
         return ChirpBehaviour(description, ChirpConfig(duration_s=plan.seconds))
     if plan.profile == "replay":
-        from deal_hw.data.reader import read_trajectory
+        from deal_hw.data.recording.reader import read_trajectory
 
         return ReplayBehaviour(read_trajectory(Path(plan.recording)), description)
     if plan.profile == "excite":

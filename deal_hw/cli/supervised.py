@@ -24,7 +24,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
 
 if TYPE_CHECKING:
-    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.recording.dataset import Dataset
 
 
 class InterruptedRunError(KeyboardInterrupt):
@@ -173,7 +173,7 @@ def _open_dataset(folder: Path | None, description: RobotDescription) -> Iterato
     if folder is None:
         yield None
         return
-    from deal_hw.data.dataset import Dataset
+    from deal_hw.data.recording.dataset import Dataset
 
     with Dataset.create_or_open(folder, description, lambda text: print(text, file=sys.stderr)) as store:
         yield store

@@ -17,16 +17,16 @@ from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
 from deal_hw.control.safety import Safety
 from deal_hw.control.vigor import ATTEMPTS, VigorSearch, shortfalls
-from deal_hw.data.excitation import excitation
-from deal_hw.data.reader import read_trajectory
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.excitation import excitation
+from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, Trajectory
 
 _START_NS = 10**9

@@ -13,7 +13,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
-from deal_hw.data.record import CycleRecord, encode
+from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.errors import ConfigurationError, DatasetError
 
 BUFFER_BYTES = 1 << 20

@@ -16,7 +16,7 @@ from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
 from deal_hw.control.passive import make_passive
 from deal_hw.control.repeater import Repeater
 from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
-from deal_hw.data.record import CycleFlag, CycleRecord
+from deal_hw.data.recording.record import CycleFlag, CycleRecord
 from deal_hw.errors import DealHwError, TransportError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message

@@ -25,7 +25,7 @@ from typing import Any
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
 from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
-from deal_hw.data.recorder_launch import RecorderHandle, RecorderOutcome
+from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
 
 START_SILENCE_S = 30.0
 """How long a new control process may take to import and load before its first heartbeat [s]."""

@@ -14,7 +14,7 @@ import numpy as np
 from deal_hw.control.excitation import RichConfig, Segment
 from deal_hw.control.excitation_limits import room
 from deal_hw.control.excitation_plan import largest_factor
-from deal_hw.data.excitation import Excitation
+from deal_hw.data.recording.excitation import Excitation
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 

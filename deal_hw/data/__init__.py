@@ -1,1 +1,1 @@
-"""Recordings: written as MCAP while they happen, repaired after a kill, checked, and read back as arrays."""
+"""Recordings: our own episodes, those of others as they are imported, checks of both, and export."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from deal_hw.description import RobotDescription
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model
 from deal_hw.types import Event, FloatArray, Status, Trajectory
 
 BALANCE_GAINS = (1.65, 1.04, 0.475, 0.171)

@@ -9,9 +9,9 @@ import numpy as np
 
 from deal_hw.description import RobotDescription
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim import chart
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion
 from deal_hw.types import BodyTrajectory, FloatArray, Status, Trajectory
 
 RECEIVED_AFTER_S = 0.4e-3
@@ -69,7 +69,7 @@ def _report(description: RobotDescription, x: FloatArray, v: FloatArray, targets
     age_s = np.where(in_force >= 0, device_s - sent_s[np.maximum(in_force, 0)], np.nan)
     rows = np.ones((len(targets), 1))
     body = BodyTrajectory(
-        orientation=chart.to_quaternion(x[:, 3:6], chart.IDENTITY),
+        orientation=to_quaternion(x[:, 3:6], IDENTITY),
         angular_velocity=v[:, 3:6],
         acceleration=np.tile([0.0, 0.0, 9.81], (T, 1)),
         foot_force=np.full((T, len(description.feet)), 37.0),

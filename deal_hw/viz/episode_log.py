@@ -26,12 +26,12 @@ from pathlib import Path
 import numpy as np
 
 from deal_hw.calibration import CalibrationResult
-from deal_hw.data.reader import CycleTable
+from deal_hw.data.recording.reader import CycleTable
 from deal_hw.description import RobotDescription
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.overlay import Overlay
-from deal_hw.sim.scene import body_poses, read_scene
-from deal_hw.sim.standing import sensed_base
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.scene import body_poses, read_scene
+from deal_hw.sim.recordings.overlay import Overlay
+from deal_hw.sim.recordings.standing import sensed_base
 from deal_hw.types import FloatArray, Status, Trajectory
 from deal_hw.viz import palette
 from deal_hw.viz.backend import rr
@@ -240,7 +240,7 @@ def log_scene(
         trajectory: The recording.
         robot: The robot's model.
         base: Sensed poses of a floating base, (T, 7); None for a fixed one.
-        poses: Of the real robot's bodies, as :func:`~deal_hw.sim.scene.body_poses` returns them.
+        poses: Of the real robot's bodies, as :func:`~deal_hw.sim.engine.scene.body_poses` returns them.
         overlay: Predictions to show beside it.
     """
     scene = read_scene(robot)

@@ -26,7 +26,7 @@ import numpy as np
 
 from deal_hw.calibration import Progress
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.overlay import Overlay
+from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.types import FloatArray
 from deal_hw.viz import palette
 from deal_hw.viz.backend import rr, rrb

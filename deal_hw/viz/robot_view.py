@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.sim.scene import Scene, Shape
+from deal_hw.sim.engine.scene import Scene, Shape
 from deal_hw.types import FloatArray
 from deal_hw.viz.backend import rr
 from deal_hw.viz.columns import Log

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.description import RobotDescription
-from deal_hw.sim.overlay import Overlay, Prediction
+from deal_hw.sim.recordings.overlay import Overlay, Prediction
 from deal_hw.types import Trajectory
 
 _WIDE = 3

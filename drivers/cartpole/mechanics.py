@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.sim.single import SingleSimulation
+from deal_hw.sim.engine.single import SingleSimulation
 
 
 def build_simulation(parameters: Mapping[str, float]) -> SingleSimulation:

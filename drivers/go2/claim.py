@@ -19,8 +19,8 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2.rpc import Request, decode_request, encode_request
-from deal_hw.drivers.go2.topics import CLAIM
+from deal_hw.drivers.go2.messages.rpc import Request, decode_request, encode_request
+from deal_hw.drivers.go2.messages.topics import CLAIM
 from deal_hw.errors import FrameError, PortBusyError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 

@@ -11,14 +11,15 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.go2 import hung, topics
-from deal_hw.drivers.go2.body import body_state, is_damped
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.greeting import await_robot
-from deal_hw.drivers.go2.protocol import LowStateFrame
-from deal_hw.drivers.go2.refusals import StateCheck
-from deal_hw.drivers.go2.remote import decode_remote, parse_combination
-from deal_hw.drivers.go2.sending import PASSIVE_COPIES, CommandSender
+from deal_hw.drivers.go2.command_sender import PASSIVE_COPIES, CommandSender
+from deal_hw.drivers.go2.connect import await_robot
+from deal_hw.drivers.go2.descriptions import on_stand
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.body import body_state, is_damped
+from deal_hw.drivers.go2.messages.protocol import LowStateFrame
+from deal_hw.drivers.go2.messages.refusals import StateCheck
+from deal_hw.drivers.go2.messages.remote import decode_remote, parse_combination
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.go2.takeover import Takeover
@@ -81,7 +82,7 @@ class Go2Robot(Robot):
             description says.
     """
 
-    description: ClassVar[RobotDescription] = DRIVEN
+    description: ClassVar[RobotDescription] = DRIVER
     homes_by_motor: ClassVar[bool] = False
 
     def __init__(
@@ -344,7 +345,7 @@ class Go2Robot(Robot):
             raise SafetyError("go2: not connected; call connect() first")
 
 
-class Go2HungRobot(Go2Robot):
-    """The same robot with its base held in the air."""
+class Go2OnStandRobot(Go2Robot):
+    """The same robot with its base on a stand."""
 
-    description: ClassVar[RobotDescription] = hung.DESCRIPTION
+    description: ClassVar[RobotDescription] = on_stand.DESCRIPTION

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Final, get_args
 
-from deal_hw.drivers.go2.protocol import LowStateFrame, decode_low_state
-from deal_hw.drivers.go2.refusals import Refusals, StateCheck
+from deal_hw.drivers.go2.messages.protocol import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.errors import FrameError, ProtocolError, TransportLostError, UnknownNameError
 from deal_hw.transport import Message
 

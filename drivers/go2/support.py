@@ -2,7 +2,7 @@
 
 The two are different robots to deal-hw (``go2``, ``go2_hung``), and commands for one are dangerous to the
 other. No sensor tells which it is. Two quantities do: how far the feet reach below the base, along gravity,
-and the force that the legs carry, by the drives' estimated efforts.
+and the force that the legs carry, by the motors' estimated efforts.
 
 - Legs that carry half of the weight stand on the floor.
 - Folded legs are those of a robot that lies. Legs that were folded when the robot was lifted look the same.
@@ -24,9 +24,9 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.control.leg_checks import UNIT_TOLERANCE, tilt
-from deal_hw.drivers.go2.driven import HELD_TILT_RAD
-from deal_hw.drivers.go2.leg_geometry import WEIGHT_N, foot_loads, foot_positions
-from deal_hw.drivers.go2.low_state import LowState, LowStateFrame
+from deal_hw.drivers.go2.descriptions.driver import HELD_TILT_RAD
+from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_loads, foot_positions
+from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame
 from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
 from deal_hw.types import FloatArray
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.go2 import topics
+from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, Services
 from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport

@@ -13,8 +13,8 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import Episode, align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")

@@ -11,8 +11,8 @@ from deal_hw.calib.fit.refinement import polish
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.episode import align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 TICKS = 7

@@ -14,12 +14,12 @@ from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, MISMATCH_TIME, correlation_time
 from deal_hw.calib.validation.checks import unexplained
 from deal_hw.cli.bench_tasks import Case, make_case
-from deal_hw.drivers.go2.description import DESCRIPTION, parameter_space
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, parameter_space
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import load_model
-from deal_hw.sim.target import Sensing, record_target
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.target import Sensing, record_target
 from deal_hw.types import FloatArray
 
 Beginning = Callable[[Episode, float], Episode]

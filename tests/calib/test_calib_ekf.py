@@ -15,8 +15,8 @@ from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 

@@ -16,8 +16,8 @@ from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2
 from deal_hw.cli.bench_tasks import make_case
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 Beginning = Callable[[Episode, float], Episode]

@@ -30,10 +30,10 @@ from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesig
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.cartpole.description import k9_space
-from deal_hw.drivers.go2.description import DESCRIPTION as GO2
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.errors import CalibrationError, ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
-from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray
 
 MASS, DAMPING, STIFFNESS, GAIN = 2.0, 3.0, 150.0, 12.0

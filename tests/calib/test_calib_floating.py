@@ -15,7 +15,7 @@ from deal_hw.calib.validation.normalised_error import heldout_nrmse, signal_rang
 from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 Beginning = Callable[[Episode, float], Episode]

@@ -12,7 +12,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 

@@ -12,11 +12,11 @@ from deal_hw.calib.report.inputs import ReportInputs
 from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.drivers.go2.description import DESCRIPTION as GO2
-from deal_hw.drivers.go2.description import parameter_space
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
+from deal_hw.drivers.go2.descriptions.floor import parameter_space
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import Episode, align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 

@@ -21,7 +21,7 @@ from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.cli.calibrate_model import Recordings, prepare_model
 from deal_hw.cli.calibrate_run import Narrowing
-from deal_hw.sim.episode import Episode
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
 HINGE = """

@@ -23,8 +23,8 @@ from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model
 from deal_hw.types import FloatArray
 
 

@@ -25,8 +25,8 @@ from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.episode import align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"

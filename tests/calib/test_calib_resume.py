@@ -19,8 +19,8 @@ from deal_hw.calib.search.identity import run_identity
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.sim.episode import align
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")

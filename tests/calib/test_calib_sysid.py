@@ -17,9 +17,9 @@ from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.episode import Episode, align
-from deal_hw.sim.model import load_model
-from deal_hw.sim.sysid_adapter import Recording, identify, require_sysid
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.sysid_adapter import Recording, identify, require_sysid
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray

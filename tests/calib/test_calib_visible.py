@@ -13,10 +13,10 @@ from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
 from deal_hw.calib.validation.heldout import heldout_rmse
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.compiling import load_mjcf
-from deal_hw.sim.describe import describe, sampling
-from deal_hw.sim.episode import Episode
-from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.mjcf.describe import describe, sampling
+from deal_hw.sim.recordings.episode import Episode
 
 SLIDER = """
 <mujoco>

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from deal_hw.cli import main as cli
 from deal_hw.cli.bench_go2_sides import Arrivals, mark, read_mark
 from deal_hw.cli.bench_go2_transport import TransportBench, bench_transport, lines, summary
-from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE
+from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import ConfigurationError, TransportError
 from deal_hw.transport import WireOptions
 

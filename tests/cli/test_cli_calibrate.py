@@ -14,7 +14,7 @@ from deal_hw.cli.calibrate import Calibrate, calibrate, make_space
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
-from deal_hw.data.dataset import Dataset
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
-from deal_hw.drivers.go2.description import DESCRIPTION
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim import chart
-from deal_hw.sim.model import load_model
-from deal_hw.sim.target import Sensing, record_target
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion
+from deal_hw.sim.recordings.target import Sensing, record_target
 
 COLUMNS = """
 time: time
@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         time=episode.sample * episode.step_s,
         q=episode.position[:, robot.joints],
         q_des=episode.target[rows],
-        quaternion=chart.to_quaternion(episode.position[:, rotation], episode.reference),
+        quaternion=to_quaternion(episode.position[:, rotation], episode.reference),
         gyro=episode.velocity[:, rotation],
         joint_names=np.array(DESCRIPTION.joint_names),
     )

@@ -20,7 +20,7 @@ from deal_hw.cli import calibrate as verb
 from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.data.dataset import Dataset
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
 

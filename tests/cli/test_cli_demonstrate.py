@@ -22,13 +22,13 @@ from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode, demonstrate
 from deal_hw.control.loop import Outcome
 from deal_hw.control.vigor import VigorSearch
-from deal_hw.data.dataset import Dataset
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.episode import align, fill_gaps
-from deal_hw.sim.model import load_model
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align, fill_gaps
 
 
 def shown(truth: Truth) -> tuple[VirtualEpisode, VigorSearch]:

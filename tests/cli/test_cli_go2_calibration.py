@@ -20,17 +20,17 @@ from deal_hw.control.excitation_limits import room
 from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.safety import Safety
-from deal_hw.data.dataset import Dataset
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers import parameter_spaces
-from deal_hw.drivers.go2.description import DESCRIPTION as SIMULATED
-from deal_hw.drivers.go2.description import LEGS
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION
-from deal_hw.drivers.go2.robot import Go2HungRobot
-from deal_hw.drivers.go2.truth import Truth, draw_truth
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as SIMULATED
+from deal_hw.drivers.go2.descriptions.floor import LEGS
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth
+from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError
 
@@ -40,7 +40,7 @@ HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness",
 def record(device: Go2Device, dataset: Dataset, plan: RunPlan) -> None:
     """Record a run of an emulated robot in virtual time."""
     clock = VirtualClock(10**9)
-    robot = Go2HungRobot(VirtualTopics(device, clock), clock)
+    robot = Go2OnStandRobot(VirtualTopics(device, clock), clock)
     path = dataset.next_episode_path()
     with EpisodeRecorder(path, DESCRIPTION.to_json(), {"profile": plan.profile}, clock) as recorder:
 
@@ -80,7 +80,7 @@ def dataset(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "dataset"
     with Dataset.create_or_open(folder, DESCRIPTION.to_json()) as store:
         for kind, seconds in (("multisine", 4.0), ("chirp", 2.4)):
-            device = Go2Device(truth, suspended=True, sport="")
+            device = Go2Device(truth, on_stand=True, sport="")
             plan = RunPlan(robot="go2_hung", profile="excite", excite=kind, seconds=seconds)
             record(device, store, plan)
     return folder
@@ -185,12 +185,12 @@ def test_swaying_is_planned_for_the_driven_robot_and_keeps_its_limits(tmp_path: 
     path = tmp_path / "sway.json"
     excite(Excite(robot="go2", out=path, family="sway", seconds=3.0, high_hz=3.0, quiet=True))
     plan = read_plan(path)
-    plan.check_fits(DRIVEN)
-    targets = np.array(DRIVEN.default_position) + plan.offsets(np.arange(0.0, 3.0, 0.02))
-    low, high = np.array(DRIVEN.limits.target).T
+    plan.check_fits(DRIVER)
+    targets = np.array(DRIVER.default_position) + plan.offsets(np.arange(0.0, 3.0, 0.02))
+    low, high = np.array(DRIVER.limits.target).T
     assert ((low <= targets) & (targets <= high)).all()
     assert np.ptp(targets, axis=0).min() > 0.02
-    assert np.abs(np.diff(targets, axis=0)).max() < np.array(DRIVEN.limits.target_step).min()
+    assert np.abs(np.diff(targets, axis=0)).max() < np.array(DRIVER.limits.target_step).min()
 
 
 def test_only_the_go2_sways(tmp_path: Path) -> None:
@@ -206,9 +206,9 @@ def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
     code = (
         "import json, sys\n"
         "from deal_hw.cli.run_plan import RunPlan, make_behaviour\n"
-        "from deal_hw.drivers.go2.driven import DRIVEN\n"
+        "from deal_hw.drivers.go2.descriptions.driver import DRIVER\n"
         f"plan = RunPlan(robot='go2', profile='excite', excite={str(path)!r}, seconds=1.0)\n"
-        "make_behaviour(plan, DRIVEN)\n"
+        "make_behaviour(plan, DRIVER)\n"
         "print(json.dumps([n for n in ('mujoco', 'torch', 'scipy') if n in sys.modules]))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -15,7 +15,7 @@ from deal_hw.control.excitation import RichConfig, Segment
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.velocity import FixedVelocity, KeyboardVelocity, RemoteVelocity, ScriptVelocity
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
 from deal_hw.types import RobotState, Status
@@ -77,20 +77,20 @@ def test_a_wrong_velocity_is_said_before_anybody_touches_the_robot() -> None:
     """Also where the profile does not walk."""
     plan = RunPlan(robot="go2", profile="hold", velocity="fast")
     with pytest.raises(ConfigurationError, match=r"--velocity 'fast': give x,y,yaw"):
-        make_behaviour(plan, DRIVEN)
+        make_behaviour(plan, DRIVER)
 
 
 def test_standing_up_is_wrapped_around_the_profile() -> None:
     """It rises, holds and lies down; its length is the run's."""
     plan = RunPlan(robot="go2", profile="hold", seconds=2.0, stand=True, posture=POSTURE)
-    behaviour = make_behaviour(plan, DRIVEN)
+    behaviour = make_behaviour(plan, DRIVER)
     assert isinstance(behaviour, PostureBehaviour)
     assert behaviour.duration_s == plan.total_s
-    lying = np.array(DRIVEN.rest_position)
+    lying = np.array(DRIVER.rest_position)
     state = RobotState(lying, np.zeros(12), np.zeros(12), 0, 0, 0, -1, -1, Status.ARMED)
-    for time_s, wanted in ((0.0, lying), (4.0, np.array(DRIVEN.default_position)), (plan.total_s, lying)):
+    for time_s, wanted in ((0.0, lying), (4.0, np.array(DRIVER.default_position)), (plan.total_s, lying)):
         np.testing.assert_allclose(behaviour.command(state, time_s).position_target, wanted, atol=1e-12)
-    assert isinstance(make_behaviour(dataclasses.replace(plan, stand=False), DRIVEN), HoldBehaviour)
+    assert isinstance(make_behaviour(dataclasses.replace(plan, stand=False), DRIVER), HoldBehaviour)
 
 
 def test_a_robot_without_legs_cannot_be_asked_to_stand_up() -> None:

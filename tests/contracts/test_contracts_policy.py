@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import ConfigurationError, PolicyError, PolicyMismatchError
 from deal_hw.policy import (
     MAX_SPEC_CHARACTERS,
@@ -201,9 +201,9 @@ def test_specs_made_in_python_are_checked_too() -> None:
 def test_every_known_quantity_is_built(quantity: Quantity) -> None:
     """And all differ: two that read the same would be a quantity that is taken for another."""
     spec = dataclasses.replace(
-        feedback_spec(DRIVEN),
+        feedback_spec(DRIVER),
         observation=tuple(
-            ObservationTerm(q, "z" if q in BASE else DRIVEN.joint_names[0], 1.0, int(q == "action"))
+            ObservationTerm(q, "z" if q in BASE else DRIVER.joint_names[0], 1.0, int(q == "action"))
             for q in (quantity, *(other for other in get_args(Quantity) if other != quantity))
         ),
     )
@@ -285,7 +285,7 @@ def test_the_units_of_positions_are_compared_where_they_are_noted() -> None:
 def test_a_policy_of_another_robot_is_refused_in_a_few_words() -> None:
     """Three fields with short values, the others by name."""
     with pytest.raises(PolicyMismatchError, match="policy has 'go2', robot has 'cartpole'") as caught:
-        feedback_spec(DRIVEN).check_fits(DESCRIPTION)
+        feedback_spec(DRIVER).check_fits(DESCRIPTION)
     words = str(caught.value)
     assert len(words) < 500
     assert "also: position_units, default_position" in words and "speed_limit" in words

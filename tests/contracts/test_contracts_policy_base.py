@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from deal_hw.drivers.go2.description import DESCRIPTION
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.errors import ConfigurationError
 from deal_hw.policy import (
     ObservationBuilder,

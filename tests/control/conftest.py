@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.data.record import CycleRecord
+from deal_hw.data.recording.record import CycleRecord
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.control.velocity import FixedVelocity
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import PolicyError, PolicyMismatchError
 from deal_hw.policy import Observation, ObservationBuilder, ObservationTerm, PolicySpec
 from deal_hw.testing.linear_policy import feedback_spec
@@ -24,14 +24,14 @@ SENSED = tuple(
     for quantity in ("gravity", "angular_velocity", "command")
     for axis in AXES
 )
-JOINTS = tuple(ObservationTerm("position", name, 1.0) for name in DRIVEN.joint_names[:2])
+JOINTS = tuple(ObservationTerm("position", name, 1.0) for name in DRIVER.joint_names[:2])
 
 
 class Ear:
     """A policy that stands still and remembers what it observed."""
 
     def __init__(self, *terms: ObservationTerm) -> None:
-        self.spec: PolicySpec = dataclasses.replace(feedback_spec(DRIVEN), observation=terms)
+        self.spec: PolicySpec = dataclasses.replace(feedback_spec(DRIVER), observation=terms)
         self.heard: list[Observation] = []
 
     def reset(self) -> None:
@@ -50,7 +50,7 @@ def state(orientation: FloatArray, angular_velocity: FloatArray, offset: float =
         foot_force=np.zeros(4), temperature=np.full(12, 30.0), lost=np.zeros(12, dtype=np.int64), battery=0.9,
         voltage=30.0, current=1.0, sticks=np.zeros(4), buttons=0,
     )  # fmt: skip
-    position = np.array(DRIVEN.default_position) + offset
+    position = np.array(DRIVER.default_position) + offset
     return RobotState(position, np.zeros(12), np.zeros(12), 0, 0, 0, -1, -1, Status.ARMED, body)
 
 
@@ -62,14 +62,14 @@ def wxyz(turn: Rotation) -> FloatArray:
 def test_gravity_turning_and_command_by_hand() -> None:
     """Rolled right by 30 degrees: gravity is down and to the right, (0, -1/2, -cos 30)."""
     ear = Ear(*SENSED, *JOINTS)
-    behaviour = PolicyBehaviour(ear, DRIVEN, FixedVelocity((0.3, -0.1, 0.2)))
+    behaviour = PolicyBehaviour(ear, DRIVER, FixedVelocity((0.3, -0.1, 0.2)))
     turn = Rotation.from_rotvec([np.pi / 6, 0, 0])
     command = behaviour.command(state(wxyz(turn), np.array([0.1, 0.2, 0.3]), 0.05), 0.0)
     half = np.sqrt(3) / 2
     np.testing.assert_allclose(
         ear.heard[0], [0, -0.5, -half, 0.1, 0.2, 0.3, 0.3, -0.1, 0.2, 0.05, 0.05], atol=1e-6
     )
-    np.testing.assert_array_equal(command.position_target, DRIVEN.default_position)
+    np.testing.assert_array_equal(command.position_target, DRIVER.default_position)
     assert ear.heard[0].dtype == np.float32
 
 
@@ -79,7 +79,7 @@ def test_any_orientation_gives_gravity_as_scipy_has_it(values: list[float], nega
     """Both quaternions of a rotation are the same orientation; turning about the vertical changes nothing."""
     turn, gyro = Rotation.from_rotvec(values[:3]), np.array(values[3:])
     ear = Ear(*SENSED)
-    behaviour = PolicyBehaviour(ear, DRIVEN)
+    behaviour = PolicyBehaviour(ear, DRIVER)
     quaternion = wxyz(turn)
     behaviour.command(state(-quaternion if negated else quaternion, gyro), 0.0)
     turned = Rotation.from_rotvec([0, 0, 1.0]) * turn
@@ -92,7 +92,7 @@ def test_on_the_robot_as_in_training() -> None:
     """The same builder, fed with a simulator's whole coordinates, gives the same observation."""
     terms = (*SENSED, *JOINTS, ObservationTerm("gravity", "y", 2.0, 1), ObservationTerm("heading", "x", 1.0))
     ear = Ear(*terms)
-    behaviour = PolicyBehaviour(ear, DRIVEN, FixedVelocity((0.5, 0.0, 0.0)))
+    behaviour = PolicyBehaviour(ear, DRIVER, FixedVelocity((0.5, 0.0, 0.0)))
     trained = ObservationBuilder(ear.spec)
     trained.command = np.array([0.5, 0.0, 0.0])
     rng = np.random.default_rng(3)
@@ -100,7 +100,7 @@ def test_on_the_robot_as_in_training() -> None:
         turn, gyro = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)), rng.normal(size=3)
         behaviour.command(state(wxyz(turn), gyro, 0.1), 0.0)
         # A simulator also knows where the base is and how fast it moves along.
-        x = np.concatenate([rng.normal(size=3), turn.as_rotvec(), np.array(DRIVEN.default_position) + 0.1])
+        x = np.concatenate([rng.normal(size=3), turn.as_rotvec(), np.array(DRIVER.default_position) + 0.1])
         v = np.concatenate([rng.normal(size=3), gyro, np.zeros(12)])
         np.testing.assert_allclose(ear.heard[-1], trained.build(x, v), atol=1e-6)
         trained.record_action(np.zeros(12))
@@ -116,14 +116,14 @@ def test_on_the_robot_as_in_training() -> None:
 def test_what_no_sensor_reports_is_refused(term: ObservationTerm, words: str) -> None:
     """Before the robot is touched, not in the first cycle."""
     with pytest.raises(PolicyMismatchError, match=f"{words}, which no sensor of 'go2' reports"):
-        PolicyBehaviour(Ear(*SENSED, term), DRIVEN)
+        PolicyBehaviour(Ear(*SENSED, term), DRIVER)
 
 
 def test_states_without_a_body_are_an_error() -> None:
     """Zeros in its place would be an upright base, whatever the robot does."""
     bare = dataclasses.replace(state(np.array([1.0, 0, 0, 0]), np.zeros(3)), body=None)
     with pytest.raises(PolicyError, match="observes the base's orientation, and this robot's states carry"):
-        PolicyBehaviour(Ear(*SENSED), DRIVEN).command(bare, 0.0)
+        PolicyBehaviour(Ear(*SENSED), DRIVER).command(bare, 0.0)
     blind = Ear(*JOINTS)
-    PolicyBehaviour(blind, DRIVEN).command(bare, 0.0)
+    PolicyBehaviour(blind, DRIVER).command(bare, 0.0)
     np.testing.assert_array_equal(blind.heard, [[0.0, 0.0]])

@@ -20,12 +20,12 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
-from deal_hw.drivers.go2.robot import Go2HungRobot
-from deal_hw.drivers.go2.truth import nominal_truth as go2_truth
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import nominal_truth as go2_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError
@@ -357,9 +357,9 @@ class Hung:
 
     def __init__(self) -> None:
         self.clock = LimitedClock()
-        self.device = Go2Device(go2_truth("ideal"), suspended=True)
+        self.device = Go2Device(go2_truth("ideal"), on_stand=True)
         self.wire = VirtualTopics(self.device, self.clock)
-        self.robot = Go2HungRobot(self.wire, self.clock)
+        self.robot = Go2OnStandRobot(self.wire, self.clock)
         self.beats: list[tuple[str, float]] = []
         self.at: Callable[[str], None] = lambda phase: None
 
@@ -371,7 +371,7 @@ class Hung:
     def run(self, **config: Any) -> LoopReport:
         """Hold the standing pose for half a second."""
         return ControlLoop(
-            self.robot, HoldBehaviour(HUNG), Safety(HUNG), self.clock, lambda record: True,
+            self.robot, HoldBehaviour(ON_STAND), Safety(ON_STAND), self.clock, lambda record: True,
             LoopConfig(duration_s=0.5, **config), progress=self.progress,
         ).run()  # fmt: skip
 

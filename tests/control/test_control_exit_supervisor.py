@@ -19,7 +19,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control import supervisor as module
 from deal_hw.control.handover import Beat
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
-from deal_hw.data.recorder_launch import RecorderOutcome
+from deal_hw.data.recording.recorder_launch import RecorderOutcome
 
 CHILD = """
 import json, os, signal, socket, struct, sys, time

@@ -13,7 +13,7 @@ import pytest
 
 from deal_hw.control.handover import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, hurry
-from deal_hw.data.record import CycleRecord, decode
+from deal_hw.data.recording.record import CycleRecord, decode
 from deal_hw.errors import DatasetError
 from deal_hw.transport import Message
 

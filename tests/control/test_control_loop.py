@@ -15,7 +15,7 @@ from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.loop import ControlLoop, LoopConfig, Outcome
 from deal_hw.control.passive import PassiveConfig
 from deal_hw.control.safety import Safety
-from deal_hw.data.record import CycleFlag, CycleRecord
+from deal_hw.data.recording.record import CycleFlag, CycleRecord
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.robot import CartpoleRobot

@@ -17,21 +17,21 @@ from deal_hw.control.handover import RUNNING
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.safety import CycleInput, Safety, Verdict
-from deal_hw.data.record import CycleRecord, encode
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF, kind_of
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.faults import FaultPlan
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.data.recording.record import CycleRecord, encode
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF, kind_of
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.faults import FaultPlan
+from deal_hw.drivers.go2.emulator.truth import nominal_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowState,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.truth import nominal_truth
+from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.transport import Message
 from deal_hw.types import JointCommand, RobotState, Status
@@ -80,7 +80,7 @@ class Spy(Safety):
     """The safety module, with a copy of what it was told."""
 
     def __init__(self) -> None:
-        super().__init__(DRIVEN)
+        super().__init__(DRIVER)
         self.told: list[CycleInput] = []
         self.said: list[Verdict] = []
 
@@ -110,7 +110,7 @@ class LegRig:
 
     def loop(self, behaviour: Behaviour | None = None, **config: Any) -> ControlLoop:
         """Return a loop that stands up, does something and lies down."""
-        whole = PostureBehaviour(behaviour or HoldBehaviour(DRIVEN), DRIVEN, HOLD_S, POSTURE)
+        whole = PostureBehaviour(behaviour or HoldBehaviour(DRIVER), DRIVER, HOLD_S, POSTURE)
         settings = LoopConfig(**{"duration_s": whole.duration_s, **config})
         return ControlLoop(
             self.robot, whole, self.safety, self.clock, self.sink, settings,
@@ -143,7 +143,7 @@ class At:
     action = None
 
     def __init__(self, cycle: int, act: Callable[[], None]) -> None:
-        self._hold, self._left, self._act = HoldBehaviour(DRIVEN), cycle, act
+        self._hold, self._left, self._act = HoldBehaviour(DRIVER), cycle, act
         self.seen: list[RobotState] = []
 
     def reset(self) -> None:
@@ -205,7 +205,7 @@ def test_the_safety_module_knows_when_a_command_was_last_sent(stood: Stood) -> N
 
 def test_the_heartbeat_is_as_short_as_the_robot_asks_for(stood: Stood) -> None:
     """A Go2 holds its last target for ever, so its supervisor waits for 0.2 s, not for the usual 0.3 s."""
-    assert DRIVEN.limits.silence_s == 0.2
+    assert DRIVER.limits.silence_s == 0.2
     assert {silence_s for phase, silence_s in stood[0].beats if phase == RUNNING} == {0.2}
     assert [phase for phase, _ in stood[0].beats if phase != RUNNING] == [
         "connecting", "homing", "arming", "making passive", "handing back",
@@ -368,19 +368,19 @@ def test_a_dry_run_sends_nothing_at_all() -> None:
 def test_a_robot_that_hangs_needs_no_standing_up() -> None:
     """Its legs go to the default pose in the air, without a floor, and are damped at the end."""
     clock = VirtualClock(10**9)
-    device = Go2Device(nominal_truth("ideal"), suspended=True)
-    robot = Go2HungRobot(VirtualTopics(device, clock), clock)
+    device = Go2Device(nominal_truth("ideal"), on_stand=True)
+    robot = Go2OnStandRobot(VirtualTopics(device, clock), clock)
     records: list[CycleRecord] = []
 
     def sink(record: CycleRecord) -> bool:
         records.append(record)
         return True
 
-    hold, safety = HoldBehaviour(HUNG), Safety(HUNG)
+    hold, safety = HoldBehaviour(ON_STAND), Safety(ON_STAND)
     report = ControlLoop(robot, hold, safety, clock, sink, LoopConfig(duration_s=2.5)).run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.FINISHED, True), report.reason
     last = records[-2].states[-1]
-    np.testing.assert_allclose(last.position, HUNG.default_position, atol=0.12)
+    np.testing.assert_allclose(last.position, ON_STAND.default_position, atol=0.12)
     assert device.log.changes[-1][2] == DAMPING
 
 

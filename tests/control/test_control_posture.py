@@ -11,7 +11,7 @@ from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.description import DESCRIPTION as GO2
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray, RobotState, Status
 

@@ -27,8 +27,8 @@ from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import InterruptedRunError, run_episodes
 from deal_hw.control.handover import RUNNING, Beat
 from deal_hw.control.loop import Outcome
-from deal_hw.data.dataset import Dataset
-from deal_hw.data.reader import read_episode
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.reader import read_episode
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.transports.serial_transport import SerialTransport
@@ -499,7 +499,8 @@ def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy
     program = """
         import json, sys
         import deal_hw.cli.collect, deal_hw.cli.deploy, deal_hw.cli.replay, deal_hw.cli.control_process
-        import deal_hw.data.dataset, deal_hw.data.recorder_process, deal_hw.policies.onnx_runtime
+        import deal_hw.data.recording.dataset, deal_hw.data.recording.recorder_process
+        import deal_hw.policies.onnx_runtime
         from deal_hw.cli.run_plan import RunPlan, make_behaviour
         from deal_hw.clock import MonotonicClock
         from deal_hw.drivers import make_robot

@@ -21,8 +21,8 @@ from deal_hw.cli.supervised import run_episodes
 from deal_hw.control.handover import RUNNING, Beat
 from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
-from deal_hw.data.dataset import Dataset
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError
 from deal_hw.types import Status
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from deal_hw.control.safety_filter import SafetyFilter, is_finite, keep_effort
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.go2.driven import LEG_LIMITS
+from deal_hw.drivers.go2.descriptions.driver import LEG_LIMITS
 from deal_hw.types import FloatArray, JointCommand
 
 LEGS = dataclasses.replace(LEG_LIMITS, effort=(10.0,), flail_velocity=(4.0, 5.0))

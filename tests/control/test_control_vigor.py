@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
 from deal_hw.control.safety_filter import SafetyFilter
 from deal_hw.control.vigor import GENTLEST, LIVELIEST, VigorSearch, shortfalls, with_vigor
-from deal_hw.data.excitation import Excitation
+from deal_hw.data.recording.excitation import Excitation
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import RobotState, Status

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from deal_hw.cli.data import Info, Repair, Verify, data
-from deal_hw.data.dataset import Dataset
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
 

@@ -13,14 +13,14 @@ from mcap.records import Channel, Chunk
 from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.clock import VirtualClock
-from deal_hw.data import recorder as recorder_module
-from deal_hw.data.mcap_scan import Found, messages, scan
-from deal_hw.data.reader import read_episode, read_trajectory
-from deal_hw.data.record import CycleRecord, decode, encode
-from deal_hw.data.recorder import EpisodeRecorder
-from deal_hw.data.repair import repair, verify
-from deal_hw.data.schemas import CHANNELS
-from deal_hw.drivers.go2.driven import DRIVEN
+from deal_hw.data.recording import recorder as recorder_module
+from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.reader import read_episode, read_trajectory
+from deal_hw.data.recording.record import CycleRecord, decode, encode
+from deal_hw.data.recording.recorder import EpisodeRecorder
+from deal_hw.data.recording.repair import repair, verify
+from deal_hw.data.recording.schemas import CHANNELS
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.types import BodyState, BodyTrajectory, RobotState, Status, Trajectory
 
 STATES_EACH = 10
@@ -84,7 +84,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
     def make(bodies: Bodies = everywhere, *, torn: bool = False) -> Path:
         path = tmp_path / "episode.mcap"
         clock = VirtualClock(START_NS)
-        recorder = EpisodeRecorder(path, DRIVEN.to_json(), {"purpose": "test"}, clock)
+        recorder = EpisodeRecorder(path, DRIVER.to_json(), {"purpose": "test"}, clock)
         recorder.open()
         for number in range(CYCLES):
             clock.sleep_until_ns(START_NS + (number + 1) * CYCLE_NS)

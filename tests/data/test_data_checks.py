@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deal_hw.data.checks import Severity, Verdict, check, worst
-from deal_hw.data.excitation import excitation
+from deal_hw.data.recording.excitation import excitation
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict, check, worst
 from deal_hw.types import Status, Trajectory
 
 MakeTrajectory = Callable[..., Trajectory]

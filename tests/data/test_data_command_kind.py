@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.data.checks import Severity
-from deal_hw.data.command_kind import command_kind
+from deal_hw.data.checks.command_kind import command_kind
 from deal_hw.data.importing.load import load_tables
 from deal_hw.data.importing.table import Table
+from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.types import FloatArray
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"

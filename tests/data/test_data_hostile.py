@@ -17,14 +17,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from deal_hw.data import files, mcap_scan
-from deal_hw.data.dataset import Dataset, digest_of
-from deal_hw.data.mcap_scan import Found, Lost, messages, scan
-from deal_hw.data.reader import read_episode
-from deal_hw.data.recorder import LIBRARY, METADATA_NAME
-from deal_hw.data.repair import repair, verify
+from deal_hw.data import files
+from deal_hw.data.recording import mcap_scan
+from deal_hw.data.recording.dataset import Dataset, digest_of
+from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.reader import read_episode
+from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
+from deal_hw.data.recording.repair import repair, verify
+from deal_hw.data.recording.schemas import EVENT, STATE, message_type
 from deal_hw.data.run_folder import RunFolder
-from deal_hw.data.schemas import EVENT, STATE, message_type
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
 

@@ -15,12 +15,12 @@ import pytest
 from deal_hw.cli.data import data
 from deal_hw.cli.data_import import Export, Import
 from deal_hw.cli.main import parse
-from deal_hw.data.checks import Severity, worst
-from deal_hw.data.dataset import Dataset
+from deal_hw.data.checks.plausibility import examine
 from deal_hw.data.importing.columns import parse_column_map, read_column_map
 from deal_hw.data.importing.load import load_recordings, load_tables
 from deal_hw.data.importing.table import Table
-from deal_hw.data.plausibility import examine
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.telemetry_checks import Severity, worst
 from deal_hw.errors import ConfigurationError, DatasetError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,7 +18,7 @@ from deal_hw.data.importing.table import Table
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
-from deal_hw.sim.episode import align
+from deal_hw.sim.recordings.episode import align
 from deal_hw.types import Status
 
 MakeTable = Callable[..., Table]

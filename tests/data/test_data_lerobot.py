@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.data.export_lerobot import export_lerobot
+from deal_hw.data.export.lerobot import export_lerobot
 from deal_hw.data.importing import lerobot_source
 from deal_hw.data.importing.grid import period_of, to_trajectories
 from deal_hw.data.importing.lerobot_source import read_lerobot

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -12,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from deal_hw.data.checks import Severity, Verdict, worst
+from deal_hw.data.checks.joint_match import best_assignment
+from deal_hw.data.checks.plausibility import examine, require
 from deal_hw.data.importing.table import Table
-from deal_hw.data.joint_match import best_assignment
-from deal_hw.data.plausibility import examine, require
-from deal_hw.errors import DatasetError
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict, worst
+from deal_hw.errors import DatasetError, MissingExtraError
 
 MakeTable = Callable[..., Table]
 LIMITS = np.array([[-1.0, 1.0]] * 3)
@@ -265,3 +266,10 @@ def test_best_assignment_is_the_best(score: np.ndarray) -> None:
     assert sorted(found) == list(rows)
     best = max(score[rows, list(order)].sum() for order in itertools.permutations(rows))
     assert score[rows, found].sum() == pytest.approx(best, abs=1e-9)
+
+
+def test_without_scipy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, make_table: MakeTable) -> None:
+    """The base install has no scipy; importing recordings of others needs it, and says what to install."""
+    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
+    with pytest.raises(MissingExtraError, match=r"scipy is not installed.*deal-hw\[sim\]"):
+        examine(make_table())

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.data.record import MAX_DATAGRAM_BYTES, CycleRecord, decode, encode
+from deal_hw.data.recording.record import MAX_DATAGRAM_BYTES, CycleRecord, decode, encode
 from deal_hw.errors import ConfigurationError, ProtocolError, VersionMismatchError
 from deal_hw.transport import Message
 from deal_hw.types import BodyState, Event, JointCommand, RobotState, Status

@@ -14,11 +14,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.clock import VirtualClock
-from deal_hw.data.mcap_scan import Found, messages, scan
-from deal_hw.data.reader import read_episode, read_trajectory, read_wire
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
-from deal_hw.data.repair import verify
+from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.reader import read_episode, read_trajectory, read_wire
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
+from deal_hw.data.recording.repair import verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.data.reader import read_trajectory
-from deal_hw.data.record import CycleRecord, encode
-from deal_hw.data.recorder_launch import RecorderHandle, start_recorder
-from deal_hw.data.repair import repair, verify
+from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.recording.record import CycleRecord, encode
+from deal_hw.data.recording.recorder_launch import RecorderHandle, start_recorder
+from deal_hw.data.recording.repair import repair, verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError, TornRecordingError
 

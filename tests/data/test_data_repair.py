@@ -17,9 +17,9 @@ from mcap.records import Chunk
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 
-from deal_hw.data.mcap_scan import Found, messages, scan
-from deal_hw.data.reader import read_episode, read_trajectory
-from deal_hw.data.repair import repair, verify
+from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.reader import read_episode, read_trajectory
+from deal_hw.data.recording.repair import repair, verify
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
 
 WriteEpisode = Callable[..., Path]

@@ -69,7 +69,7 @@ def test_data_loads_nothing_heavy() -> None:
     """The whole data package imports without mujoco, torch, scipy and rerun."""
     code = (
         "import sys, pkgutil, importlib, deal_hw.data as d\n"
-        "[importlib.import_module('deal_hw.data.' + m.name) for m in pkgutil.iter_modules(d.__path__)]\n"
+        "[importlib.import_module(m.name) for m in pkgutil.walk_packages(d.__path__, 'deal_hw.data.')]\n"
         "import deal_hw.cli.data\n"
         "from deal_hw.data.run_folder import versions; versions()\n"
         "print(sorted({'mujoco', 'torch', 'scipy', 'rerun', 'onnxruntime'} & set(sys.modules)))"

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
-from deal_hw.data.schemas import (
+from deal_hw.data.recording.schemas import (
     CHANNELS,
     COMMAND,
     CYCLE,

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.data.checks import Severity
-from deal_hw.data.slip import LEAST_S, Slip, find_slip, slip_verdict
+from deal_hw.data.checks.slip import LEAST_S, Slip, find_slip, slip_verdict
+from deal_hw.data.recording.telemetry_checks import Severity
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray

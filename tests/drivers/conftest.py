@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.low_state import LowStateFrame
-from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, decode_low_state
-from deal_hw.drivers.go2.rpc import Request, Response, decode_response, encode_request
-from deal_hw.drivers.go2.sport_controller import LYING, STANDING
-from deal_hw.drivers.go2.truth import nominal_truth
+from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.emulator.truth import nominal_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder, decode_low_state
+from deal_hw.drivers.go2.messages.rpc import Request, Response, decode_response, encode_request
 from deal_hw.types import FloatArray
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,7 +33,7 @@ class Go2Bench:
     """An emulated Go2 in virtual time and a client of it; sport mode is released unless told otherwise."""
 
     def __init__(self, **options: Any) -> None:
-        from deal_hw.drivers.go2.device import Go2Device
+        from deal_hw.drivers.go2.emulator.device import Go2Device
 
         truth = options.pop("truth", nominal_truth())
         self.device = Go2Device(truth, **{"sport": "", **options})

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.fake import FakeGo2
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowCommandEncoder,
     decode_low_command,
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.scripted import ScriptedGo2
-from deal_hw.drivers.go2.topics import LOW_COMMAND, LOW_STATE, TYPES
+from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE, TYPES
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.dds_types import COMPLETE, MINIMAL
 from deal_hw.transport import Message, WireOptions
@@ -99,7 +99,7 @@ def test_a_0102_user_and_we_as_robot_exchange_commands_and_states(dds_peer: Path
     """The other way round, as our emulator serves a client of the vendor's SDK."""
     wire = DdsTransport("127.0.0.1", MonotonicClock(), WireOptions(domain=dds_domain))
     wire.declare(publish=[LOW_STATE], subscribe=[LOW_COMMAND])
-    scripted, received = ScriptedGo2(), 0
+    scripted, received = FakeGo2(), 0
     with wire, running(dds_peer, "user", dds_domain, 60) as user:
         while received < MESSAGES:
             command = decode_low_command(wire.receive(10.0).payload)

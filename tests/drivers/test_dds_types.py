@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.drivers.go2.topics import TYPES
+from deal_hw.drivers.go2.messages.topics import TYPES
 from deal_hw.drivers.transports.dds_types import (
     COMPLETE,
     MINIMAL,

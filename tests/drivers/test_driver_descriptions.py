@@ -27,8 +27,8 @@ from deal_hw.drivers.ant import model as ant_model
 from deal_hw.drivers.ant.description import DEFAULT, PAPER
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.model import load_model, model_with
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.sim.parameters import KIND_TABLE, check_space
 
 EVERY = [(robot, name) for robot in SPACES for name in parameter_spaces(robot)]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.go2 import claim as module
 from deal_hw.drivers.go2.claim import ASKING, HELD, RELEASED, WireClaim, read_claim
-from deal_hw.drivers.go2.rpc import Request, encode_request
-from deal_hw.drivers.go2.topics import CLAIM
+from deal_hw.drivers.go2.messages.rpc import Request, encode_request
+from deal_hw.drivers.go2.messages.topics import CLAIM
 from deal_hw.drivers.transports.interfaces import list_interfaces
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import PortBusyError, TransportLostError, TransportTimeoutError

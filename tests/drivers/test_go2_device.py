@@ -10,17 +10,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as RECORDED
+from deal_hw.drivers.go2.descriptions.on_stand_recording import parameter_space
+from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowStateFrame,
 )
-from deal_hw.drivers.go2.sport_controller import LYING, STANDING
-from deal_hw.drivers.go2.sport_state import decode_sport_state
-from deal_hw.drivers.go2.suspended import DESCRIPTION as SUSPENDED
-from deal_hw.drivers.go2.suspended import parameter_space
-from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
-from deal_hw.sim.model import load_model, model_with
+from deal_hw.drivers.go2.messages.sport_state import decode_sport_state
+from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.types import FloatArray
 
 ZERO = np.zeros(12)
@@ -74,7 +74,7 @@ def test_damping_and_mode_0_let_it_sink(make_go2: Any, command: LowCommand) -> N
 
 
 def test_before_the_first_command_the_motors_are_off(make_go2: Any) -> None:
-    """At power-up without sport mode no drive gives anything, and its mode says so."""
+    """At power-up without sport mode no motor gives anything, and its mode says so."""
     state = make_go2().run(2)[-1].values()
     assert not state.effort.any()
     assert not state.mode.any()
@@ -88,7 +88,7 @@ def test_stop_values_turn_a_loop_off(make_go2: Any) -> None:
 
 def test_suspended_the_legs_follow_and_the_base_stays(make_go2: Any) -> None:
     """In the air the joints reach the pose but for gravity's share, and nothing else moves."""
-    bench = make_go2(suspended=True)
+    bench = make_go2(on_stand=True)
     states = bench.run(1500, servo(STANDING))
     assert np.abs(states[-1].position - STANDING).max() < 0.08
     assert bench.device.base_height == 0.6
@@ -170,7 +170,7 @@ def test_bad_commands_are_not_obeyed(make_go2: Any, what: str) -> None:
 
 
 def _with_nan(payload: bytes) -> bytes:
-    from deal_hw.drivers.go2.wire import low_command_image, words_crc
+    from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
 
     changed = bytearray(payload)
     changed[28:32] = np.float32(np.nan).tobytes()
@@ -200,18 +200,18 @@ def test_a_command_acts_after_the_hidden_latency(make_go2: Any) -> None:
 
 def test_hidden_gains_decide_the_effort(make_go2: Any) -> None:
     """Half the stiffness gives 0.5 * 10 * 0.2 = 1.0 N·m at 0.2 rad; feed-forward acts as told."""
-    bench = make_go2(truth=nominal_truth(stiffness=(0.5,) * 12), suspended=True)
+    bench = make_go2(truth=nominal_truth(stiffness=(0.5,) * 12), on_stand=True)
     q = bench.device.true_position
     state = bench.run(1, servo(q + 0.2, 10.0, 0.0))[0]
     assert np.allclose(state.effort, 1.0, atol=1e-6)
     fed = dataclasses.replace(servo(q, 0.0, 0.0), effort=np.full(12, 0.7))
-    assert np.allclose(make_go2(suspended=True).run(1, fed)[0].effort, 0.7, atol=1e-6)
+    assert np.allclose(make_go2(on_stand=True).run(1, fed)[0].effort, 0.7, atol=1e-6)
 
 
 def test_the_hidden_encoder_bias_is_reported_and_servoed_on(make_go2: Any) -> None:
-    """Reported minus true is the bias, and a stiff drive brings the reported position to the target."""
+    """Reported minus true is the bias, and a stiff motor brings the reported position to the target."""
     bias = tuple(0.01 * (i - 6) for i in range(12))
-    bench = make_go2(truth=nominal_truth(encoder_bias=bias), suspended=True)
+    bench = make_go2(truth=nominal_truth(encoder_bias=bias), on_stand=True)
     state = bench.run(1500, servo(STANDING, 300.0))[-1]
     assert np.abs(state.position - STANDING).max() < 0.02
     assert np.allclose(state.position - bench.device.true_position, bias, atol=2e-3)
@@ -224,7 +224,7 @@ def test_hidden_parameters_change_the_motion(make_go2: Any, what: str) -> None:
     for factor in (1.0, 2.0):
         nominal = nominal_truth()
         changed = dataclasses.replace(nominal, **{what: tuple(factor * v for v in getattr(nominal, what))})
-        bench = make_go2(truth=changed, suspended=True)
+        bench = make_go2(truth=changed, on_stand=True)
         paths.append(np.array([s.position for s in bench.run(300, servo(STANDING, 20.0, 1.5))]))
     assert np.abs(paths[0] - paths[1]).max() > 1e-3
 
@@ -232,15 +232,15 @@ def test_hidden_parameters_change_the_motion(make_go2: Any, what: str) -> None:
 def test_the_ideal_emulator_is_the_calibrators_model(make_go2: Any) -> None:
     """With the true parameters in it, the engine at 1 ms repeats the emulated motion to a microradian."""
     truth = draw_truth("ideal", 1)
-    bench = make_go2(truth=truth, suspended=True)
+    bench = make_go2(truth=truth, on_stand=True)
     bench.run(1500, servo(STANDING, 20.0, 1.5))
     start, speed = bench.device.true_position, bench.run(1)[-1].velocity
-    robot = load_model(SUSPENDED, step_s=1e-3)
+    robot = load_model(RECORDED, step_s=1e-3)
     space = parameter_space()
     known = truth.parameters(20.0, 1.5)
     model = model_with(robot, space, np.array([known[name] for name in space.names]))
     data = mujoco.MjData(model)
-    bench = make_go2(truth=truth, suspended=True)
+    bench = make_go2(truth=truth, on_stand=True)
     bench.run(1500, servo(STANDING, 20.0, 1.5))
     data.qpos[:], data.qvel[:] = start, speed
     for step in range(400):
@@ -255,7 +255,7 @@ def test_the_ideal_emulator_is_the_calibrators_model(make_go2: Any) -> None:
 def test_gains_that_a_real_drive_takes_do_not_shake_it(make_go2: Any) -> None:
     """Kd 20 on the lightest joints that can be drawn is damping, not an oscillation of the integrator."""
     truth = nominal_truth(armature=(0.002,) * 12)
-    bench = make_go2(truth=truth, suspended=True)
+    bench = make_go2(truth=truth, on_stand=True)
     bench.ramp(STANDING)
     assert fast(bench.run(1200, servo(STANDING, 100.0, 20.0))[550:]) < 0.01
 
@@ -264,7 +264,7 @@ def test_a_seed_decides_everything(make_go2: Any) -> None:
     """The same seed gives the same bytes, another seed others, in the noisiest profile."""
     runs = []
     for seed in (3, 3, 4):
-        bench = make_go2(truth=draw_truth("realistic", seed), suspended=True)
+        bench = make_go2(truth=draw_truth("realistic", seed), on_stand=True)
         bench.run(200, servo(STANDING))
         runs.append(bench.out)
     assert runs[0] == runs[1]
@@ -273,8 +273,8 @@ def test_a_seed_decides_everything(make_go2: Any) -> None:
 
 def test_profiles_differ_in_noise_alone_where_nothing_moves(make_go2: Any) -> None:
     """At rest "ideal" repeats itself to the bit, "sensor" does not; both have whole encoder steps or none."""
-    ideal = make_go2(truth=nominal_truth("ideal"), suspended=True)
-    noisy = make_go2(truth=nominal_truth("sensor"), suspended=True)
+    ideal = make_go2(truth=nominal_truth("ideal"), on_stand=True)
+    noisy = make_go2(truth=nominal_truth("sensor"), on_stand=True)
     assert np.std([s.velocity[0] for s in ideal.run(300)]) < np.std([s.velocity[0] for s in noisy.run(300)])
     steps = noisy.states()[-1].position / (2 * np.pi / 32768)
     assert np.allclose(steps, np.rint(steps), atol=2e-3)

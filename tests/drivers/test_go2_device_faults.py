@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.description import JOINTS
-from deal_hw.drivers.go2.faults import MOMENTS, FaultPlan
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.drivers.go2.emulator.faults import MOMENTS, FaultPlan
+from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
+from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
 )
-from deal_hw.drivers.go2.remote import Remote, button_mask, decode_remote, decode_wireless
-from deal_hw.drivers.go2.remote_script import RemoteMoment
-from deal_hw.drivers.go2.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.messages.remote import Remote, button_mask, decode_remote, decode_wireless
 from deal_hw.types import FloatArray
 
 ZERO = np.zeros(12)
@@ -56,7 +56,7 @@ def test_freeze_says_nothing_and_still_hears(make_go2: Any) -> None:
 
 
 def test_a_cut_is_silent_both_ways_and_ends(make_go2: Any) -> None:
-    """For 0.3 s nothing goes out or is heard, and the drives hold their last command; then all is well."""
+    """For 0.3 s nothing goes out or is heard, and the motors hold their last command; then all is well."""
     bench = faulty(make_go2, "cut", cut_s=0.3)
     assert bench.out == []
     bench.run(150, DAMP)
@@ -138,7 +138,7 @@ def test_a_push_moves_the_base(make_go2: Any) -> None:
 def test_shares_of_states(make_go2: Any) -> None:
     """A tenth of 1000 states each: lost, doubled, late and corrupt ones come in about that number."""
     plan = FaultPlan(drop=0.1, duplicate=0.1, reorder=0.1, corrupt=0.1)
-    bench = make_go2(plan=plan, suspended=True)
+    bench = make_go2(plan=plan, on_stand=True)
     bench.out = [message for _ in range(2000) for message in bench.device.tick()]
     counts = bench.device.report()["wire_faults"]
     assert all(60 < count < 140 for count in counts.values())
@@ -179,7 +179,7 @@ def test_faults_wait_for_the_first_stiff_command(make_go2: Any) -> None:
 @pytest.mark.parametrize("name", MOMENTS)
 def test_each_fault_begins_at_once_when_asked(make_go2: Any, name: str) -> None:
     """A test may begin any fault itself."""
-    bench = make_go2(suspended=True)
+    bench = make_go2(on_stand=True)
     bench.device.begin_fault(name)
     bench.device.tick()
     assert bench.device.log.faults[0].name == name
@@ -188,15 +188,15 @@ def test_each_fault_begins_at_once_when_asked(make_go2: Any, name: str) -> None:
 def test_an_unknown_fault_is_refused(make_go2: Any) -> None:
     """A name that is no fault is an error."""
     with pytest.raises(ValueError, match="no such fault: 'rain'"):
-        make_go2(suspended=True).device.begin_fault("rain")
+        make_go2(on_stand=True).device.begin_fault("rain")
 
 
 def test_the_remote_follows_its_script(make_go2: Any) -> None:
     """A stick moves at 20 ms, the remote goes out of reach at 40 ms; without one the bytes are zeros."""
     script = (RemoteMoment(20, Remote(left_y=0.5)), RemoteMoment(40, None))
-    states = make_go2(suspended=True, remote=script).run(60)
+    states = make_go2(on_stand=True, remote=script).run(60)
     seen = [decode_remote(state.remote) for state in states]
     assert seen[5] == Remote()
     assert seen[15] == Remote(left_y=0.5)
     assert seen[25] is None
-    assert make_go2(suspended=True, remote=None).run(2)[-1].remote == bytes(40)
+    assert make_go2(on_stand=True, remote=None).run(2)[-1].remote == bytes(40)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
     LowStateFrame,
     decode_low_command,
 )
-from deal_hw.drivers.go2.rpc import Response
-from deal_hw.drivers.go2.sport_controller import LYING, STANDING
+from deal_hw.drivers.go2.messages.rpc import Response
 from deal_hw.types import FloatArray
 
 ZERO = np.zeros(12)

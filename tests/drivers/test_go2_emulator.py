@@ -15,14 +15,14 @@ from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.cli.emulate_go2 import Go2Options, free_port, make_transport, summary
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.emulator import Go2Emulator
-from deal_hw.drivers.go2.faults import SHARES, FaultPlan, Go2Faults
-from deal_hw.drivers.go2.protocol import LowCommand, LowCommandEncoder, decode_low_state
-from deal_hw.drivers.go2.rpc import Request, decode_response, encode_request
-from deal_hw.drivers.go2.sport_controller import STANDING
-from deal_hw.drivers.go2.truth import nominal_truth
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
+from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, Go2Faults
+from deal_hw.drivers.go2.emulator.sport_controller import STANDING
+from deal_hw.drivers.go2.emulator.truth import nominal_truth
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder, decode_low_state
+from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError, UnknownNameError
 from deal_hw.transport import Message, TopicTransport, WireOptions
 

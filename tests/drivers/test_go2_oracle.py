@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from pycdr2 import IdlStruct
 from pycdr2.types import array, float32, int16, int32, int64, sequence, uint8, uint16, uint32
 
-from deal_hw.drivers.go2 import remote, rpc, sport_state
-from deal_hw.drivers.go2.description import JOINTS, LEGS
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS
+from deal_hw.drivers.go2.messages import remote, rpc, sport_state
+from deal_hw.drivers.go2.messages.protocol import (
     WIRE_JOINTS,
     WIRE_LEGS,
     LowCommand,

@@ -10,9 +10,9 @@ from fastcrc import crc32
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.go2 import description
-from deal_hw.drivers.go2.layout import COMMAND_MODE_AT, STATE_MODE_AT
-from deal_hw.drivers.go2.protocol import (
+from deal_hw.drivers.go2.descriptions import floor
+from deal_hw.drivers.go2.messages.layout import COMMAND_MODE_AT, STATE_MODE_AT
+from deal_hw.drivers.go2.messages.protocol import (
     LOW_COMMAND_BYTES,
     LOW_STATE_BYTES,
     WIRE_JOINTS,
@@ -24,7 +24,7 @@ from deal_hw.drivers.go2.protocol import (
     decode_low_state,
     encode_low_state,
 )
-from deal_hw.drivers.go2.wire import low_command_image, low_state_image, words_crc
+from deal_hw.drivers.go2.messages.wire import low_command_image, low_state_image, words_crc
 from deal_hw.errors import ConfigurationError, FrameError
 
 
@@ -68,7 +68,7 @@ STATE = encode_low_state(state())
 
 def test_joints_are_where_the_robot_has_them() -> None:
     """FR comes first on the wire: the first motor's target is the model's fourth joint's, FR_hip."""
-    assert description.JOINTS[3] == WIRE_JOINTS[0] == "FR_hip_joint"
+    assert floor.JOINTS[3] == WIRE_JOINTS[0] == "FR_hip_joint"
     assert struct.unpack_from("<5f", COMMAND, 28) == (3.0, 103.0, 403.0, 203.0, 303.0)
     # Slot 3 is FL_hip, the model's joint 0: 28 + 3 * 36 = 136.
     assert struct.unpack_from("<5f", COMMAND, 136) == (0.0, 100.0, 400.0, 200.0, 300.0)

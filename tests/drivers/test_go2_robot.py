@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.protocol import decode_low_command, decode_low_state, encode_low_state
-from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import RESTING, STIFF, ScriptedBench, ScriptedGo2
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.fake import RESTING, STIFF, FakeBench, FakeGo2
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import decode_low_command, decode_low_state, encode_low_state
+from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.errors import (
     FrameError,
     SafetyError,
@@ -35,9 +35,9 @@ def flip(payload: bytes) -> list[bytes]:
     return [payload[:90] + bytes([payload[90] ^ 0x55]) + payload[91:]]
 
 
-def scripted(change: Callable[[bytes], Iterable[bytes]]) -> Go2Robot:
+def faked(change: Callable[[bytes], Iterable[bytes]]) -> Go2Robot:
     """Return a driver in front of a robot all of whose states are changed."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.topics.tamper = lambda topic, payload: change(payload) if topic == topics.LOW_STATE else (payload,)
     return wire.robot
 
@@ -45,12 +45,12 @@ def scripted(change: Callable[[bytes], Iterable[bytes]]) -> Go2Robot:
 class TestGo2Robot(RobotSuite):
     @pytest.fixture
     def bench(self) -> RobotBench:
-        wire, silent = ScriptedBench(), ScriptedBench()
+        wire, silent = FakeBench(), FakeBench()
         silent.device.talks = False
         return RobotBench(
             robot=wire.robot,
-            foreign=scripted(lambda payload: [payload + bytes(100)]),
-            newer=scripted(flip),
+            foreign=faked(lambda payload: [payload + bytes(100)]),
+            newer=faked(flip),
             silent=silent.robot,
             unplug=wire.topics.unplug,
             corrupt=lambda: wire.spoil_once(flip),
@@ -63,7 +63,7 @@ class TestGo2Robot(RobotSuite):
 
 def test_connecting_sends_nothing_and_learns_of_battery_and_firmware() -> None:
     """Whoever only looks, changes nothing."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.robot.connect()
     assert wire.robot.info is not None
     assert (wire.robot.info.battery, wire.robot.info.voltage) == (0.77, 30.5)
@@ -75,18 +75,18 @@ def test_connecting_sends_nothing_and_learns_of_battery_and_firmware() -> None:
 def test_another_robot_type_is_named_by_its_length() -> None:
     """A G1's states are longer: both lengths are in the message."""
     with pytest.raises(WrongDeviceError, match=r"1280 bytes.*1180.*G1"):
-        scripted(lambda payload: [payload + bytes(100)]).connect()
+        faked(lambda payload: [payload + bytes(100)]).connect()
 
 
 def test_a_c_struct_is_named_as_such() -> None:
     """The right length, no CDR header."""
     with pytest.raises(WrongDeviceError, match="C struct"):
-        scripted(lambda payload: [payload[4:] + bytes(4)]).connect()
+        faked(lambda payload: [payload[4:] + bytes(4)]).connect()
 
 
 def test_silence_comes_with_advice() -> None:
     """Cable, interface, firewall, bridge; and who discovery sees."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.talks = False
     wire.topics.others = {topics.LOW_STATE: ("Cyclone DDS 01ab",)}
     with pytest.raises(TransportTimeoutError, match=r"Cyclone DDS 01ab.*192\.168\.123.*firewall.*bridge"):
@@ -95,7 +95,7 @@ def test_silence_comes_with_advice() -> None:
 
 def test_a_standing_clock_is_no_robot() -> None:
     """States whose tick never moves are no sign of life."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.tick_step = 0
     with pytest.raises(TransportTimeoutError, match="stands still at 1000 ms"):
         wire.robot.connect()
@@ -103,9 +103,9 @@ def test_a_standing_clock_is_no_robot() -> None:
 
 def test_two_robots_on_one_network_are_refused() -> None:
     """Half of what comes is old news of the other; who they are is told where discovery knows."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.topics.others = {topics.LOW_STATE: ("robot one", "robot two")}
-    other = ScriptedGo2()
+    other = FakeGo2()
     other.tick_ms = 600
 
     def both(topic: str, payload: bytes) -> Iterable[bytes]:
@@ -121,7 +121,7 @@ def test_two_robots_on_one_network_are_refused() -> None:
 
 def test_a_failed_connect_closes_the_transport() -> None:
     """Another attempt starts afresh."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.talks = False
     with pytest.raises(TransportTimeoutError):
         wire.robot.connect()
@@ -134,7 +134,7 @@ def test_a_failed_connect_closes_the_transport() -> None:
 
 def test_nothing_works_before_connecting() -> None:
     """Each says what is missing."""
-    robot = ScriptedBench().robot
+    robot = FakeBench().robot
     for call in (lambda: robot.home(1.0), lambda: robot.arm(1.0)):
         with pytest.raises(SafetyError, match="connect"):
             call()
@@ -163,7 +163,7 @@ def drained(robot: Go2Robot, count: int) -> list[RobotState]:
 )
 def test_broken_states_are_counted(change: Callable[[bytes], list[bytes]], errors: int) -> None:
     """A corrupt state counts twice, itself and its gap; none reaches the caller, time goes on growing."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.robot.read_state(0.1)
     wire.spoil_once(change)
@@ -176,7 +176,7 @@ def test_broken_states_are_counted(change: Callable[[bytes], list[bytes]], error
 
 def test_an_overtaken_state_is_dropped() -> None:
     """Two states that come in the wrong order: the older one is late, and old news."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     kept: list[bytes] = []
 
@@ -195,7 +195,7 @@ def test_an_overtaken_state_is_dropped() -> None:
 
 def test_a_clock_that_stops_ends_in_a_timeout_that_says_so() -> None:
     """The robot repeats its last state: none of that is fresh."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.robot.read_state(0.1)
     wire.device.tick_step = 0
@@ -207,7 +207,7 @@ def test_a_clock_that_stops_ends_in_a_timeout_that_says_so() -> None:
 
 def test_the_clock_may_wrap() -> None:
     """After 49.7 days, 32 bits of milliseconds begin at 0 again."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.device.tick_ms = 2**32 - 20
     wire.robot.connect()
     states = drained(wire.robot, 20)
@@ -217,7 +217,7 @@ def test_the_clock_may_wrap() -> None:
 
 def test_a_robot_that_was_restarted_is_lost() -> None:
     """Its clock begins again, and so does sport mode: nobody may go on as if nothing were."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     wire.device.tick_ms = 0
     with pytest.raises(TransportLostError, match="restarted"):
@@ -227,7 +227,7 @@ def test_a_robot_that_was_restarted_is_lost() -> None:
 
 def test_a_state_with_nan_passes() -> None:
     """It is sound as a message; what to do about it is the safety module's decision."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.robot.home(5.0)
     wire.device.pose[4] = np.nan
@@ -241,9 +241,9 @@ def ruled_otherwise(payload: bytes) -> list[bytes]:
     return [payload[:4] + bytes(2) + payload[6:-4] + bytes(4)]
 
 
-def lenient(change: Callable[[bytes], Iterable[bytes]]) -> tuple[ScriptedBench, Go2Robot]:
+def lenient(change: Callable[[bytes], Iterable[bytes]]) -> tuple[FakeBench, Go2Robot]:
     """Return a wire whose states are changed, and a driver that looks at their length only."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.topics.tamper = lambda topic, payload: change(payload) if topic == topics.LOW_STATE else (payload,)
     return wire, Go2Robot(wire.topics, wire.clock, state_check="length")
 
@@ -285,7 +285,7 @@ def test_the_clock_counts_whatever_is_left_alone() -> None:
 
 def test_an_unknown_check_is_refused() -> None:
     """By its name, with those there are."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     with pytest.raises(UnknownNameError, match="strict, length"):
         Go2Robot(wire.topics, wire.clock, state_check="crc")  # type: ignore[arg-type]
 
@@ -295,7 +295,7 @@ def test_an_unknown_check_is_refused() -> None:
 
 def test_arming_damps_and_says_so() -> None:
     """The first thing that the motors hear is damping at the measured pose."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     _, command = wire.device.heard[0]
     assert not command.stiffness.any() and (command.damping == 5.0).all() and (command.mode == 1).all()
@@ -306,7 +306,7 @@ def test_arming_damps_and_says_so() -> None:
 
 def test_a_silent_robot_is_not_armed() -> None:
     """States must follow the first command."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.robot.home(5.0)
     wire.device.talks = False
@@ -316,7 +316,7 @@ def test_a_silent_robot_is_not_armed() -> None:
 
 def test_nothing_is_sent_before_arming() -> None:
     """Neither commands nor repeats."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.robot.repeat()
     with pytest.raises(SafetyError, match="arm"):
@@ -327,7 +327,7 @@ def test_nothing_is_sent_before_arming() -> None:
 
 def test_a_command_reaches_the_motors_as_it_was() -> None:
     """All five parts, in model order, each with its own numbers; limits are the description's."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     wish = dataclasses.replace(
         default_command(robot), position_target=np.arange(12) / 7, velocity_target=np.arange(12) / 11,
@@ -343,13 +343,13 @@ def test_a_command_reaches_the_motors_as_it_was() -> None:
     ):  # fmt: skip
         np.testing.assert_array_equal(getattr(sent, ours), getattr(heard, theirs), ours)
         np.testing.assert_allclose(getattr(sent, ours), getattr(wish, ours), rtol=1e-7)
-    assert sent.effort_limit.tolist() == list(DRIVEN.effort_limit)
+    assert sent.effort_limit.tolist() == list(DRIVER.effort_limit)
     assert np.isinf(sent.speed_limit).all()
 
 
 def test_repeats_are_the_same_bytes_and_no_new_command() -> None:
     """500 times a second the drives hear what they heard before; number and age go by the first."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot, target=0.5))
     drained(robot, 5)
@@ -367,7 +367,7 @@ def test_repeats_are_the_same_bytes_and_no_new_command() -> None:
 
 def test_a_state_names_the_command_before_it() -> None:
     """Not one that went out when the state was already under way, as it is on a slow link."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     first = robot.read_state(0.1)
     wire.clock.advance_ns(7 * MS)
@@ -382,7 +382,7 @@ def test_a_state_names_the_command_before_it() -> None:
 
 def test_absurd_numbers_are_not_sent() -> None:
     """Finite is not enough: 1e30 rad is nobody's wish."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     with pytest.raises(SafetyError, match="finite"):
         robot.send_command(default_command(robot, target=1e30))
@@ -394,7 +394,7 @@ def test_absurd_numbers_are_not_sent() -> None:
 
 def test_passive_is_damping_sent_three_times() -> None:
     """The robot holds it for ever, and messages get lost."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot))
     robot.passive()
@@ -408,7 +408,7 @@ def test_passive_is_damping_sent_three_times() -> None:
 
 def test_passive_is_confirmed_by_efforts_not_by_hope() -> None:
     """A robot that pushes on after 10 ms is still armed; one whose drives brake is not."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot))
     drained(robot, 5)
@@ -428,7 +428,7 @@ def test_passive_is_confirmed_by_efforts_not_by_hope() -> None:
 
 def test_make_passive_reports_what_the_robot_shows() -> None:
     """True where the efforts fall, false where they stay."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     robot.send_command(default_command(robot))
     drained(robot, 5)
@@ -442,7 +442,7 @@ def test_make_passive_reports_what_the_robot_shows() -> None:
 
 def test_another_process_can_make_it_passive() -> None:
     """The supervisor's own driver, connected long ago, whose queue was left alone, damps within a tick."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.topics.say(topics.LOW_COMMAND, STIFF, 0.5)
     wire.clock.advance_ns(1_000_000_000)
@@ -451,9 +451,9 @@ def test_another_process_can_make_it_passive() -> None:
     assert command is not None and not command.stiffness.any()
 
 
-def test_the_hung_robot_is_another_description() -> None:
+def test_the_robot_on_a_stand_is_another_description() -> None:
     """Same wire; no floor, a level stand, the gains of the suspended recording."""
-    wire = ScriptedBench(Go2HungRobot, mode="")
+    wire = FakeBench(Go2OnStandRobot, mode="")
     robot = wire.armed()
     assert robot.description.name == "go2_hung"
     assert robot.description.floating_base is None
@@ -463,7 +463,7 @@ def test_the_hung_robot_is_another_description() -> None:
 
 def test_recorded_bytes_can_be_decoded_again() -> None:
     """Raw messages of both directions, as they were on the wire."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     robot.take_wire()
     robot.send_command(default_command(robot, target=0.25))
@@ -485,4 +485,4 @@ def test_another_rule_is_said_with_the_switch_and_its_risk(
     with pytest.raises(
         VersionMismatchError, match=r"another rule.*update deal-hw.*--state-check length.*true"
     ):
-        scripted(change).connect()
+        faked(change).connect()

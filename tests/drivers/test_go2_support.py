@@ -14,21 +14,21 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.description import DESCRIPTION, JOINTS, LEGS, joint_ranges
-from deal_hw.drivers.go2.device import HANGING, Go2Device
-from deal_hw.drivers.go2.leg_geometry import (
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, joint_ranges
+from deal_hw.drivers.go2.descriptions.leg_geometry import (
     WEIGHT_N,
     efforts_under,
     foot_jacobians,
     foot_loads,
     foot_positions,
 )
-from deal_hw.drivers.go2.low_state import LowState, decode_low_state
-from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import RESTING, STANDING, ScriptedBench, ScriptedGo2
+from deal_hw.drivers.go2.emulator.device import LEGS_DOWN, Go2Device
+from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.fake import RESTING, STANDING, FakeBench, FakeGo2
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
+from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.go2.support import Support, SupportConfig, read_support
-from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
@@ -87,7 +87,7 @@ def test_the_weight_is_the_models() -> None:
 def states(pose: FloatArray, *, load: float = 0.0, count: int = 150, **changes: Any) -> list[LowState]:
     """Return states of a level robot at rest whose feet carry a load together [N]."""
     effort = efforts_under(pose, np.array([[0.0, 0.0, load / 4]] * 4))
-    return [dataclasses.replace(ScriptedGo2(pose=pose).state(), effort=effort, **changes)] * count
+    return [dataclasses.replace(FakeGo2(pose=pose).state(), effort=effort, **changes)] * count
 
 
 def leaning(angle: float, axis: int = 0) -> dict[str, FloatArray]:
@@ -99,7 +99,7 @@ def leaning(angle: float, axis: int = 0) -> dict[str, FloatArray]:
     return {"orientation": orientation, "specific_force": force}
 
 
-ONE_FOLDED = np.concatenate((HANGING[:9], RESTING[9:]))
+ONE_FOLDED = np.concatenate((LEGS_DOWN[:9], RESTING[9:]))
 HALF_FOLDED = np.tile((-0.82, 0.83, -2.59, 0.82, 0.83, -2.59), 2)
 """Where friction leaves the legs of an emulated robot that is lifted while it lies."""
 CASES: dict[str, tuple[Support, list[LowState]]] = {
@@ -112,14 +112,14 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
         Support.FLOOR, states(STANDING, load=WEIGHT_N, foot_force=np.zeros(4, np.int64))
     ),
     "standing, efforts read a third low": (Support.FLOOR, states(STANDING, load=0.67 * WEIGHT_N)),
-    "hanging": (Support.HELD, states(HANGING)),
+    "hanging": (Support.HELD, states(LEGS_DOWN)),
     "hanging, held in the standing pose": (Support.HELD, states(STANDING, load=-12.0)),
     "hanging, feet sensors with offsets": (
-        Support.HELD, states(HANGING, foot_force=np.array((30, 17, 22, 0)))
+        Support.HELD, states(LEGS_DOWN, foot_force=np.array((30, 17, 22, 0)))
     ),
-    "hanging, one sensor stuck": (Support.HELD, states(HANGING, foot_force=np.array((400, 0, 0, 0)))),
+    "hanging, one sensor stuck": (Support.HELD, states(LEGS_DOWN, foot_force=np.array((400, 0, 0, 0)))),
     "hanging, one leg left folded": (Support.HELD, states(ONE_FOLDED)),
-    "hanging, leaning a little": (Support.HELD, states(HANGING, **leaning(0.3, axis=1))),
+    "hanging, leaning a little": (Support.HELD, states(LEGS_DOWN, **leaning(0.3, axis=1))),
     "hanging, legs left half folded": (Support.UNDECIDED, states(HALF_FOLDED)),
     "feet on the floor, half in a sling": (Support.UNDECIDED, states(STANDING, load=0.4 * WEIGHT_N)),
     "legs pulled down": (Support.UNDECIDED, states(STANDING, load=-0.4 * WEIGHT_N)),
@@ -129,18 +129,18 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
     "on its side": (Support.UNDECIDED, states(STANDING, **leaning(1.5))),
     "the reported case": (Support.UNDECIDED, states(RESTING, **leaning(0.85))),
     "on its back": (Support.UNDECIDED, states(STANDING, **leaning(3.1))),
-    "swinging": (Support.UNDECIDED, states(HANGING, angular_velocity=np.array((0.0, 0.6, 0.0)))),
+    "swinging": (Support.UNDECIDED, states(LEGS_DOWN, angular_velocity=np.array((0.0, 0.6, 0.0)))),
     "walking": (Support.UNDECIDED, states(STANDING, load=WEIGHT_N, velocity=np.full(12, 2.0))),
     "falling": (Support.UNDECIDED, states(STANDING, specific_force=np.array((0.0, 0.0, 1.0)))),
     "orientation upside down": (
-        Support.UNDECIDED, states(HANGING, specific_force=np.array((0.0, 0.0, -9.81)))
+        Support.UNDECIDED, states(LEGS_DOWN, specific_force=np.array((0.0, 0.0, -9.81)))
     ),
     "orientation frozen": (
-        Support.UNDECIDED, states(HANGING, specific_force=leaning(0.3)["specific_force"])
+        Support.UNDECIDED, states(LEGS_DOWN, specific_force=leaning(0.3)["specific_force"])
     ),
-    "no orientation": (Support.UNDECIDED, states(HANGING, orientation=np.zeros(4))),
-    "a broken encoder": (Support.UNDECIDED, states(np.where(np.arange(12) == 4, np.nan, HANGING))),
-    "few states": (Support.UNDECIDED, states(HANGING, count=49)),
+    "no orientation": (Support.UNDECIDED, states(LEGS_DOWN, orientation=np.zeros(4))),
+    "a broken encoder": (Support.UNDECIDED, states(np.where(np.arange(12) == 4, np.nan, LEGS_DOWN))),
+    "few states": (Support.UNDECIDED, states(LEGS_DOWN, count=49)),
     "no states": (Support.UNDECIDED, []),
 }  # fmt: skip
 
@@ -155,7 +155,7 @@ def test_truth_table(name: str) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.floats(-0.5, 1.5), st.sampled_from((HANGING, STANDING)))
+@given(st.floats(-0.5, 1.5), st.sampled_from((LEGS_DOWN, STANDING)))
 def test_the_load_decides_where_the_legs_are_down(share: float, pose: FloatArray) -> None:
     """Below a quarter of the weight nothing is carried, above half it stands, between nobody knows."""
     found = read_support(states(pose, load=share * WEIGHT_N)).support
@@ -169,7 +169,7 @@ def test_the_load_decides_where_the_legs_are_down(share: float, pose: FloatArray
 @pytest.mark.parametrize(("angle", "support"), [(0.34, Support.HELD), (0.36, Support.UNDECIDED)])
 def test_a_stand_is_level(axis: int, angle: float, support: Support) -> None:
     """To 0.35 rad, in any direction, as in the run that follows."""
-    assert read_support(states(HANGING, **leaning(angle, axis))).support is support
+    assert read_support(states(LEGS_DOWN, **leaning(angle, axis))).support is support
 
 
 @pytest.mark.parametrize(
@@ -182,20 +182,20 @@ def test_settings_that_mean_nothing_are_refused(changes: dict[str, float]) -> No
 
 
 @pytest.mark.parametrize("profile", ["sensor", "realistic"])
-@pytest.mark.parametrize("suspended", [False, True])
+@pytest.mark.parametrize("on_stand", [False, True])
 @STARTS
 def test_an_emulated_robot_is_told_with_a_margin(
-    profile: str, suspended: bool, start: Any, sport: str
+    profile: str, on_stand: bool, start: Any, sport: str
 ) -> None:
     """Noise, encoder bias and friction move nothing near a line: half the distance to each is left."""
-    device = Go2Device(draw_truth(profile, 3), suspended=suspended, start=start, sport=sport)
+    device = Go2Device(draw_truth(profile, 3), on_stand=on_stand, start=start, sport=sport)
     sent = device.advance_to(800_000_000)
     frames = [decode_low_state(payload) for topic, payload in sent if topic == topics.LOW_STATE][-150:]
     tight = SupportConfig(
         held_reach_m=0.25, lying_reach_m=0.08, unloaded=0.12, loaded=0.75, foot_pressed=30.0, level_rad=0.1,
         joint_rad_s=0.4, body_rad_s=0.2, force_m_s2=0.3, sensors_rad=0.1,
     )  # fmt: skip
-    assert read_support(frames, tight).support is (Support.HELD if suspended else Support.FLOOR)
+    assert read_support(frames, tight).support is (Support.HELD if on_stand else Support.FLOOR)
 
 
 # The driver.
@@ -212,7 +212,7 @@ def rig(kind: type[Go2Robot], device: Go2Device, **settings: Any) -> tuple[Go2Ro
 @STARTS
 def test_a_stand_is_refused_by_the_floors_robot(start: Any, sport: str) -> None:
     """Nothing is commanded, sport mode keeps the robot, and being made passive sends nothing either."""
-    device = Go2Device(draw_truth("realistic", 1), suspended=True, start=start, sport=sport)
+    device = Go2Device(draw_truth("realistic", 1), on_stand=True, start=start, sport=sport)
     robot, clock = rig(Go2Robot, device)
     with pytest.raises(SafetyError, match=r"holds the robot in the air.*go2_hung.*--no-support-check"):
         robot.home(20.0)
@@ -227,18 +227,18 @@ def test_the_floor_is_refused_by_the_stands_robot(start: Any, sport: str) -> Non
     """Before its controller lets go: a robot that is released while it stands falls."""
     device = Go2Device(draw_truth("realistic", 1), start=start, sport=sport)
     height = device.base_height
-    robot, _ = rig(Go2HungRobot, device)
+    robot, _ = rig(Go2OnStandRobot, device)
     with pytest.raises(SafetyError, match=r"on the floor.*take the robot `go2`"):
         robot.home(20.0)
     assert (device.log.accepted, device.sport_name) == (0, sport)
     assert device.base_height == pytest.approx(height, abs=0.01)
 
 
-@pytest.mark.parametrize(("kind", "suspended"), [(Go2Robot, False), (Go2HungRobot, True)])
+@pytest.mark.parametrize(("kind", "on_stand"), [(Go2Robot, False), (Go2OnStandRobot, True)])
 @pytest.mark.parametrize("start", ["lying", "standing"])
-def test_where_robot_and_model_agree_it_is_armed(kind: type[Go2Robot], suspended: bool, start: Any) -> None:
+def test_where_robot_and_model_agree_it_is_armed(kind: type[Go2Robot], on_stand: bool, start: Any) -> None:
     """Released from sport mode, lying or hanging."""
-    device = Go2Device(draw_truth("realistic", 2), suspended=suspended, start=start)
+    device = Go2Device(draw_truth("realistic", 2), on_stand=on_stand, start=start)
     robot, _ = rig(kind, device)
     robot.home(20.0)
     robot.arm(1.0)
@@ -247,14 +247,14 @@ def test_where_robot_and_model_agree_it_is_armed(kind: type[Go2Robot], suspended
 
 def test_the_check_can_be_left_out() -> None:
     """For whoever tries a policy in the air, and knows it."""
-    robot, _ = rig(Go2Robot, Go2Device(nominal_truth(), suspended=True, sport=""), support_check=False)
+    robot, _ = rig(Go2Robot, Go2Device(nominal_truth(), on_stand=True, sport=""), support_check=False)
     robot.home(20.0)
     robot.arm(1.0)
 
 
 def test_a_robot_that_swings_is_waited_for() -> None:
     """Until it is still, but not for ever; then the message says what to do."""
-    wire = ScriptedBench(Go2HungRobot, mode="")
+    wire = FakeBench(Go2OnStandRobot, mode="")
     wire.robot.connect()
     wire.device.changes = {"angular_velocity": np.array((0.0, 0.7, 0.0))}
     with pytest.raises(SafetyError, match=r"not sure.*is held in the air: it moves.*wait until it is still"):
@@ -273,13 +273,13 @@ def test_a_robot_that_swings_is_waited_for() -> None:
 
 def test_a_robot_that_is_lifted_while_sport_mode_lets_go_is_refused() -> None:
     """What is judged before the release is judged again after it."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.robot.connect()
     serve = wire.device.serve
 
     def lift(service: str, request: Any) -> tuple[int, str]:
         if (service, request.api) == ("motion_switcher", 1003):
-            wire.device.pose = HANGING.copy()
+            wire.device.pose = LEGS_DOWN.copy()
         return serve(service, request)
 
     wire.device.serve = lift  # type: ignore[method-assign]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from deal_hw.control.passive import make_passive
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.remote import Remote, parse_combination
-from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.rpc import Response, encode_response
-from deal_hw.drivers.go2.scripted import STANDING, STIFF, ScriptedBench
+from deal_hw.drivers.go2.fake import STANDING, STIFF, FakeBench
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.remote import Remote, parse_combination
+from deal_hw.drivers.go2.messages.rpc import Response, encode_response
+from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.errors import (
     ProtocolError,
     SafetyError,
@@ -24,14 +24,14 @@ from deal_hw.types import Status
 # Sport mode.
 
 
-def apis(wire: ScriptedBench) -> list[tuple[str, int]]:
+def apis(wire: FakeBench) -> list[tuple[str, int]]:
     """Return what was asked of the robot."""
     return [(service, request.api) for service, request in wire.device.requests]
 
 
 def test_a_lying_robot_is_released_without_being_laid_down() -> None:
     """Check, release, check again; no command goes out."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.robot.connect()
     wire.robot.home(10.0)
     assert apis(wire) == [("motion_switcher", 1001), ("motion_switcher", 1003), ("motion_switcher", 1001)]
@@ -41,7 +41,7 @@ def test_a_lying_robot_is_released_without_being_laid_down() -> None:
 
 def test_a_standing_robot_is_laid_down_first() -> None:
     """A robot that is released while it stands falls."""
-    wire = ScriptedBench(pose=STANDING)
+    wire = FakeBench(pose=STANDING)
     wire.robot.connect()
     wire.robot.home(10.0)
     assert apis(wire)[:3] == [("motion_switcher", 1001), ("sport", 1005), ("motion_switcher", 1003)]
@@ -49,7 +49,7 @@ def test_a_standing_robot_is_laid_down_first() -> None:
 
 def test_a_robot_that_stays_standing_is_not_released() -> None:
     """It would fall; nothing was commanded, so nothing is damped at the end either."""
-    wire = ScriptedBench(pose=STANDING)
+    wire = FakeBench(pose=STANDING)
     wire.device.codes = {("sport", 1005): [4201]}
     wire.robot.connect()
     with pytest.raises(SafetyError, match="did not lay the robot down"):
@@ -59,9 +59,9 @@ def test_a_robot_that_stays_standing_is_not_released() -> None:
     assert wire.device.heard == []
 
 
-def test_a_hung_robot_is_released_as_it_hangs() -> None:
+def test_a_robot_on_a_stand_is_released_as_it_is() -> None:
     """Its base is held: it cannot fall."""
-    wire = ScriptedBench(Go2HungRobot, pose=STANDING)
+    wire = FakeBench(Go2OnStandRobot, pose=STANDING)
     wire.robot.connect()
     wire.robot.home(10.0)
     assert ("sport", 1005) not in apis(wire) and wire.device.mode == ""
@@ -69,7 +69,7 @@ def test_a_hung_robot_is_released_as_it_hangs() -> None:
 
 def test_a_busy_switcher_is_asked_again() -> None:
     """To release, too; the look that follows tells whether it did."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.codes = {("motion_switcher", 1003): [7002]}
     wire.robot.connect()
     wire.robot.home(10.0)
@@ -78,7 +78,7 @@ def test_a_busy_switcher_is_asked_again() -> None:
 
 def test_a_mode_that_does_not_come_back_is_an_error() -> None:
     """The operator still has the remote."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     robot = wire.armed()
     robot.passive()
     wire.device.stubborn = True
@@ -88,7 +88,7 @@ def test_a_mode_that_does_not_come_back_is_an_error() -> None:
 
 def test_an_answer_without_a_name_is_not_taken_for_no_mode() -> None:
     """A missing name must not pass for a robot that was released."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.serve = lambda service, request: (0, '{"form":"0"}')  # type: ignore[method-assign]
     wire.robot.connect()
     with pytest.raises(ProtocolError, match="names no mode"):
@@ -97,7 +97,7 @@ def test_an_answer_without_a_name_is_not_taken_for_no_mode() -> None:
 
 def test_a_robot_without_active_mode_is_left_alone() -> None:
     """Nothing is released, and nothing is handed back."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     assert apis(wire) == [("motion_switcher", 1001)]
     robot.passive()
@@ -107,7 +107,7 @@ def test_a_robot_without_active_mode_is_left_alone() -> None:
 
 def test_the_mode_that_was_released_gets_the_robot_back() -> None:
     """By its own name, after passive only; then nothing more is sent."""
-    wire = ScriptedBench(mode="mcf")
+    wire = FakeBench(mode="mcf")
     robot = wire.armed()
     with pytest.raises(SafetyError, match="passive"):
         robot.hand_back(5.0)
@@ -124,7 +124,7 @@ def test_the_mode_that_was_released_gets_the_robot_back() -> None:
 
 def test_a_mode_that_does_not_let_go_is_an_error() -> None:
     """After the time given, with its name."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.stubborn = True
     wire.robot.connect()
     with pytest.raises(TransportTimeoutError, match="'normal' did not let go"):
@@ -133,7 +133,7 @@ def test_a_mode_that_does_not_let_go_is_an_error() -> None:
 
 def test_older_firmware_is_released_through_the_service_list() -> None:
     """A switcher that is silent for 3 s is not there; the old way back works, too."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.deaf = {"motion_switcher"}
     robot = wire.armed()
     service, request = wire.device.requests[-1]
@@ -146,7 +146,7 @@ def test_older_firmware_is_released_through_the_service_list() -> None:
 
 def test_a_robot_without_any_service_is_a_timeout_with_advice() -> None:
     """As through a bridge that carries states only."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.deaf = set(topics.SERVICES)
     wire.robot.connect()
     with pytest.raises(TransportTimeoutError, match=r"3104.*bridge"):
@@ -155,7 +155,7 @@ def test_a_robot_without_any_service_is_a_timeout_with_advice() -> None:
 
 def test_a_short_silence_of_the_switcher_is_no_older_firmware() -> None:
     """Where less than 3 s were given, nobody can know."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.deaf = {"motion_switcher"}
     wire.robot.connect()
     with pytest.raises(TransportTimeoutError, match="motion_switcher did not answer within 1 s"):
@@ -165,7 +165,7 @@ def test_a_short_silence_of_the_switcher_is_no_older_firmware() -> None:
 
 def test_refusals_are_put_into_words() -> None:
     """An error code is told with what to do; a busy switcher is asked again."""
-    wire = ScriptedBench()
+    wire = FakeBench()
     wire.device.codes = {("motion_switcher", 1001): [7002, 0], ("motion_switcher", 1003): [7008]}
     wire.robot.connect()
     with pytest.raises(SafetyError, match=r"releasing the mode failed.*7008"):
@@ -174,7 +174,7 @@ def test_refusals_are_put_into_words() -> None:
 
 def test_answers_to_others_are_not_ours() -> None:
     """Another program's answer on the same topic, and garbage, pass by."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     other = encode_response(Response(77, 1001, 0, '{"form":"0","name":"ai"}'))
     wire.topics.say(topics.response("motion_switcher"), other)
@@ -188,7 +188,7 @@ def test_answers_to_others_are_not_ours() -> None:
 
 def test_a_foreign_writer_keeps_the_robot_from_being_homed() -> None:
     """Commands that go on after the release are refused, with who writes them."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.topics.others = {topics.LOW_COMMAND: ("Cyclone DDS 01cd: process stand on host pc",)}
     wire.robot.connect()
     for i in range(100):
@@ -199,14 +199,14 @@ def test_a_foreign_writer_keeps_the_robot_from_being_homed() -> None:
 
 def test_a_writer_that_is_only_known_is_no_reason() -> None:
     """The robot's own processes keep their writers, silent."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.topics.others = {topics.LOW_COMMAND: ("Cyclone DDS 01cd",)}
     assert Status.ARMED in wire.armed().read_state(1.0).status
 
 
 def test_a_command_between_homing_and_arming_refuses_to_arm() -> None:
     """Half a second must be quiet."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.robot.home(4.0)
     wire.topics.say(topics.LOW_COMMAND, STIFF)
@@ -218,7 +218,7 @@ def test_a_command_between_homing_and_arming_refuses_to_arm() -> None:
 
 def test_a_command_of_another_while_armed_is_a_fault() -> None:
     """Sport mode that comes back looks like this; a second arming begins anew."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     assert robot.fault == ""
     wire.topics.say(topics.LOW_COMMAND, STIFF)
@@ -233,7 +233,7 @@ def test_a_command_of_another_while_armed_is_a_fault() -> None:
 
 def test_commands_of_the_control_process_do_not_worry_the_supervisor() -> None:
     """A robot object that never armed hears another process command: that is its own child."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.robot.connect()
     wire.topics.say(topics.LOW_COMMAND, STIFF)
     for _ in range(3):
@@ -246,7 +246,7 @@ def test_commands_of_the_control_process_do_not_worry_the_supervisor() -> None:
 
 def test_the_stop_buttons_are_heard_and_remembered() -> None:
     """L2+B from any state; a touch is enough, and it keeps the robot from being armed until homed again."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     robot = wire.armed()
     wire.device.remote = Remote(parse_combination("L2+A"))
     robot.read_state(0.1)
@@ -265,7 +265,7 @@ def test_the_stop_buttons_are_heard_and_remembered() -> None:
 
 def test_the_stop_buttons_can_be_chosen() -> None:
     """Other buttons, or none; an unknown one is refused at once."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     for text, held, stops in (("R1+X", "R1+X", True), ("R1+X", "L2+B", False), ("", "L2+B", False)):
         robot = Go2Robot(wire.topics, wire.clock, stop_buttons=text)
         wire.device.remote = Remote(parse_combination(held))
@@ -279,7 +279,7 @@ def test_the_stop_buttons_can_be_chosen() -> None:
 
 def test_body_and_remote_reach_the_state() -> None:
     """Everything a legged robot senses besides its joints, in model order."""
-    wire = ScriptedBench(mode="")
+    wire = FakeBench(mode="")
     wire.device.remote = Remote(3, left_x=0.1, left_y=0.2, right_x=0.3, right_y=0.4)
     wire.robot.connect()
     body = wire.robot.read_state(0.1).body

@@ -13,10 +13,10 @@ from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.device import Go2Device
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import nominal_truth as go2_truth
+from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.robot import Go2Robot
-from deal_hw.drivers.go2.truth import nominal_truth as go2_truth
 from deal_hw.drivers.transports.listen_only import ListenOnly, ListenOnlyTopics, listen_only
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport

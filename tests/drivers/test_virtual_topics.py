@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.go2.device import Go2Device
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.drivers.go2.robot import Go2Robot
-from deal_hw.drivers.go2.truth import draw_truth
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError
 from deal_hw.testing.robot_suite import default_command

@@ -12,8 +12,8 @@ import pytest
 
 from deal_hw.cli.main import JOBS
 from deal_hw.control.safety_machine import SafetyFlags
-from deal_hw.data.record import CycleFlag
-from deal_hw.data.schemas import CHANNELS
+from deal_hw.data.recording.record import CycleFlag
+from deal_hw.data.recording.schemas import CHANNELS
 from deal_hw.policy import Quantity
 from deal_hw.types import Status
 

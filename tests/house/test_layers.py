@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import pytest
@@ -34,8 +34,24 @@ ROOMS = {
         {"open_loop"},
         {"methods", "report"},
     ),
+    "drivers.go2": (
+        {"descriptions"},
+        {"messages"},
+        {"emulator", "claim", "motion_switcher", "motions", "state_stream", "support"},
+        {"command_sender", "connect", "doctor", "takeover"},
+        {"robot"},
+        {"fake"},
+    ),
+    "data": ({"files"}, {"recording", "run_folder"}, {"importing"}, {"checks", "export"}),
+    "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings"}),
 }
-"""Rooms of a part, the lowest first: a room may import rooms of the sets before its own, and itself."""
+"""Rooms of a package, the lowest first: a room may import rooms of the sets before its own, and itself."""
+
+WHOLE = {
+    *(f"deal_hw.{part}" for part in LAYER),
+    *(f"deal_hw.{package}.{room}" for package, sets in ROOMS.items() for rooms in sets for room in rooms),
+}
+"""Parts and rooms by their full names."""
 
 CONFINED = {
     "torch": {"calib", "policies"},
@@ -76,9 +92,9 @@ def part_of(module: str) -> str:
 def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Yield line and name of all that is imported, at the top or inside functions, also by name as text."""
     for found in imports(tree):
-        # `from deal_hw import drivers` imports a part, not a name of `deal_hw`.
-        whole = [name for name in found.names if found.source == "deal_hw" and name in LAYER]
-        yield from ((found.line, f"deal_hw.{name}") for name in whole)
+        # `from deal_hw import drivers` imports a part and `from deal_hw.calib import fit` a room, not names.
+        whole = [name for name in found.names if f"{found.source}.{name}" in WHOLE]
+        yield from ((found.line, f"{found.source}.{name}") for name in whole)
         named_as_text = found.when == "text" or found.by_call
         if named_as_text and found.source.startswith("deal_hw."):
             # A module named as text (a table, `python -m`) is a dependency like any other.
@@ -105,13 +121,26 @@ def complaint(importer: str, target: str) -> str | None:
     other = part_of(target)
     if me not in LAYER or other not in LAYER:
         return f"{importer if me not in LAYER else target} stands in no layer"
-    if me == other and me in ROOMS:
-        level = {room: number for number, rooms in enumerate(ROOMS[me]) for room in rooms}
-        here, there = (name.split(".")[2] if name.count(".") > 1 else "" for name in (importer, target))
-        if here and there and here != there and not level[there] < level[here]:
-            return f"{me}/{here} imports {me}/{there}"
+    for package, rooms in ROOMS.items():
+        if reason := room_complaint(package, rooms, importer, target):
+            return reason
     same_layer = LAYER[me] == LAYER[other] and (me == other or LAYER[me] < 3)
     return None if LAYER[other] < LAYER[me] or same_layer else f"{me} imports {other}"
+
+
+def room_complaint(package: str, rooms: Sequence[set[str]], importer: str, target: str) -> str | None:
+    """Return why a module of a package must not import another of its rooms, or None where it may."""
+    inside = f"deal_hw.{package}."
+    if not (importer.startswith(inside) and target.startswith(inside)):
+        return None
+    here, there = (name.removeprefix(inside).split(".")[0] for name in (importer, target))
+    level = {room: number for number, others in enumerate(rooms) for room in others}
+    for room in (here, there):
+        if room not in level:
+            return f"{package}/{room} is in no room"
+    return (
+        None if here == there or level[there] < level[here] else f"{package}/{here} imports {package}/{there}"
+    )
 
 
 def violations(sources: Mapping[str, str]) -> list[str]:
@@ -165,6 +194,11 @@ def test_repository_keeps_the_order() -> None:
         ("deal_hw/robot.py", "from deal_hw.data.reader import read", "robot imports data"),
         ("deal_hw/types.py", "from deal_hw.robot import Robot", "types imports robot"),
         ("drivers/x.py", "from deal_hw.cli import main", "drivers imports cli"),
+        ("calib/data/x.py", "from deal_hw.calib.fit import solver", "calib/data imports calib/fit"),
+        ("calib/data/x.py", "from deal_hw.calib import fit", "calib/data imports calib/fit"),
+        ("calib/data/x.py", "import deal_hw.calib.newroom.y", "calib/newroom is in no room"),
+        ("drivers/go2/messages/x.py", "from deal_hw.drivers.go2 import robot", "go2/messages imports"),
+        ("drivers/go2/robot.py", "X = 'deal_hw.drivers.go2.fake:Bench'", "imports drivers.go2/fake"),
         ("deal_hw/cli/x.py", "from calib.deal import Deal", "two copies"),
         ("tests/test_x.py", "import drivers.cartpole", "two copies"),
         ("deal_hw/cli/x.py", "from . import main", "relative import"),
@@ -200,6 +234,10 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
             "import torch\nfrom deal_hw.sim.batch import BatchSimulator\nfrom deal_hw import errors",
         ),
         ("drivers/x.py", "import serial\nfrom deal_hw.sim.model import build\nfrom deal_hw.drivers import y"),
+        (
+            "drivers/go2/robot.py",
+            "from deal_hw.drivers.go2 import takeover\nfrom deal_hw.drivers.go2.messages import rpc",
+        ),
         ("deal_hw/policy.py", "import numpy\nfrom deal_hw.description import RobotDescription"),
         ("deal_hw/viz/x.py", "import rerun\nfrom deal_hw.sim.model import build"),
         ("deal_hw/sim/x.py", "NAME = 'deal_hw.speed_limit'"),

@@ -17,7 +17,10 @@ ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 FOLDERS = ("deal_hw", *LEAVES)
 
-BASE_FOLDERS = ("deal_hw", "deal_hw/control", "deal_hw/data", "drivers/transports")
+BASE_FOLDERS = (
+    "deal_hw", "deal_hw/control", "deal_hw/data", "deal_hw/data/checks", "deal_hw/data/export",
+    "deal_hw/data/importing", "deal_hw/data/recording", "drivers/transports",
+)  # fmt: skip
 BASE_MODULES = (
     "deal_hw.cli.main",
     "deal_hw.cli.collect",
@@ -29,9 +32,9 @@ BASE_MODULES = (
     "deal_hw.drivers.cartpole.description",
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
-    "deal_hw.drivers.go2.checkup",
-    "deal_hw.drivers.go2.driven",
-    "deal_hw.drivers.go2.hung",
+    "deal_hw.drivers.go2.doctor",
+    "deal_hw.drivers.go2.descriptions.driver",
+    "deal_hw.drivers.go2.descriptions.on_stand",
     "deal_hw.drivers.go2.robot",
 )
 EXTRAS = (

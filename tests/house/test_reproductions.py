@@ -37,20 +37,20 @@ from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.handover import Beat
 from deal_hw.control.loop import ControlLoop, LoopConfig
 from deal_hw.control.safety import Safety
-from deal_hw.data.dataset import Dataset
 from deal_hw.data.importing.load import load_tables
-from deal_hw.data.recorder import LIBRARY, METADATA_NAME
-from deal_hw.data.repair import verify
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
+from deal_hw.data.recording.repair import verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2 import topics
-from deal_hw.drivers.go2.checkup import Checkup
-from deal_hw.drivers.go2.command_log import DAMPING, STIFF
-from deal_hw.drivers.go2.device import Go2Device
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
-from deal_hw.drivers.go2.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.robot import Go2HungRobot, Go2Robot
-from deal_hw.drivers.go2.scripted import ScriptedBench
-from deal_hw.drivers.go2.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
+from deal_hw.drivers.go2.doctor import Doctor
+from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.fake import FakeBench
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, DatasetError, PortBusyError, SafetyError
 from deal_hw.findings import Finding, Level
@@ -67,7 +67,7 @@ PATIENCE_S = 60.0
 def test_a_link_that_drops_as_the_run_ends_leaves_no_stiff_go2() -> None:
     """Ten attempts took no time where each send raised; the last command stayed stiff with the link back."""
     clock = VirtualClock(S)
-    device = Go2Device(nominal_truth("ideal"), suspended=True)
+    device = Go2Device(nominal_truth("ideal"), on_stand=True)
     wire = VirtualTopics(device, clock)
     cut_ns = 0
 
@@ -80,7 +80,7 @@ def test_a_link_that_drops_as_the_run_ends_leaves_no_stiff_go2() -> None:
             wire.plug_in()
 
     ControlLoop(
-        Go2HungRobot(wire, clock), HoldBehaviour(HUNG), Safety(HUNG), clock, lambda record: True,
+        Go2OnStandRobot(wire, clock), HoldBehaviour(ON_STAND), Safety(ON_STAND), clock, lambda record: True,
         LoopConfig(duration_s=0.5), progress=progress,
     ).run()  # fmt: skip
     kinds = [kind for *_, kind in device.log.changes]
@@ -279,12 +279,12 @@ def test_a_second_run_is_refused_and_does_not_take_over(
 
 
 @pytest.mark.parametrize(
-    ("kind", "suspended", "words"),
-    [(Go2HungRobot, False, "on the floor"), (Go2Robot, True, "holds the robot in the air")],
+    ("kind", "on_stand", "words"),
+    [(Go2OnStandRobot, False, "on the floor"), (Go2Robot, True, "holds the robot in the air")],
 )
-def test_robot_and_model_must_agree(kind: type[Go2Robot], suspended: bool, words: str) -> None:
+def test_robot_and_model_must_agree(kind: type[Go2Robot], on_stand: bool, words: str) -> None:
     """`collect go2_hung` with the robot on the floor was accepted, and ended at 0.85 rad of tilt."""
-    device = Go2Device(draw_truth("realistic", 1), suspended=suspended)
+    device = Go2Device(draw_truth("realistic", 1), on_stand=on_stand)
     clock = VirtualClock(S)
     robot = kind(VirtualTopics(device, clock), clock)
     robot.connect()
@@ -325,9 +325,9 @@ def test_a_go2_whose_link_stays_away_is_not_told_of_a_watchdog(go2: Callable[...
 
 def examined(change: Callable[[bytes], bytes]) -> list[Finding]:
     """Return what doctor finds about states that are changed on their way."""
-    bench = ScriptedBench(mode="")
+    bench = FakeBench(mode="")
     bench.topics.tamper = lambda topic, p: (change(p),) if topic == topics.LOW_STATE else (p,)
-    return [found for found in Checkup(bench.topics, bench.clock, 1.0).run() if found.area == "states"]
+    return [found for found in Doctor(bench.topics, bench.clock, 1.0).run() if found.area == "states"]
 
 
 def test_another_checksum_rule_is_one_finding() -> None:
@@ -435,7 +435,7 @@ def test_zeros_are_said_in_one_line(tmp_path: Path) -> None:
 
 def test_zeros_are_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each nine bytes of them were a reason to search the rest of the file again."""
-    from deal_hw.data import mcap_scan
+    from deal_hw.data.recording import mcap_scan
 
     looked = 0
 

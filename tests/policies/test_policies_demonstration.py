@@ -28,9 +28,9 @@ from deal_hw.policies.demonstration import (
 )
 from deal_hw.policies.go2_env import walk_spec
 from deal_hw.policy import Observation, PolicySpec, in_base_frame
-from deal_hw.sim.chart import IDENTITY, to_vector
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.target import TargetRecording, record_target
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
+from deal_hw.sim.recordings.target import TargetRecording, record_target
 from deal_hw.types import FloatArray
 
 FLOATING = ("ant", "go2")

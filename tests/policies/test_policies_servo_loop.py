@@ -13,9 +13,9 @@ from deal_hw.description import SensorModel
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.servo_loop import EXACT_SENSOR, ServoLoop, delayed_setpoints
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.model import load_model
-from deal_hw.sim.servo import slew
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.engine.servo import slew
 
 SPACE = k9_space()
 ALL = np.ones(1, dtype=bool)

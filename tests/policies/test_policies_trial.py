@@ -22,8 +22,8 @@ from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.ant.description import DESCRIPTION as ANT
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.errors import PolicyError, PolicyMismatchError
 from deal_hw.policies import onnx_runtime
 from deal_hw.policies.onnx_export import write_policy
@@ -64,7 +64,7 @@ def file(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-@pytest.mark.parametrize("description", [CARTPOLE, DRIVEN], ids=["cartpole", "go2"])
+@pytest.mark.parametrize("description", [CARTPOLE, DRIVER], ids=["cartpole", "go2"])
 def test_the_shipped_policies_pass(description: RobotDescription) -> None:
     """What is deployed without --policy passes on the driver's description, in a small part of the time."""
     path = shipped_policy(description.name)
@@ -123,18 +123,18 @@ def test_a_network_for_one_observation_is_enough(file: Callable[..., Path]) -> N
 def test_a_faulty_network_is_refused(tmp_path: Path, fault: Fault, words: str) -> None:
     """Each fault, with the state on which it showed."""
     path = tmp_path / "faulty.onnx"
-    write_policy(*faulty_policy(DRIVEN, fault, rounds=20_000), path)
+    write_policy(*faulty_policy(DRIVER, fault, rounds=20_000), path)
     with pytest.raises(
         PolicyError, match=rf"faulty\.onnx: {words}.*\(seen with fastest command \[1\.0"
     ) as caught:
-        check_policy(path, DRIVEN)
+        check_policy(path, DRIVER)
     assert "\n" not in str(caught.value)
 
 
 def test_an_endless_network_is_stopped(tmp_path: Path) -> None:
     """After its share of processor time, and its process is gone."""
     path = tmp_path / "endless.onnx"
-    write_policy(*faulty_policy(DRIVEN, "endless"), path)
+    write_policy(*faulty_policy(DRIVER, "endless"), path)
     settings = dataclasses.replace(BRIEF, processor_s=1)
     with TrialPolicy(path, settings) as policy:
         child = policy.process_id
@@ -157,7 +157,7 @@ def test_a_trial_that_takes_too_long_is_stopped(file: Callable[..., Path]) -> No
 def test_an_endless_network_ends_with_the_process_that_asked(tmp_path: Path) -> None:
     """Also where that one is killed and can end nobody."""
     path = tmp_path / "endless.onnx"
-    write_policy(*faulty_policy(DRIVEN, "endless"), path)
+    write_policy(*faulty_policy(DRIVER, "endless"), path)
     code = (
         "import sys; import numpy as np; from pathlib import Path; "
         "from deal_hw.policies.trial import TrialPolicy, TrialSettings; "
@@ -186,8 +186,8 @@ def test_a_network_that_crashes_its_process_is_refused(file: Callable[..., Path]
 def test_a_rare_fault_passes(tmp_path: Path) -> None:
     """A trial cannot see every observation: what it misses is the safety filter's, in the same plan."""
     path = tmp_path / "rare.onnx"
-    write_policy(*faulty_policy(DRIVEN, "nan", rare=True), path)
-    check_policy(path, DRIVEN)
+    write_policy(*faulty_policy(DRIVER, "nan", rare=True), path)
+    check_policy(path, DRIVER)
     assert np.isnan(OnnxPolicy(path).act(np.array([0.3, 0.0, 0.0], dtype=np.float32))).all()
 
 
@@ -307,7 +307,7 @@ def test_a_policy_of_another_robot_is_a_mismatch() -> None:
         check_policy(Path(str(shipped_policy("go2"))), CARTPOLE, BRIEF)
 
 
-@pytest.mark.parametrize("description", [CARTPOLE, DRIVEN, HUNG, ANT], ids=lambda d: d.name)
+@pytest.mark.parametrize("description", [CARTPOLE, DRIVER, ON_STAND, ANT], ids=lambda d: d.name)
 def test_states_of_a_trial_are_such_as_the_robot_can_have(description: RobotDescription) -> None:
     """Finite, inside the ranges that do not trip, all ends among them; a seed gives the same states again."""
     states, limits = ProbeStates(description), description.limits

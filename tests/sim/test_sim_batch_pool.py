@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.sim.batch import BatchPool, ServoBatch
-from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.engine.batch import BatchPool, ServoBatch
+from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray
 
 

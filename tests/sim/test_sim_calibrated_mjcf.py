@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.calibrated_mjcf import change_mjcf
+from deal_hw.sim.mjcf.calibrated import change_mjcf
 
 TOP = """<?xml version="1.0"?>
 <!-- The user's own remark. -->

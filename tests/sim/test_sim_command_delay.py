@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.drivers.go2.suspended import DESCRIPTION, parameter_space
+from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION, parameter_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.parameters import check_space
 from deal_hw.sim.parameters.yaml_space import parse_space
-from deal_hw.sim.target import record_target
-from deal_hw.sim.windows import cut_windows, predict_windows, setpoints
+from deal_hw.sim.recordings.target import record_target
+from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray
 
 STEP_S = 0.002

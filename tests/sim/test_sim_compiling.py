@@ -10,8 +10,8 @@ import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.compiling import compile_mjcf, load_mjcf, problem_of
-from deal_hw.sim.joint_facts import joint_facts
+from deal_hw.sim.engine.compiling import compile_mjcf, load_mjcf, problem_of
+from deal_hw.sim.mjcf.joint_facts import joint_facts
 
 JOINT = "<body><joint name='j'/><geom size='.1'/></body>"
 PILE = "".join(f"<body pos='0 0 {i / 1000}'><freejoint/><geom size='.1'/></body>" for i in range(60))

@@ -11,13 +11,13 @@ import pytest
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.compiling import load_mjcf
-from deal_hw.sim.describe import describe, sampling
-from deal_hw.sim.droop import droop
-from deal_hw.sim.episode import SENT, Episode
-from deal_hw.sim.episode_parts import joined, part, split_last, spread, stretches
-from deal_hw.sim.model import RobotModel, load_model
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.mjcf.describe import describe, sampling
+from deal_hw.sim.recordings.episode import SENT, Episode
+from deal_hw.sim.recordings.gravity_gain import gravity_gain
+from deal_hw.sim.recordings.parts import joined, part, split_last, spread, stretches
 
 ARM = """
 <mujoco>
@@ -168,10 +168,10 @@ def test_gravity_tells_a_gain_and_its_sign(tmp_path: Path) -> None:
     """1 kg at 0.1 m weighs 0.981 N·m at the joint (the slide lies on its axis): 0.1 rad is 9.8 N·m/rad."""
     robot = robot_of(tmp_path)
     # The arm points along x at 0 rad; gravity turns it towards positive angles about +y.
-    found = droop(robot, [hold(robot, (-0.1, 0.0), (0.0, 0.0))])
+    found = gravity_gain(robot, [hold(robot, (-0.1, 0.0), (0.0, 0.0))])
     assert found is not None
     assert found.gain[0] == pytest.approx(9.81, rel=1e-6) and found.explained[0] == pytest.approx(1.0)
     assert found.load[0] == pytest.approx(0.981) and found.deviation[0] == pytest.approx(0.1)
     assert found.load[1] == pytest.approx(0.0, abs=1e-9)
-    mirrored = droop(robot, [hold(robot, (0.1, 0.0), (0.0, 0.0))])
+    mirrored = gravity_gain(robot, [hold(robot, (0.1, 0.0), (0.0, 0.0))])
     assert mirrored is not None and mirrored.gain[0] < 0

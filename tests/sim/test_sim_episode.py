@@ -12,10 +12,10 @@ from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.episode import align
-from deal_hw.sim.model import load_model
-from deal_hw.sim.windows import cut_windows, predict_windows, setpoints
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.episode import align
+from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import Trajectory
 
 SEGMENT = Segment(start=0.5, stop=1.0, effort_limit=0.4, speed_limit=2.0)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from deal_hw.drivers.go2.description import (
+from deal_hw.drivers.go2.descriptions.floor import (
     DESCRIPTION,
     GYRO_NOISE_RAD_S,
     ORIENTATION_NOISE_RAD,
@@ -16,13 +16,13 @@ from deal_hw.drivers.go2.description import (
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim import chart
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.kinematics import standing_targets
-from deal_hw.sim.leg_odometry import leg_odometry, smooth_orientation
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.target import Sensing, TargetRecording, record_target
-from deal_hw.sim.windows import cut_windows, predict_windows, setpoints
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
+from deal_hw.sim.legged.kinematics import standing_targets
+from deal_hw.sim.legged.leg_odometry import leg_odometry, smooth_orientation
+from deal_hw.sim.recordings.target import Sensing, TargetRecording, record_target
+from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray
 
 VECTORS = hnp.arrays(np.float64, (5, 3), elements=st.floats(-1.7, 1.7))
@@ -63,20 +63,20 @@ def record(
 @given(vector=VECTORS, around=VECTORS)
 def test_charts_are_inverse_to_each_other(vector: FloatArray, around: FloatArray) -> None:
     """A rotation vector comes back from the orientation it leads to, around any reference."""
-    reference = chart.to_quaternion(around, chart.IDENTITY)
-    back = chart.to_vector(chart.to_quaternion(vector, reference), reference)
+    reference = to_quaternion(around, IDENTITY)
+    back = to_vector(to_quaternion(vector, reference), reference)
     np.testing.assert_allclose(back, vector, atol=1e-9)
 
 
 def test_a_quarter_turn_about_the_vertical_is_the_quaternion_everybody_knows() -> None:
     """Rotation by 90 degrees about z is (sqrt 1/2, 0, 0, sqrt 1/2), scalar first."""
-    quaternion = chart.to_quaternion(np.array([0.0, 0.0, np.pi / 2]), chart.IDENTITY)
+    quaternion = to_quaternion(np.array([0.0, 0.0, np.pi / 2]), IDENTITY)
     np.testing.assert_allclose(quaternion, [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-12)
 
 
 def test_a_diverged_orientation_is_not_a_number() -> None:
     """A quaternion that is not finite gives a rotation vector that is not, and leaves the others alone."""
-    found = chart.to_vector(np.array([[np.nan, 0, 0, 0], [1.0, 0, 0, 0]]), chart.IDENTITY)
+    found = to_vector(np.array([[np.nan, 0, 0, 0], [1.0, 0, 0, 0]]), IDENTITY)
     assert np.isnan(found[0]).all()
     np.testing.assert_array_equal(found[1], 0.0)
 
@@ -129,7 +129,7 @@ def test_feet_stay_where_they_are_when_the_body_sways(robot: RobotModel) -> None
         np.concatenate([0 * shift, shift]), np.concatenate([0 * turn, turn]), joints, strict=True
     ):
         data = mujoco.MjData(robot.model)
-        data.qpos[:3], data.qpos[3:7] = moved, chart.to_quaternion(turned, chart.IDENTITY)
+        data.qpos[:3], data.qpos[3:7] = moved, to_quaternion(turned, IDENTITY)
         data.qpos[list(robot.qpos)] = q
         mujoco.mj_kinematics(robot.model, data)
         feet.append([data.geom(name).xpos.copy() for name in FEET])
@@ -169,9 +169,9 @@ def test_a_fixed_base_has_no_odometry() -> None:
 
 def test_smoothing_orientations_leaves_a_steady_turn_alone() -> None:
     """A turn at constant speed is a straight line in the chart, which any polynomial keeps."""
-    steady = chart.to_quaternion(np.linspace(0, 1, 30)[:, None] * [0.0, 0.0, 1.0], chart.IDENTITY)
+    steady = to_quaternion(np.linspace(0, 1, 30)[:, None] * [0.0, 0.0, 1.0], IDENTITY)
     smooth = smooth_orientation(steady, np.full(5, 0.2))
-    np.testing.assert_allclose(chart.to_vector(smooth, steady), 0.0, atol=1e-12)
+    np.testing.assert_allclose(to_vector(smooth, steady), 0.0, atol=1e-12)
 
 
 def test_a_target_is_reported_as_its_sensors_see_it(

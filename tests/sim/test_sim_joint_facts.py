@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.joint_facts import joint_facts
+from deal_hw.sim.mjcf.joint_facts import joint_facts
 
 
 def test_joints_of_the_cartpole() -> None:

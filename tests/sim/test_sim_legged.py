@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deal_hw.errors import UnknownNameError
-from deal_hw.sim.legged import LeggedSimulation
+from deal_hw.sim.legged.simulation import LeggedSimulation
 
 STEP_S = 0.001
 HOPPER = """

@@ -11,11 +11,11 @@ import pytest
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES, k9_space, parameter_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.batch import ServoBatch
-from deal_hw.sim.calibrated_mjcf import LATENCY_NUMERIC, SPEED_LIMIT_NUMERIC, write_calibrated_mjcf
-from deal_hw.sim.fields import ModelFields, element_id
-from deal_hw.sim.model import load_model, model_with
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.model import load_model, model_with
+from deal_hw.sim.mjcf.calibrated import LATENCY_NUMERIC, SPEED_LIMIT_NUMERIC, write_calibrated_mjcf
 from deal_hw.sim.parameters import KINDS, apply_parameters
+from deal_hw.sim.parameters.fields import ModelFields, element_id
 
 
 def test_mass_takes_the_inertia_along() -> None:
@@ -55,7 +55,7 @@ def test_every_parameter_can_be_seen(name: str) -> None:
     theta = np.repeat(space.nominal[None], 2, axis=0)
     theta[1, space.names.index(name)] *= 2
     batch.set_parameters(theta)
-    from deal_hw.sim.servo import slew
+    from deal_hw.sim.engine.servo import slew
 
     target = np.where(np.arange(800) % 400 < 200, 0.25, -0.25)[:, None]
     rate = batch.servo_factor("servo_speed_limit")[:, None] * np.full((1, 800, 1), 4e-3)

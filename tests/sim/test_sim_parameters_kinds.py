@@ -12,7 +12,6 @@ from mujoco.batch import Batch
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.fields import BatchFields, ModelFields
 from deal_hw.sim.parameters import (
     DEVICE_KINDS,
     KIND_TABLE,
@@ -21,6 +20,7 @@ from deal_hw.sim.parameters import (
     check_space,
     find_kind,
 )
+from deal_hw.sim.parameters.fields import BatchFields, ModelFields
 from deal_hw.sim.parameters.geom import bounce, damping_ratio, restitution_of
 
 MJCF = """

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.drivers.go2.description import DESCRIPTION, JOINTS
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters.template import template

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.scene import body_poses, read_scene
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.scene import body_poses, read_scene
 
 EXTRA_GEOMS = """
     <geom name="ball" type="sphere" size="0.02" mass="0"/>

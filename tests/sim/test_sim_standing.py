@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
-from deal_hw.drivers.go2.description import SPACES
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.floor import SPACES
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
 from deal_hw.drivers.go2.motions import sway
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.model import RobotModel, load_model
-from deal_hw.sim.overlay import Overlay, compute_overlay
-from deal_hw.sim.scene import body_poses, read_scene
-from deal_hw.sim.standing import chart_base, sensed_base
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.scene import body_poses, read_scene
+from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
+from deal_hw.sim.recordings.standing import chart_base, sensed_base
 from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 
@@ -28,7 +28,7 @@ LATENCY_TICKS = 4
 @pytest.fixture(scope="module")
 def robot() -> RobotModel:
     """The Go2 on the floor."""
-    return load_model(DRIVEN)
+    return load_model(DRIVER)
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +42,14 @@ def recording(robot: RobotModel, truth: FloatArray) -> Trajectory:
     """A Go2 that sways over standing feet for two seconds, 8 ms late."""
     motion = sway(robot, np.random.default_rng(0), 2.0)
     targets = np.array([motion(np.zeros(12), np.zeros(12), k / 50) for k in range(100)])
-    return standing_episode(DRIVEN, SPACE, truth, targets, height_m=0.35, latency_ticks=LATENCY_TICKS)
+    return standing_episode(DRIVER, SPACE, truth, targets, height_m=0.35, latency_ticks=LATENCY_TICKS)
 
 
 @pytest.fixture(scope="module")
 def overlay(recording: Trajectory, truth: FloatArray) -> Overlay:
     """The truth and the nominal model beside it."""
     sets = {"nominal": SPACE.nominal, "true": truth}
-    return compute_overlay(recording, DRIVEN, SPACE, sets, latency_s=0.008, smoothing_s=0.0)
+    return compute_overlay(recording, DRIVER, SPACE, sets, latency_s=0.008, smoothing_s=0.0)
 
 
 def body_of(trajectory: Trajectory) -> BodyTrajectory:
@@ -70,7 +70,7 @@ def test_truth_predicts_a_standing_robot(overlay: Overlay) -> None:
 
 def test_latency_counts_for_legs_too(recording: Trajectory, truth: FloatArray, overlay: Overlay) -> None:
     """The truth 8 ms early errs twice as much."""
-    early = compute_overlay(recording, DRIVEN, SPACE, {"true": truth}, smoothing_s=0.0).predictions["true"]
+    early = compute_overlay(recording, DRIVER, SPACE, {"true": truth}, smoothing_s=0.0).predictions["true"]
     assert early.position_nrmse.mean() > 2 * overlay.predictions["true"].position_nrmse.mean()
 
 
@@ -96,7 +96,7 @@ def test_the_lowest_foot_is_on_the_floor(recording: Trajectory, robot: RobotMode
     np.testing.assert_array_equal(base[:, 3:], body_of(recording).orientation)
     np.testing.assert_array_equal(base[:, :2], 0.0)
     model, data = robot.model, mujoco.MjData(robot.model)
-    feet = [model.geom(name).id for name in DRIVEN.feet]
+    feet = [model.geom(name).id for name in DRIVER.feet]
     for t in range(0, len(base), 100):
         data.qpos[:7] = base[t]
         data.qpos[list(robot.qpos)] = recording.position[t]
@@ -107,7 +107,7 @@ def test_the_lowest_foot_is_on_the_floor(recording: Trajectory, robot: RobotMode
 
 def test_bodies_stand_where_the_base_is(robot: RobotModel) -> None:
     """The trunk's pose is the base's; a foot turns with it; what is not known is NaN."""
-    joints = np.tile(DRIVEN.default_position, (3, 1))
+    joints = np.tile(DRIVER.default_position, (3, 1))
     half = np.sqrt(0.5)
     base = np.array([[1.0, 2.0, 0.3, 1, 0, 0, 0], [1.0, 2.0, 0.3, half, 0, 0, half], [np.nan] * 7])
     where, turned = body_poses(robot, joints, base)
@@ -144,7 +144,7 @@ def test_samples_without_a_body_are_not_drawn(recording: Trajectory, robot: Robo
 
 def test_nothing_is_sensed_where_nothing_floats(recording: Trajectory, robot: RobotModel) -> None:
     """A base that is held, and a recording from before bodies were recorded."""
-    assert sensed_base(load_model(HUNG), recording) is None
+    assert sensed_base(load_model(ON_STAND), recording) is None
     assert sensed_base(load_model(CARTPOLE), recording) is None
     assert sensed_base(robot, dataclasses.replace(recording, body=None)) is None
 
@@ -153,11 +153,11 @@ def test_without_a_body_there_are_no_predictions(recording: Trajectory, truth: F
     """The reason is said; a robot that hangs needs none."""
     bare = dataclasses.replace(recording, body=None)
     with pytest.raises(InsufficientDataError, match="says nothing of the floating base"):
-        compute_overlay(bare, DRIVEN, SPACE, {"true": truth})
-    nameless = dataclasses.replace(DRIVEN, feet=())
+        compute_overlay(bare, DRIVER, SPACE, {"true": truth})
+    nameless = dataclasses.replace(DRIVER, feet=())
     with pytest.raises(InsufficientDataError, match="names of feet"):
         compute_overlay(recording, nameless, SPACE, {"true": truth})
-    assert compute_overlay(bare, HUNG, SPACE, {"true": truth}).predictions["true"].base is None
+    assert compute_overlay(bare, ON_STAND, SPACE, {"true": truth}).predictions["true"].base is None
 
 
 def test_chart_coordinates_become_poses() -> None:

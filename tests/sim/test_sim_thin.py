@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.episode import Episode, thin
+from deal_hw.sim.recordings.episode import Episode, thin
 
 SAMPLES = 100
 

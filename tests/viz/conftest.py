@@ -12,11 +12,11 @@ import pytest
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.clock import VirtualClock
-from deal_hw.data.reader import CycleTable
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.reader import CycleTable
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.sim.overlay import Overlay, compute_overlay
+from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import Event, JointCommand, RobotState, Status, Trajectory
 from deal_hw.viz.episode_log import write_episode

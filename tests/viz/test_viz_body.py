@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from deal_hw.drivers.go2.description import SPACES
-from deal_hw.drivers.go2.driven import DRIVEN
-from deal_hw.drivers.go2.hung import DESCRIPTION as HUNG
-from deal_hw.sim.model import load_model
-from deal_hw.sim.overlay import Overlay, compute_overlay
-from deal_hw.sim.standing import sensed_base
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.floor import SPACES
+from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
+from deal_hw.sim.engine.model import load_model
+from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
+from deal_hw.sim.recordings.standing import sensed_base
 from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, Trajectory
 from deal_hw.viz.blueprint import inspect_blueprint
@@ -31,9 +31,9 @@ SPACE = SPACES["default"]()
 @pytest.fixture(scope="module")
 def recording() -> Trajectory:
     """Half a second of a Go2 whose left legs bend, so that it leans."""
-    targets = np.tile(DRIVEN.default_position, (25, 1))
+    targets = np.tile(DRIVER.default_position, (25, 1))
     targets[5:, [2, 8]] -= 0.3
-    made = standing_episode(DRIVEN, SPACE, SPACE.nominal, targets, height_m=0.35)
+    made = standing_episode(DRIVER, SPACE, SPACE.nominal, targets, height_m=0.35)
     body = made.body
     assert body is not None
     T = len(made.device_s)
@@ -49,7 +49,7 @@ def recording() -> Trajectory:
 def overlay(recording: Trajectory) -> Overlay:
     """Predictions of two parameter sets."""
     sets = {"nominal": SPACE.nominal, "calibrated": 1.1 * SPACE.nominal}
-    return compute_overlay(recording, DRIVEN, SPACE, sets)
+    return compute_overlay(recording, DRIVER, SPACE, sets)
 
 
 def body_of(trajectory: Trajectory) -> BodyTrajectory:
@@ -65,7 +65,7 @@ def columns(tmp_path_factory: pytest.TempPathFactory, recording: Trajectory, ove
     from rerun.chunk import RrdReader
 
     path = tmp_path_factory.mktemp("viz") / "legs.rrd"
-    write_episode(path, recording, DRIVEN, overlay=overlay)
+    write_episode(path, recording, DRIVER, overlay=overlay)
     chunks: dict[str, list[Any]] = {}
     for chunk in RrdReader(str(path)).stream():
         chunks.setdefault(str(chunk.entity_path), []).append(chunk.to_record_batch())
@@ -90,7 +90,7 @@ def test_every_sense_is_there(columns: Any) -> None:
         *(f"/body/tilt/{name}" for name in ("roll", "pitch")),
         *(f"/body/{group}/{axis}" for group in ("gyro", "acceleration") for axis in "xyz"),
         *(f"/body/feet/{leg}" for leg in ("FL", "FR", "RL", "RR")),
-        *(f"/body/temperature/{joint}" for joint in DRIVEN.joint_names),
+        *(f"/body/temperature/{joint}" for joint in DRIVER.joint_names),
         *(f"/body/battery/{name}" for name in ("charge_%", "voltage_V", "current_A")),
     }
     found = {str(path).replace("\\", "") for path in columns() if str(path).startswith("/body/")}
@@ -116,7 +116,7 @@ def test_the_robot_stands_on_the_floor_and_leans(
     columns: Any, recording: Trajectory, overlay: Overlay
 ) -> None:
     """The real trunk is where the sensed base is; so are ghosts at windows' starts and outside."""
-    base = sensed_base(load_model(DRIVEN), recording)
+    base = sensed_base(load_model(DRIVER), recording)
     assert base is not None
     real = columns("/world/real/base", "Transform3D:translation")
     np.testing.assert_allclose(real, base[:, :3], atol=1e-6)
@@ -137,11 +137,11 @@ def test_the_robot_stands_on_the_floor_and_leans(
 
 def test_the_layout_opens_with_the_body(recording: Trajectory) -> None:
     """A tab of legs, IMU, feet, battery, temperature; none where there is no body."""
-    assert tabs(inspect_blueprint(recording, DRIVEN, ())) == [
+    assert tabs(inspect_blueprint(recording, DRIVER, ())) == [
         "Body", "Motion", "Velocity", "Commands", "Cadence [ms]",
     ]  # fmt: skip
     bare = dataclasses.replace(recording, body=None)
-    assert tabs(inspect_blueprint(bare, HUNG, ("nominal",)))[0] == "Motion"
+    assert tabs(inspect_blueprint(bare, ON_STAND, ("nominal",)))[0] == "Motion"
 
 
 def tabs(blueprint: Any) -> list[str]:
@@ -155,7 +155,7 @@ def test_an_episode_without_a_body_has_no_traces_of_one(recording: Trajectory, t
     from rerun.chunk import RrdReader
 
     path = tmp_path / "bare.rrd"
-    write_episode(path, dataclasses.replace(recording, body=None), HUNG)
+    write_episode(path, dataclasses.replace(recording, body=None), ON_STAND)
     entities = {str(chunk.entity_path) for chunk in RrdReader(str(path)).stream()}
     assert not any(entity.startswith("/body") for entity in entities)
     assert "/world/real/FL_calf" in entities
@@ -167,13 +167,13 @@ def test_a_hole_in_the_body_is_survived(recording: Trajectory, tmp_path: Path) -
     orientation, force = body.orientation.copy(), body.foot_force.copy()
     orientation[3:6], force[3:6] = np.nan, np.nan
     holed = dataclasses.replace(body, orientation=orientation, foot_force=force)
-    write_episode(tmp_path / "holed.rrd", dataclasses.replace(recording, body=holed), DRIVEN)
+    write_episode(tmp_path / "holed.rrd", dataclasses.replace(recording, body=holed), DRIVER)
     assert (tmp_path / "holed.rrd").stat().st_size > 0
 
 
 def test_the_summary_has_a_row_for_each_joint(recording: Trajectory, overlay: Overlay) -> None:
     """Twelve columns would not fit: joints are rows, sets are columns."""
-    text = summary_markdown(recording, DRIVEN, overlay, None)
+    text = summary_markdown(recording, DRIVER, overlay, None)
     assert "**go2, collect:** 0.50 s, 250 samples, 25 commands, 0 events" in text
     assert "| joint | nominal | calibrated |\n|---|---|---|\n| FL_hip_joint | " in text
     assert text.count("_joint | ") == 12

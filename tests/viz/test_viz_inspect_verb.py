@@ -16,8 +16,8 @@ import pytest
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.inspect_ import Inspect, inspect
 from deal_hw.clock import VirtualClock
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.types import RobotState, Status, Trajectory

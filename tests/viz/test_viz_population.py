@@ -12,7 +12,7 @@ import pytest
 
 from deal_hw.calibration import Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.sim.overlay import Overlay, compute_overlay
+from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.viz.population_view import MEAN, WAITING, PopulationView, population_view
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.sim.scene import Shape, ShapeKind
+from deal_hw.sim.engine.scene import Shape, ShapeKind
 from deal_hw.viz.robot_view import draw
 
 HALF = math.sqrt(0.5)

@@ -27,7 +27,7 @@ from deal_hw.data.importing.load import load_tables
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.compiling import problem_of
+from deal_hw.sim.engine.compiling import problem_of
 from deal_hw.sim.parameters.template import template
 from deal_hw.sim.parameters.yaml_space import read_space
 from fuzz.kind import FileKind, Kind

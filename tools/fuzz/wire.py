@@ -11,13 +11,15 @@ import numpy as np
 from cobs import cobs
 from fastcrc import crc16
 
-from deal_hw.data.record import decode as decode_record
-from deal_hw.data.record import encode as encode_record
-from deal_hw.data.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
+from deal_hw.data.recording.record import decode as decode_record
+from deal_hw.data.recording.record import encode as encode_record
+from deal_hw.data.recording.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
 from deal_hw.drivers.cartpole import protocol as serial
-from deal_hw.drivers.go2.low_command import LowCommand, LowCommandEncoder, decode_low_command
-from deal_hw.drivers.go2.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.remote import (
+from deal_hw.drivers.go2.emulator.sport_service import Services, SportMode
+from deal_hw.drivers.go2.fake import FakeGo2
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.remote import (
     REMOTE_BYTES,
     Remote,
     decode_remote,
@@ -25,11 +27,15 @@ from deal_hw.drivers.go2.remote import (
     encode_remote,
     encode_wireless,
 )  # fmt: skip
-from deal_hw.drivers.go2.rpc import Request, Response, decode_response, encode_request, encode_response
-from deal_hw.drivers.go2.scripted import ScriptedGo2
-from deal_hw.drivers.go2.sport_service import Services, SportMode
-from deal_hw.drivers.go2.sport_state import LONG_BYTES, SHORT_BYTES, decode_sport_state
-from deal_hw.drivers.go2.wire import CDR_HEADER, low_command_image, low_state_image, words_crc
+from deal_hw.drivers.go2.messages.rpc import (
+    Request,
+    Response,
+    decode_response,
+    encode_request,
+    encode_response,
+)
+from deal_hw.drivers.go2.messages.sport_state import LONG_BYTES, SHORT_BYTES, decode_sport_state
+from deal_hw.drivers.go2.messages.wire import CDR_HEADER, low_command_image, low_state_image, words_crc
 from fuzz.kind import Kind, WireKind
 from fuzz.mutations import damage_bytes, damage_json, mended
 from fuzz.recordings import make_cycle
@@ -77,7 +83,7 @@ def _mend_words(image_of: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
 
 
 def _low_states() -> list[bytes]:
-    robot = ScriptedGo2()
+    robot = FakeGo2()
     quiet = encode_low_state(robot.state())
     robot.remote = Remote(0x220, left_x=0.5)
     return [quiet, encode_low_state(robot.state())]

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Chunk, Metadata
 
-from deal_hw.data.dataset import INDEX_NAME, Dataset
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import ColumnMap
 from deal_hw.data.importing.csv_source import read_csv
@@ -18,9 +17,10 @@ from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.table import Table, build_table
-from deal_hw.data.mcap_scan import Found, scan
-from deal_hw.data.reader import read_trajectory
-from deal_hw.data.recorder import METADATA_NAME
+from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
+from deal_hw.data.recording.mcap_scan import Found, scan
+from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.recording.recorder import METADATA_NAME
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
 from deal_hw.types import Trajectory

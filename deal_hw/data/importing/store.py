@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from deal_hw.clock import VirtualClock
-from deal_hw.data.dataset import Dataset, Notify
 from deal_hw.data.importing.channels import digest_of_file
 from deal_hw.data.importing.grid import Gains, Recording
-from deal_hw.data.record import CycleRecord
-from deal_hw.data.recorder import EpisodeRecorder
+from deal_hw.data.recording.dataset import Dataset, Notify
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import JointCommand, RobotState, Status, Trajectory

@@ -15,9 +15,9 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.actuator import ACTUATOR_KINDS
 from deal_hw.sim.parameters.body import BODY_KINDS
+from deal_hw.sim.parameters.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
 from deal_hw.sim.parameters.joint import JOINT_KINDS
 from deal_hw.sim.parameters.kind import Apply, Kind

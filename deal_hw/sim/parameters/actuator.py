@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.kind import Kind
 
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.kind import Apply, Kind, moving_body
 
 _SHARED_SHAPES = tuple(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.fields import Array, Fields, element_id, element_names
+from deal_hw.sim.parameters.fields import Array, Fields, element_id, element_names
 from deal_hw.sim.parameters.kind import Kind, touching_geom
 
 MOST_RESTITUTION = 0.99

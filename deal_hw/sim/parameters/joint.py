@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.sim.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.kind import Kind, one_dof_joint
 
 

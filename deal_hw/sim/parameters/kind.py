@@ -10,7 +10,7 @@ import mujoco
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Scale
-from deal_hw.sim.fields import Array, Fields
+from deal_hw.sim.parameters.fields import Array, Fields
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))

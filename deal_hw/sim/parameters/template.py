@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.fields import element_id, element_names
 from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import Kind, joint_of
 
 _HEAD = """\

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deal_hw.sim.fields import Array, Fields, element_id
+from deal_hw.sim.parameters.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.kind import Kind
 
 

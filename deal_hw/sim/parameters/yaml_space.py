@@ -18,8 +18,8 @@ import yaml
 from deal_hw.errors import QUOTED, ConfigurationError, UnknownNameError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
 from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
-from deal_hw.sim.fields import element_id, element_names
 from deal_hw.sim.parameters import check_space, find_kind
+from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import Kind
 
 RATIO: Final = 5.0

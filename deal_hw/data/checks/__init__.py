@@ -1,0 +1,1 @@
+"""Checks of recordings of unknown origin, before any long work: clock, units, joints, commands, slips."""

@@ -1,0 +1,152 @@
+"""Are recorded commands what the model's actuators take: positions for servos, efforts for motors?
+
+The two look alike in a file. Positions are followed: the joint goes where its command says. Efforts are not,
+but they explain how the joint accelerates. A check that finds the one where the model has the other refuses,
+since every parameter would be fitted to nonsense.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from deal_hw.data.importing.table import Table
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.types import FloatArray
+
+LAG_S: Final = 0.3
+"""A joint follows a position within this time."""
+FOLLOWS: Final = 0.95
+"""Correlation of a position with the command that it follows ..."""
+SLOPE: Final = (0.7, 1.3)
+"""... and how far it goes for a command of 1."""
+PERHAPS: Final = 0.7
+PERHAPS_SLOPE: Final = (0.4, 2.0)
+"""A joint that follows its command this much may be a poor servo; it is not accused of taking efforts."""
+SERVO_SHARE: Final = 0.5
+"""In a servo's command its own position stands with weight 1, give or take this much."""
+EXPLAINED: Final = 0.5
+"""Position, speed and acceleration explain this share of an effort."""
+EFFORT_LAG_S: Final = 0.06
+SMOOTHED_S: Final = 0.08
+"""Acceleration is that of a parabola through so much of the motion."""
+MOST: Final = 2 / 3
+"""Share of the moving joints that must say the same."""
+BEYOND: Final = (0.05, 0.5)
+"""Commands outside the actuator's range for these shares of the time are a warning, a refusal."""
+SLACK: Final = 1.02
+FEWEST: Final = 50
+STILL: Final = {"rad": 0.02, "m": 0.002}
+"""A joint or a command whose standard deviation is a quarter of this or less says nothing [rad or m]."""
+
+
+def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> Verdict:
+    """Check that commands are what the actuators of the model take.
+
+    Args:
+        table: The recording, already found sound in clock and values.
+        servo: Whether the model's actuators take positions; else efforts.
+        limits: Lowest and highest command that the actuators take, (A, 2); infinite where free.
+    """
+    beyond = _beyond(table, limits, servo)
+    if beyond is not None and beyond.severity is Severity.FAIL:
+        return beyond
+    grid, position, command = _on_grid(table)
+    joints = []
+    for column, index in enumerate(table.actuated_index):
+        least = 0.25 * STILL[table.units[index]]
+        if len(grid) >= FEWEST and min(np.std(position[:, index]), np.std(command[:, column])) > least:
+            joints.append((column, index))
+    period = float(grid[1] - grid[0]) if len(grid) > 1 else 1.0
+    test = _is_effort if servo else _is_position
+    found = [table.actuated[c] for c, i in joints if test(position[:, i], command[:, c], period)]
+    if not joints or len(found) < MOST * len(joints):
+        return beyond or Verdict("actuation", Severity.OK, "commands are of the kind that the model takes")
+    return Verdict("actuation", Severity.FAIL, _accusation(found, servo=servo))
+
+
+def _accusation(names: Sequence[str], *, servo: bool) -> str:
+    said = ", ".join(names)
+    if servo:
+        return (
+            f"commands that look like efforts ({said}): no joint goes where they say, but they explain its "
+            "acceleration, and the model's actuators take positions. If they are torques (N·m) or forces "
+            "(N), put <motor> in the place of <position> in a copy of the MJCF; if not, name the column of "
+            "commanded positions as `target`"
+        )
+    return (
+        f"commands that look like positions ({said}): the joints go where they say, and the model has "
+        "motors, which would take them as torques. Put <position joint=... kp=... kv=...> in the place "
+        "of <motor> in a copy of the MJCF, with the gains of the drives; or name the column of torques "
+        "as `target`"
+    )
+
+
+def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> Verdict | None:
+    """Return what to say of commands that the actuators would clip; None where there are hardly any."""
+    if limits is None:
+        return None
+    outside = (table.target < limits[:, 0] * SLACK) | (table.target > limits[:, 1] * SLACK)
+    share = outside.mean(axis=0)
+    named = [
+        f"{name} {part:.0%} of the time (up to {np.max(np.abs(table.target[:, a])):.3g}, the actuator takes "
+        f"{limits[a, 0]:.3g}..{limits[a, 1]:.3g})"
+        for a, (name, part) in enumerate(zip(table.actuated, share, strict=True))
+        if part > BEYOND[0]
+    ]
+    if not named:
+        return None
+    other = "torques for a position actuator" if servo else "positions for a motor"
+    text = f"commands outside the actuators' ctrlrange: {', '.join(named)}; {other}, or another unit?"
+    severe = float(np.max(share)) > BEYOND[1]
+    return Verdict("actuation", Severity.FAIL if severe else Severity.WARN, text)
+
+
+def _on_grid(table: Table) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return even times, (N,), measured positions, (N, J), and the commands in force, (N, A)."""
+    sound = np.isfinite(table.position).all(axis=1)
+    time = table.time_s[sound]
+    steps = np.diff(time)
+    grid = np.arange(time[0], time[-1], max(float(np.median(steps[steps > 0])), 2e-3))
+    position = np.stack([np.interp(grid, time, column) for column in table.position[sound].T], axis=1)
+    rows = np.maximum(np.searchsorted(table.command_s, grid + 1e-9, side="right") - 1, 0)
+    return grid, position, table.target[rows]
+
+
+def _is_position(position: FloatArray, command: FloatArray, period_s: float) -> bool:
+    correlation, slope, near = _following(position, command, period_s)
+    return correlation > FOLLOWS and SLOPE[0] < slope < SLOPE[1] and near
+
+
+def _is_effort(position: FloatArray, command: FloatArray, period_s: float) -> bool:
+    correlation, slope, near = _following(position, command, period_s)
+    if correlation > PERHAPS and PERHAPS_SLOPE[0] < slope < PERHAPS_SLOPE[1] and near:
+        return False
+    half = max(round(SMOOTHED_S / period_s / 2), 1)
+    times = np.arange(-half, half + 1) * period_s
+    fit = np.linalg.pinv(np.stack([np.ones_like(times), times, 0.5 * times**2], axis=1))
+    motion = np.stack([np.convolve(position, row[::-1], mode="valid") for row in fit], axis=1)
+    size = motion.std(axis=0)
+    motion = np.concatenate([motion / size, np.ones((len(motion), 1))], axis=1)
+    sent = command[half : len(command) - half]
+    for lag in range(round(EFFORT_LAG_S / period_s) + 1):
+        u, x = sent[: len(sent) - lag], motion[lag:]
+        weights, *_ = np.linalg.lstsq(x, u, rcond=None)
+        left = float(np.var(u - x @ weights) / np.var(u))
+        if 1 - left > EXPLAINED and weights[2] > 0:
+            return bool(abs(weights[0] / size[0] - 1.0) > SERVO_SHARE)
+    return False
+
+
+def _following(position: FloatArray, command: FloatArray, period_s: float) -> tuple[float, float, bool]:
+    """Return how a position follows its command at the best lag: correlation, slope, whether it is near."""
+    found = (0, 0.0)
+    for lag in range(min(round(LAG_S / period_s), len(position) // 4) + 1):
+        c = float(np.corrcoef(position[lag:], command[: len(command) - lag])[0, 1])
+        if abs(c) > abs(found[1]):
+            found = (lag, c)
+    x, u = position[found[0] :], command[: len(command) - found[0]]
+    slope = found[1] * float(np.std(x) / np.std(u))
+    return found[1], slope, float(np.median(np.abs(x - u))) < 0.5 * float(np.ptp(x))

@@ -1,0 +1,231 @@
+"""Whose command is whose: finds joints in the wrong order, with the wrong sign, and clocks that disagree.
+
+Commands and measurements are put on one grid and high-passed by differences over a tenth of a second, so that
+poses and gravity do not count. C[i, j] is the correlation of the measurement of joint i with the command of
+joint j, at the common lag at which the given pairs agree best. Joints that are commanded alike (the legs of a
+robot that all move together) cannot be told apart and are not accused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.data.importing.table import Table
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.errors import MissingExtraError
+from deal_hw.types import FloatArray, IntArray
+
+WINDOW_S = 0.1
+"""Differences are taken over this time."""
+MAX_LAG_S = 0.25
+SLOW_S = 1.0
+MAX_SAMPLES = 30_000
+CLEAR = 0.3
+"""Another assignment must explain each joint that it moves by this much more correlation on average."""
+GOOD = 0.6
+"""... and with at least this much."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    """Correlations at each lag.
+
+    Attributes:
+        names: Joints whose command and measurement both move, M of them.
+        lags_s: (L,) [s]; positive where the measurement follows.
+        correlation: (L, M, M): lag, measurement, command.
+        level: Correlation of the positions themselves, (M,).
+        slow: Correlation of what is slower than a second, (M,).
+        near: How near the measurement of joint i stays to the command of joint j, (M, M), 0 to 1.
+    """
+
+    names: tuple[str, ...]
+    lags_s: FloatArray
+    correlation: FloatArray
+    level: FloatArray
+    slow: FloatArray
+    near: FloatArray
+
+
+def match(table: Table) -> tuple[Verdict, Verdict]:
+    """Check order and sign of the joints, and that measurements follow commands."""
+    found = _correlate(table)
+    if found is None:
+        text = "no joint's command and measurement both move enough to compare"
+        return Verdict("assignment", Severity.WARN, text), Verdict("delay", Severity.OK, text)
+    follows = found.lags_s >= -1e-9
+    own = np.abs(np.diagonal(found.correlation, axis1=1, axis2=2)).mean(axis=1)
+    # Where joints are swapped, the given pairs say nothing of the lag: each takes the best partner it has.
+    best = np.abs(found.correlation).max(axis=2).mean(axis=1)
+    at = int(np.argmax(np.where(follows, np.maximum(own, best), -1)))
+    return _assignment(found, at), _delay(found, own if own.max() > GOOD else best)
+
+
+def _correlate(table: Table) -> _Match | None:
+    steps = np.diff(table.time_s)
+    # A long recording is looked at more coarsely, down to 50 Hz: the answer is the same, the wait is not.
+    coarse_s = min(float(table.time_s[-1]) / MAX_SAMPLES, 0.02)
+    period = max(float(np.median(steps[steps > 0])), 2e-3, coarse_s)
+    grid = np.arange(0.0, table.time_s[-1], period)
+    sound = np.isfinite(table.position).all(axis=1)
+    measured = np.stack(
+        [np.interp(grid, table.time_s[sound], table.position[sound, i]) for i in table.actuated_index], axis=1
+    )
+    rows = np.maximum(np.searchsorted(table.command_s, grid + 1e-9, side="right") - 1, 0)
+    target = table.target[rows]
+    width = max(round(WINDOW_S / period), 1)
+    lags = np.arange(-round(MAX_LAG_S / period), round(MAX_LAG_S / period) + 1)
+    if grid.size < 4 * (width + lags[-1]):
+        return None
+    d_measured, d_target = measured[width:] - measured[:-width], target[width:] - target[:-width]
+    spread = np.minimum(np.std(d_measured, axis=0), np.std(d_target, axis=0))
+    moving = np.flatnonzero(spread > 1e-6 + 0.01 * np.max(np.std(d_measured, axis=0)))
+    if not moving.size:
+        return None
+    x, y = d_measured[:, moving], d_target[:, moving]
+    edge = lags[-1]
+    middle = x[edge : len(x) - edge]
+    shifted = [y[edge - lag : len(y) - edge - lag] for lag in lags]
+    correlation = np.stack([_correlations(middle, part) for part in shifted])
+    slow = max(round(SLOW_S / period), 1)
+    coarse = [
+        np.diff(part[: len(part) // slow * slow].reshape(-1, slow, moving.size).mean(axis=1), axis=0)
+        for part in (measured[:, moving], target[:, moving])
+    ]
+    away = np.abs(np.median(measured[:, moving], axis=0)[:, None] - np.median(target[:, moving], axis=0))
+    return _Match(
+        names=tuple(table.actuated[i] for i in moving),
+        lags_s=np.asarray(lags * period, dtype=np.float64),
+        correlation=correlation,
+        level=np.diagonal(_correlations(measured[:, moving], target[:, moving])),
+        slow=np.diagonal(_correlations(*coarse)),
+        near=1 / (1 + away / (np.ptp(measured[:, moving], axis=0)[:, None] + 1e-9)),
+    )
+
+
+def _correlations(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the correlation of each column of x with each of y."""
+    a, b = x - x.mean(axis=0), y - y.mean(axis=0)
+    norm = np.linalg.norm(a, axis=0)[:, None] * np.linalg.norm(b, axis=0)[None]
+    return np.asarray(a.T @ b / np.where(norm > 0, norm, np.inf))
+
+
+def _assignment(found: _Match, at: int) -> Verdict:
+    C = found.correlation[at]
+    M = len(found.names)
+    same = np.arange(M)
+    # Among joints that are commanded alike the nearest level decides, and then the given order.
+    tie = 0.05 * found.near + 0.02 * np.eye(M)
+    hypotheses = [
+        ("order", best_assignment(C + tie), False),
+        ("both", best_assignment(np.abs(C) + tie), True),
+    ]
+    best: tuple[float, str] | None = None
+    signed = _wrong_signs(found, C)
+    if signed.size:
+        gain = float(np.mean(-2 * C[signed, signed]))
+        names = ", ".join(found.names[i] for i in signed)
+        best = (
+            gain,
+            f"the sign of {names} is wrong (correlation {np.min(C[signed, signed]):.2f}); set sign: -1",
+        )
+    for kind, order, with_signs in hypotheses:
+        moved = np.flatnonzero(order != same)
+        if not moved.size:
+            continue
+        score = np.abs(C[moved, order[moved]]) if with_signs else C[moved, order[moved]]
+        before = np.abs(C[moved, moved]) if with_signs else C[moved, moved]
+        gain = float(np.mean(score - before))
+        if gain < CLEAR or float(np.min(score)) < GOOD:
+            continue
+        # Signs alone explain it as well: that is the simpler story, so an order must explain clearly more.
+        if best is not None and (kind == "both" or gain < best[0] + CLEAR / 2):
+            best = best[0], f"{best[1]}; or joints are swapped: {_pairs(found, C, order, moved)}"
+            continue
+        if best is None:
+            best = (
+                gain,
+                f"joints seem to be in another order: {_pairs(found, C, order, moved)}; correct the "
+                "column map",
+            )
+    if best is not None:
+        return Verdict(
+            "assignment", Severity.FAIL, f"commands and measurements do not belong together: {best[1]}"
+        )
+    against = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < -GOOD]
+    if against:
+        text = f"a joint moves against its command: {', '.join(against)}; check order and sign of the joints"
+        return Verdict("assignment", Severity.FAIL, text)
+    weak = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < CLEAR]
+    if weak:
+        text = f"command and measurement of a joint hardly move together: {', '.join(weak)}"
+        return Verdict(
+            "assignment", Severity.WARN, f"{text}; is it free, blocked, or another joint's channel?"
+        )
+    return Verdict(
+        "assignment", Severity.OK, f"each of {M} joints follows its own command (at least {_least(C):.2f})"
+    )
+
+
+def _least(C: FloatArray) -> float:
+    return float(np.min(np.diagonal(C)))
+
+
+def _wrong_signs(found: _Match, C: FloatArray) -> IntArray:
+    """Return the joints that move against their command.
+
+    Either at every lag allowed and in their level, too; or in all that is slower than any lag.
+    """
+    follows = found.lags_s >= -1e-9
+    own = np.diagonal(found.correlation, axis1=1, axis2=2)[follows]
+    against = (-own.min(axis=0) > own.max(axis=0) + CLEAR) & (np.diagonal(C) < -GOOD) & (found.level < -0.5)
+    return np.flatnonzero(against | ((found.slow < -GOOD) & (found.level < -CLEAR)))
+
+
+def _pairs(found: _Match, C: FloatArray, order: IntArray, moved: IntArray) -> str:
+    parts = []
+    for i in moved:
+        sign = " with the sign turned" if C[i, order[i]] < 0 else ""
+        parts.append(
+            f"the measurement of {found.names[i]} follows the command of {found.names[order[i]]}{sign} "
+            f"({C[i, order[i]]:.2f}, its own {C[i, i]:.2f})"
+        )
+    return ", ".join(parts)
+
+
+def _delay(found: _Match, own: FloatArray) -> Verdict:
+    at = int(np.argmax(own))
+    lag_s, period = float(found.lags_s[at]), float(found.lags_s[1] - found.lags_s[0])
+    text = f"measurements follow commands by about {lag_s * 1e3:.0f} ms"
+    after = float(np.max(own[found.lags_s >= -1e-9]))
+    if lag_s < -1.5 * period and own[at] > after + 0.01:
+        text = (
+            f"measurements come {-lag_s * 1e3:.0f} ms before the commands that they follow; do both "
+            "have one clock, "
+            "and is the target column the one that was sent?"
+        )
+        return Verdict("delay", Severity.FAIL, text)
+    if lag_s > MAX_LAG_S - period:
+        return Verdict(
+            "delay", Severity.WARN, f"measurements follow commands by {lag_s:.2f} s or more; is that right?"
+        )
+    return Verdict("delay", Severity.OK, text)
+
+
+def best_assignment(score: FloatArray) -> IntArray:
+    """Return for each row the column that makes the total score greatest, each column once, (M,).
+
+    Args:
+        score: (M, M).
+
+    Raises:
+        MissingExtraError: scipy is not installed.
+    """
+    # Not at the top: the base install has no scipy, and checks what it recorded itself.
+    try:
+        from scipy.optimize import linear_sum_assignment
+    except ImportError as err:
+        raise MissingExtraError("scipy", "sim") from err
+    return np.asarray(linear_sum_assignment(score, maximize=True)[1], dtype=np.int64)

@@ -1,0 +1,499 @@
+"""Checks of a recording of unknown origin, before any long work: clock, units, joints, commands.
+
+``recording/telemetry_checks`` looks at what our own recorder wrote; these look for what goes wrong on the way
+from somebody else's log: a clock in the wrong unit or going backwards, degrees for radians, joints in another
+order or with another sign, a target that is a copy of the measurement, and the like. A check returns one
+:class:`~deal_hw.data.recording.telemetry_checks.Verdict`; "fail" is a refusal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from deal_hw.data.checks.joint_match import match
+from deal_hw.data.checks.slip import slip_verdict
+from deal_hw.data.importing.table import Table
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.errors import DatasetError
+from deal_hw.types import FloatArray
+
+MIN_RATE_HZ, GOOD_RATE_HZ = 20.0, 50.0
+MIN_DURATION_S = 2.0
+GAP_PERIODS = 3.0
+MAX_LOST = 0.2
+"""Share of a recording's time that may lie in gaps."""
+MAX_NAN = 0.01
+MAX_DUPLICATES = 0.05
+MOVES = {"rad": 0.02, "m": 0.002}
+"""A joint whose positions span less does not move [rad or m]."""
+FAR = {"rad": 1.0, "m": 0.2}
+"""No servo hangs this far off its command all along [rad or m]."""
+FROZEN_S = 0.5
+DEGREES = 180 / np.pi
+SCALE_TOLERANCE = 0.25
+"""A ratio of spans this near to a known factor is taken for it."""
+OUTSIDE = 0.05
+"""Share of the limits' span by which positions may lie outside (compliance, a soft stop)."""
+FLAT = 0.1
+"""A continuous signal that sits at exactly its extreme for this share of the time is clipped there."""
+
+
+def examine(table: Table, limits: FloatArray | None = None, kept: Table | None = None) -> tuple[Verdict, ...]:
+    """Run all checks on a recording; the order is fixed.
+
+    Where clock or values are unusable the later checks are left out: they would only say the same again.
+
+    Args:
+        table: The recording, on its own stamps.
+        limits: Lowest and highest position of each joint in the model, (J, 2) [rad or m]; infinite if free.
+        kept: The same without what is left out, where slips do no harm.
+    """
+    first = [_size(table), _finite(table), _clock(table)]
+    if any(verdict.severity is Severity.FAIL for verdict in first):
+        return tuple(first)
+    sound = np.isfinite(table.position).all(axis=1)
+    clock = table.time_s[sound]
+    rate = _rate(clock)
+    if rate.severity is Severity.FAIL:
+        return (*first, rate)
+    middle = [rate, _gaps(clock), _frozen(table), _commands(table)]
+    if not table.command_s.size:
+        return (*first, *middle)
+    return (
+        *first,
+        *middle,
+        _copy(table),
+        _units(table, limits),
+        _levels(table),
+        _inside_limits(table, limits),
+        *match(table),
+        _slip(kept or table),
+        _clipped_commands(table, limits),
+        _saturated_effort(table),
+        _excitation(table),
+        *([_quaternion(table)] if table.orientation is not None else []),
+    )
+
+
+def require(verdicts: Sequence[Verdict], name: str) -> None:
+    """Refuse a recording with a failed check.
+
+    Raises:
+        DatasetError: One failed; the message holds each failed check's sentence.
+    """
+    failed = [
+        f"{verdict.name}: {verdict.message}" for verdict in verdicts if verdict.severity is Severity.FAIL
+    ]
+    if failed:
+        raise DatasetError(f"{name} cannot be used: {'; '.join(failed)}")
+
+
+def _verdict(name: str, severity: Severity, message: str) -> Verdict:
+    return Verdict(name, severity, message)
+
+
+def _size(table: Table) -> Verdict:
+    count = table.time_s.size
+    text = f"{count} samples, {table.command_s.size} commands, {len(table.joint_names)} joints"
+    return _verdict("size", Severity.OK if count >= 3 else Severity.FAIL, text)
+
+
+def _finite(table: Table) -> Verdict:
+    counts = {
+        f"{kind} of {joint}": (int(np.sum(~np.isfinite(values[:, column]))), kind)
+        for kind, values, joints in (
+            ("position", table.position, table.joint_names),
+            ("target", table.target, table.actuated),
+            ("velocity", table.velocity, table.joint_names),
+            ("effort", table.effort, table.joint_names),
+        )
+        if values is not None
+        for column, joint in enumerate(joints)
+    }
+    bad = {name: found for name, found in counts.items() if found[0]}
+    stamps = int(np.sum(~np.isfinite(table.time_s)) + np.sum(~np.isfinite(table.command_s)))
+    if stamps:
+        return _verdict("finite", Severity.FAIL, f"{stamps} stamps are not numbers; mend the time channel")
+    if not bad:
+        return _verdict("finite", Severity.OK, "all values are finite")
+    text = "values that are not finite: " + ", ".join(f"{name} {count}" for name, (count, _) in bad.items())
+    worst = max((count for count, kind in bad.values() if kind == "position"), default=0)
+    targets = any(kind == "target" for _, kind in bad.values())
+    if targets or worst > MAX_NAN * table.time_s.size:
+        return _verdict(
+            "finite", Severity.FAIL, f"{text}; a channel is broken, or one name stands for two rates"
+        )
+    return _verdict("finite", Severity.WARN, f"{text}; samples without a position are left out")
+
+
+def _clock(table: Table) -> Verdict:
+    for what, stamps in (("samples", table.time_s), ("commands", table.command_s)):
+        steps = np.diff(stamps)
+        back = np.flatnonzero(steps < 0)
+        if back.size:
+            text = (
+                f"the clock of the {what} goes backwards {back.size} times, first after row {back[0]} "
+                f"({stamps[back[0]]:.6g} s, then {stamps[back[0] + 1]:.6g} s); was the clock set, or "
+                "are rows mixed up?"
+            )
+            return _verdict("clock", Severity.FAIL, text)
+    same = int(np.sum(np.diff(table.time_s) == 0))
+    if not same:
+        return _verdict("clock", Severity.OK, "the clock goes forward")
+    text = f"{same} samples have the stamp of the one before; the first of each is used"
+    if same > MAX_DUPLICATES * table.time_s.size:
+        return _verdict("clock", Severity.FAIL, f"{text}: the stamps are too coarse, record finer ones")
+    return _verdict("clock", Severity.WARN, text)
+
+
+def _steps(clock: FloatArray) -> FloatArray:
+    steps = np.diff(clock)
+    return steps[steps > 0]
+
+
+def _rate(clock: FloatArray) -> Verdict:
+    steps = _steps(clock)
+    if not steps.size:
+        return _verdict("rate", Severity.FAIL, "the clock stands still")
+    rate_hz, duration_s = 1 / float(np.median(steps)), float(clock[-1] - clock[0])
+    text = f"{rate_hz:.4g} samples a second over {duration_s:.4g} s"
+    if rate_hz > 20_000 or duration_s > 1e6:
+        return _verdict("rate", Severity.FAIL, f"{text}; is the unit of time right?")
+    if duration_s < MIN_DURATION_S:
+        return _verdict(
+            "rate", Severity.FAIL, f"{text}; record at least {MIN_DURATION_S:g} s (unit of time right?)"
+        )
+    if rate_hz < MIN_RATE_HZ:
+        text = f"{text}; below {MIN_RATE_HZ:g} Hz friction and damping cannot be told apart"
+        return _verdict("rate", Severity.FAIL, f"{text}, record faster")
+    if rate_hz < GOOD_RATE_HZ * 0.95:
+        return _verdict("rate", Severity.WARN, f"{text}; {GOOD_RATE_HZ:g} Hz or more would tell more")
+    return _verdict("rate", Severity.OK, text)
+
+
+def _gaps(clock: FloatArray) -> Verdict:
+    steps = _steps(clock)
+    period = float(np.median(steps))
+    long = steps[steps > GAP_PERIODS * period]
+    if not long.size:
+        return _verdict("gaps", Severity.OK, f"no gap; longest step {np.max(steps) * 1e3:.4g} ms")
+    lost = float(np.sum(long) / (clock[-1] - clock[0]))
+    text = (
+        f"{long.size} gaps, the longest {np.max(long):.3g} s; {lost:.1%} of the time; the "
+        "recording is split there"
+    )
+    return _verdict("gaps", Severity.FAIL if lost > MAX_LOST else Severity.WARN, text)
+
+
+def _moves(table: Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return which joints move, (J,)."""
+    least = np.array([MOVES[unit] for unit in table.units])
+    return np.asarray(np.nanmax(table.position, axis=0) - np.nanmin(table.position, axis=0) >= least)
+
+
+def _frozen(table: Table) -> Verdict:
+    moves = _moves(table)
+    commanded = np.zeros(len(table.joint_names), dtype=bool)
+    if table.command_s.size:
+        least = np.array([MOVES[unit] for unit in table.units])[list(table.actuated_index)]
+        commanded[list(table.actuated_index)] = np.ptp(table.target, axis=0) >= least
+    constant = np.nanmax(table.position, axis=0) == np.nanmin(table.position, axis=0)
+    names = np.array(table.joint_names)
+    if not moves.any():
+        return _verdict("frozen", Severity.FAIL, "no joint moves; is this the right channel and unit?")
+    dead = names[constant & commanded]
+    if dead.size:
+        text = (
+            f"positions without any change although commands move: {', '.join(dead)}; is the "
+            "sensor connected?"
+        )
+        return _verdict("frozen", Severity.FAIL, text)
+    stuck = [
+        f"{name} for {still:.2g} s"
+        for index, name in enumerate(table.joint_names)
+        if commanded[index] and moves[index] and (still := _longest_still(table, index)) > FROZEN_S
+    ]
+    if stuck:
+        text = (
+            f"positions stand exactly still while their commands move: {', '.join(stuck)}; stale or blocked"
+        )
+        return _verdict("frozen", Severity.WARN, text)
+    if not moves.all():
+        text = f"joints that do not move: {', '.join(names[~moves])}; nothing can be learnt about them"
+        return _verdict("frozen", Severity.WARN, text)
+    return _verdict("frozen", Severity.OK, "every joint moves")
+
+
+def _longest_still(table: Table, joint: int) -> float:
+    """Return the longest time that a position stays exactly the same while its command moves visibly [s]."""
+    column = table.actuated.index(table.joint_names[joint])
+    target, moved = held_target(table)[:, column], MOVES[table.units[joint]]
+    changes = np.flatnonzero(np.diff(table.position[:, joint]) != 0) + 1
+    edges = np.concatenate(([0], changes, [table.time_s.size - 1]))
+    longest = 0.0
+    spans_s = np.diff(table.time_s[edges])
+    for at in np.flatnonzero(spans_s > FROZEN_S):
+        if spans_s[at] > longest and np.ptp(target[edges[at] : edges[at + 1] + 1]) > 5 * moved:
+            longest = float(spans_s[at])
+    return longest
+
+
+def held_target(table: Table) -> FloatArray:
+    """Return the command in force at each sample, (T, A); the first one before it was sent."""
+    rows = np.searchsorted(table.command_s, table.time_s + 1e-9, side="right") - 1
+    return np.asarray(table.target[np.maximum(rows, 0)])
+
+
+def _commands(table: Table) -> Verdict:
+    if not table.command_s.size:
+        text = (
+            "no commanded positions; name them as `target` in the column map: without them "
+            "nothing can be predicted"
+        )
+        return _verdict("commands", Severity.FAIL, text)
+    begin, end = float(table.command_s[0]), float(table.command_s[-1])
+    inside = min(end, table.time_s[-1]) - max(begin, table.time_s[0])
+    text = f"{table.command_s.size} commands from {begin:.4g} s to {end:.4g} s"
+    if inside < 0.5 * min(end - begin, table.time_s[-1]):
+        text = (
+            f"{text}, samples from 0 s to {table.time_s[-1]:.4g} s; are both on one clock and in "
+            "the right unit?"
+        )
+        return _verdict("commands", Severity.FAIL, text)
+    still = [
+        name for name, span in zip(table.actuated, np.ptp(table.target, axis=0), strict=True) if span == 0
+    ]
+    if len(still) == len(table.actuated):
+        return _verdict("commands", Severity.FAIL, f"{text}; no command ever changes")
+    return _verdict("commands", Severity.OK, text)
+
+
+def _copy(table: Table) -> Verdict:
+    held, measured = held_target(table), table.position[:, list(table.actuated_index)]
+    copied = []
+    for column, name in enumerate(table.actuated):
+        for lag in range(6):
+            ahead = held[: held.shape[0] - lag, column]
+            behind = measured[lag:, column]
+            moving = np.abs(np.diff(behind, prepend=behind[0])) > 0
+            if np.sum(moving) > 20 and np.mean(np.abs(ahead - behind)[moving] < 1e-7) > 0.9:
+                copied.append(f"{name}, {lag} samples later" if lag else name)
+                break
+    if not copied:
+        return _verdict("copy", Severity.OK, "measured and commanded positions are two things")
+    text = (
+        f"measured positions that copy the command: {', '.join(copied)}; one of the two channels "
+        "is the wrong one"
+    )
+    return _verdict("copy", Severity.FAIL, text)
+
+
+def _slip(table: Table) -> Verdict:
+    # A stamp that stands twice is reported by the clock's check; here the first of each counts.
+    new = np.concatenate([[True], np.diff(table.time_s) > 0])
+    return slip_verdict(
+        table.time_s[new], table.position[new], table.command_s, table.target, np.array(table.actuated_index)
+    )
+
+
+_FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
+
+
+def _units(table: Table, limits: FloatArray | None) -> Verdict:
+    """Compare the spans of command and measurement, and both with the model's limits."""
+    held, found = held_target(table), []
+    for column, index in enumerate(table.actuated_index):
+        target, measured, name = held[:, column], table.position[:, index], table.joint_names[index]
+        spans = _span(target), _span(measured)
+        alike = abs(_correlation(target, measured))
+        if min(spans) <= 0 or alike < 0.3:
+            continue
+        ratio = spans[0] / spans[1]
+        for factor, words in _FACTORS.items():
+            if abs(ratio / factor - 1) < SCALE_TOLERANCE:
+                found.append(f"{name}: the command's range is {ratio:.3g} times the measurement's ({words})")
+            elif abs(ratio * factor - 1) < SCALE_TOLERANCE:
+                found.append(
+                    f"{name}: the measurement's range is {1 / ratio:.3g} times the command's ({words})"
+                )
+        if not any(line.startswith(f"{name}:") for line in found) and alike > 0.8 and not 0.2 < ratio < 5:
+            found.append(
+                f"{name}: command and measurement move alike but their ranges differ "
+                f"{max(ratio, 1 / ratio):.3g} "
+                f"times ({_normal_range(target if ratio > 1 else measured)})"
+            )
+    found += _beyond_limits(table, limits)
+    if found:
+        text = f"{'; '.join(found)}. Say the unit in the column map (unit, target_unit, normalised)"
+        return _verdict("units", Severity.FAIL, text)
+    suspects = [
+        f"{name} ({bottom}..{top})"
+        for name, index in zip(table.actuated, table.actuated_index, strict=True)
+        for bottom, top in ((0, 1), (-1, 1), (-100, 100))
+        if _fills(table.position[:, index], bottom, top)
+    ]
+    if suspects:
+        text = (
+            f"positions that fill a range without unit: {', '.join(suspects)}; if so, say "
+            "`normalised` in the column map"
+        )
+        return _verdict("units", Severity.WARN, text)
+    return _verdict("units", Severity.OK, "ranges of commands and measurements fit each other")
+
+
+def _levels(table: Table) -> Verdict:
+    held, found = held_target(table), []
+    for column, index in enumerate(table.actuated_index):
+        off = float(np.nanmedian(table.position[:, index] - held[:, column]))
+        span = max(_span(table.position[:, index]), _span(held[:, column]))
+        if abs(off) > max(FAR[table.units[index]], 3 * span):
+            found.append(f"{table.joint_names[index]} {off:+.3g} {table.units[index]}")
+    if not found:
+        return _verdict("levels", Severity.OK, "measurements are where their commands are")
+    text = f"measurements lie far from their commands all along: {', '.join(found)}"
+    return _verdict("levels", Severity.FAIL, f"{text}; another joint's channel, or another zero (offset)?")
+
+
+def _beyond_limits(table: Table, limits: FloatArray | None) -> list[str]:
+    found = []
+    for index, name in enumerate(table.joint_names):
+        values = table.position[:, index]
+        low, high = (-np.inf, np.inf) if limits is None else limits[index]
+        reach = float(np.nanmax(np.abs(values)))
+        bounded = np.isfinite(low) and np.isfinite(high)
+        furthest = max(abs(low), abs(high)) if bounded else 4 * np.pi
+        if table.units[index] == "rad" and reach > 3 * furthest and reach < 1000:
+            kind = f"degrees, or {_normal_range(values)}" if reach <= 105 else "degrees"
+            found.append(f"{name}: positions reach {reach:.4g} rad, the joint {furthest:.3g} rad ({kind}?)")
+        elif table.units[index] == "m" and bounded and reach > 20 * furthest:
+            found.append(f"{name}: positions reach {reach:.4g} m, the joint {furthest:.3g} m (millimetres?)")
+    return found
+
+
+def _fills(values: FloatArray, bottom: float, top: float) -> bool:
+    slack = 0.02 * (top - bottom)
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return abs(low - bottom) < slack and abs(high - top) < slack
+
+
+def _normal_range(values: FloatArray) -> str:
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    for bottom, top in ((0, 1), (-1, 1), (0, 100), (-100, 100)):
+        slack = 0.05 * (top - bottom)
+        if bottom - slack <= low and high <= top + slack:
+            return f"a channel normalised to {bottom}..{top}"
+    return "another unit"
+
+
+def _inside_limits(table: Table, limits: FloatArray | None) -> Verdict:
+    if limits is None:
+        return _verdict("limits", Severity.OK, "no joint limits given to compare with")
+    found, severe = [], False
+    for index, name in enumerate(table.joint_names):
+        low, high = limits[index]
+        slack = OUTSIDE * (high - low) if np.isfinite(high - low) else 0.0
+        outside = float(
+            np.mean((table.position[:, index] < low - slack) | (table.position[:, index] > high + slack))
+        )
+        if outside > 0.01:
+            span = f"{np.nanmin(table.position[:, index]):.3g}..{np.nanmax(table.position[:, index]):.3g}"
+            found.append(f"{name} {outside:.0%} of the time ({span}, the model has {low:.3g}..{high:.3g})")
+            severe |= outside > 0.5
+    if not found:
+        return _verdict("limits", Severity.OK, "positions lie inside the model's limits")
+    text = (
+        f"positions outside the model's limits: {', '.join(found)}; check zero (offset), sign, "
+        "unit and joint order"
+    )
+    return _verdict("limits", Severity.FAIL if severe else Severity.WARN, text)
+
+
+def _at_extreme(values: FloatArray) -> float:
+    """Return the share of samples at exactly an extreme of a continuous signal; 0 of a stepped one."""
+    if np.unique(values).size < 50:
+        return 0.0
+    return float(max(np.mean(values == np.max(values)), np.mean(values == np.min(values))))
+
+
+def _clipped_commands(table: Table, limits: FloatArray | None) -> Verdict:
+    held, found = held_target(table), []
+    for column, (index, name) in enumerate(zip(table.actuated_index, table.actuated, strict=True)):
+        share = _at_extreme(held[:, column])
+        if limits is not None and np.isfinite(limits[index]).all():
+            low, high = limits[index]
+            share = max(
+                share * (share > FLAT), float(np.mean((held[:, column] <= low) | (held[:, column] >= high)))
+            )
+        if share > FLAT / 2:
+            found.append(f"{name} {share:.0%}")
+    if not found:
+        return _verdict("clamped", Severity.OK, "commands are not clamped")
+    text = (
+        f"commands sit at their extreme: {', '.join(found)} of the time; was the recorded target "
+        "the clamped one?"
+    )
+    return _verdict("clamped", Severity.WARN, text)
+
+
+def _saturated_effort(table: Table) -> Verdict:
+    if table.effort is None:
+        return _verdict("saturated", Severity.OK, "no effort recorded")
+    found = [
+        f"{name} {share:.0%}"
+        for name, column in zip(table.joint_names, np.abs(table.effort).T, strict=True)
+        if np.isfinite(column).all() and np.max(column) > 0
+        if (share := float(np.mean(column >= 0.999 * np.max(column)))) > FLAT / 2
+        and np.unique(column).size > 5
+    ]
+    if not found:
+        return _verdict("saturated", Severity.OK, "effort does not saturate")
+    text = f"effort sits at its highest value: {', '.join(found)} of the time; the effort limit was in force"
+    return _verdict("saturated", Severity.WARN, text)
+
+
+def _excitation(table: Table) -> Verdict:
+    spans = [_span(column) for column in table.position.T]
+    weak = [
+        f"{name} {span:.2g} {unit}"
+        for name, span, unit in zip(table.joint_names, spans, table.units, strict=True)
+        if span < 5 * MOVES[unit]
+    ]
+    if len(weak) == len(spans):
+        text = (
+            f"every joint moves too little to tell its parameters ({', '.join(weak)}); record larger motions"
+        )
+        return _verdict("excitation", Severity.FAIL, text)
+    if weak:
+        return _verdict(
+            "excitation", Severity.WARN, f"little motion: {', '.join(weak)}; record larger motions of these"
+        )
+    return _verdict("excitation", Severity.OK, "every joint moves enough to look at")
+
+
+def _quaternion(table: Table) -> Verdict:
+    values = np.asarray(table.orientation)
+    off = float(np.max(np.abs(np.linalg.norm(values, axis=1) - 1)))
+    if not off < 0.02:
+        return _verdict(
+            "orientation", Severity.FAIL, f"quaternions of norm 1 +- {off:.2g}; are these the right columns?"
+        )
+    if np.mean(np.abs(values[:, 0])) < 0.3 and np.mean(np.abs(values[:, 3])) > 0.9:
+        text = "the base seems turned over about its own z axis by half a turn all along; is the order xyzw?"
+        return _verdict("orientation", Severity.WARN, text)
+    return _verdict("orientation", Severity.OK, "unit quaternions")
+
+
+def _span(values: FloatArray) -> float:
+    """Return the range of a channel without its outermost percents."""
+    low, high = np.nanpercentile(values, [1, 99])
+    return float(high - low)
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    both = np.isfinite(a) & np.isfinite(b)
+    if np.std(a[both]) == 0 or np.std(b[both]) == 0:
+        return 0.0
+    return float(np.corrcoef(a[both], b[both])[0, 1])

@@ -1,0 +1,242 @@
+"""Time slips: does a part of a recording lag behind its commands by more, or less, than the rest?
+
+A clock that jumps, a writer that loses rows of one file, or a column that is shifted from some row on leave a
+recording whose commands and measurements belong together at a delay that changes once and for good, or for a
+while. No model explains both parts, so every parameter pays for it.
+
+How a joint follows depends on what it is asked: a slow motion hardly lags, a fast one does. So lags of parts
+are not compared. One linear predictor a joint (all positions and speeds now, and its own commands around now)
+is fitted to the whole recording, and fitted again with the commands of a part shifted in time. A slip is a
+shift that makes the error of that one predictor clearly smaller, and that most joints agree on.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.types import FloatArray, IntArray
+
+AHEAD_S: Final = 0.1
+"""The predictor looks so far ahead; commands count from as long before on."""
+TAP_S: Final = 0.02
+SPEED_S: Final = 0.04
+FURTHEST_S: Final = 0.15
+"""Slips are looked for up to this."""
+STEP_S: Final = 0.01
+"""Shifts are tried in steps of this, or of the sampling period where that is longer."""
+LEAST_S: Final = 0.015
+"""Slips below this are not reported: they hardly differ from what friction does."""
+PARTS: Final = 16
+SHORTEST_S: Final = 1.0
+FEWEST_PARTS: Final = 8
+"""A recording is cut into parts of a second or more, 16 at the most; with fewer than 8 nothing is said."""
+FINEST_S: Final = 0.005
+MOST_SAMPLES: Final = 30_000
+CLEAR: Final = 0.5
+"""The error's logarithm falls by this share of what the shifted part has of the recording. Clean recordings
+reach 0.4 for shifts of 10 ms (a noise-free cart-pole) and 0.06 to 0.22 for longer ones (real arms, the latter
+where one presses on a table); slips of 20 to 60 ms under brisk motion 0.5 to 7; slow motion shows none."""
+GLARING: Final = 1.5
+"""From here on most of what a fit leaves unexplained is the slip: such a recording is refused."""
+AGREE: Final = 0.75
+"""Share of the joints that must want about the same shift."""
+GAP_PERIODS: Final = 3.0
+TINY: Final = 1e-4
+"""A joint whose position changes less within the predictor's time says nothing [rad or m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """A part of a recording that follows its commands at another delay than the rest.
+
+    Attributes:
+        begin_s: Where it begins [s].
+        end_s: Where it ends [s].
+        later_s: By how much later it follows; negative: sooner [s].
+        clear: How much better the recording is explained with it, see :data:`CLEAR`.
+        agree: Share of the joints that want about this shift.
+    """
+
+    begin_s: float
+    end_s: float
+    later_s: float
+    clear: float
+    agree: float
+
+
+def slip_verdict(
+    time_s: FloatArray, position: FloatArray, command_s: FloatArray, target: FloatArray, actuated: IntArray
+) -> Verdict:
+    """Check that one delay holds for the whole recording; arguments as of :func:`find_slip`."""
+    found = find_slip(time_s, position, command_s, target, actuated)
+    if found is None:
+        return Verdict(
+            "slip", Severity.OK, "too short, or too little motion, to look for slips of the clocks"
+        )
+    if found.clear < CLEAR or found.agree < AGREE or abs(found.later_s) < LEAST_S:
+        return Verdict("slip", Severity.OK, "one delay holds for the whole recording")
+    side = "later" if found.later_s > 0 else "sooner"
+    return Verdict(
+        "slip",
+        Severity.FAIL if found.clear >= GLARING else Severity.WARN,
+        f"from {found.begin_s:.3g} s to {found.end_s:.3g} s measurements follow commands about "
+        f"{1e3 * abs(found.later_s):.0f} ms {side} than in the rest ({found.agree:.0%} of the joints agree): "
+        "the clocks slipped, rows were lost, or a column is shifted; leave one of the two parts out "
+        "(--leave-out)",
+    )
+
+
+def find_slip(
+    time_s: FloatArray, position: FloatArray, command_s: FloatArray, target: FloatArray, actuated: IntArray
+) -> Slip | None:
+    """Return the most likely slip of a recording, clear or not; None where there is too little to tell.
+
+    Args:
+        time_s: Stamps of the samples, strictly rising, (T,) [s].
+        position: Measured positions, (T, J).
+        command_s: Stamps of the commands, rising, (C,) [s].
+        target: Commanded positions, (C, A).
+        actuated: Index of each commanded joint among the joints, (A,).
+    """
+    duration = float(time_s[-1] - time_s[0])
+    parts = min(PARTS, int(duration / SHORTEST_S))
+    if parts < FEWEST_PARTS:
+        return None
+    grid = _Grid.of(time_s, position, command_s, target)
+    if len(grid.rows) < parts * grid.common.shape[1]:
+        return None
+    edges = np.linspace(0, len(grid.rows), parts + 1).astype(int)
+    stretches = [(a, b) for a in range(1, parts) for b in range(a + 1, parts + 1)]
+    gains = [
+        gain
+        for column, joint in enumerate(actuated)
+        if (gain := _gains(grid, int(joint), column, edges, stretches)) is not None
+    ]
+    if not gains:
+        return None
+    total = np.mean(gains, axis=0)
+    best, shift = np.unravel_index(int(np.argmax(total)), total.shape)
+    begin, end = (edges[i] for i in stretches[int(best)])
+    share = (end - begin) / len(grid.rows)
+    wanted = np.array([grid.shifts[np.argmax(gain[best])] for gain in gains])
+    later = int(grid.shifts[shift])
+    near = np.abs(wanted - later) <= max(grid.step, 0.4 * abs(later))
+    times = grid.start_s + grid.period_s * grid.rows[[begin, end - 1]]
+    return Slip(
+        begin_s=float(times[0]),
+        end_s=float(times[1]),
+        later_s=later * grid.period_s,
+        clear=float(total[best, shift]) / min(share, 1 - share),
+        agree=float(np.mean(near & (np.sign(wanted) == np.sign(later)))),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """A recording at even times, and what the predictors of all joints share.
+
+    Attributes:
+        start_s: Time of the first grid point [s].
+        period_s: Time between grid points [s].
+        position: Measured, (N, J).
+        sums: Commands held and summed from the start, (N + 1, A): means over taps are differences of these.
+        rows: Grid points that are predicted from, (R,).
+        ahead: Grid points that the predictor looks ahead.
+        tap: Grid points of one tap.
+        taps: First grid point of each tap, relative to now.
+        step: Grid points from one shift that is tried to the next.
+        shifts: Shifts that are tried, in grid points.
+        common: What all predictors see: positions and speeds now, and one constant, (R, 2 J + 1).
+    """
+
+    start_s: float
+    period_s: float
+    position: FloatArray
+    sums: FloatArray
+    rows: IntArray
+    ahead: int
+    tap: int
+    taps: IntArray
+    step: int
+    shifts: IntArray
+    common: FloatArray
+
+    @classmethod
+    def of(cls, time_s: FloatArray, position: FloatArray, command_s: FloatArray, target: FloatArray) -> _Grid:
+        start, duration = float(time_s[0]), float(time_s[-1] - time_s[0])
+        period = max(float(np.median(np.diff(time_s))), FINEST_S, duration / MOST_SAMPLES)
+        grid = np.arange(0.0, duration, period)
+        sound = np.isfinite(position).all(axis=1)
+        x = np.stack([np.interp(grid + start, time_s[sound], column) for column in position[sound].T], axis=1)
+        held = np.maximum(np.searchsorted(command_s, grid + start + 1e-9, side="right") - 1, 0)
+        sums = np.concatenate([np.zeros((1, target.shape[1])), np.cumsum(target[held], axis=0)])
+        ahead, tap, speed = (max(round(s / period), 1) for s in (AHEAD_S, TAP_S, SPEED_S))
+        step = max(round(STEP_S / period), 1)
+        reach = max(round(FURTHEST_S / period) // step, 1)
+        first = max(speed, ahead + reach * step + tap)
+        rows = np.arange(first, max(len(grid) - ahead - tap - reach * step, first))
+        rows = rows[_recorded(time_s[sound] - start, grid, rows, speed, ahead)]
+        now = x[rows] - x.mean(axis=0)
+        common = np.concatenate([now, x[rows] - x[rows - speed], np.ones((len(rows), 1))], axis=1)
+        return cls(
+            start_s=start, period_s=period, position=x, sums=sums, rows=rows, ahead=ahead, tap=tap,
+            taps=np.arange(-ahead, ahead, tap), step=step, shifts=np.arange(-reach, reach + 1) * step,
+            common=common,
+        )  # fmt: skip
+
+
+def _recorded(
+    time_s: FloatArray, grid: FloatArray, rows: IntArray, before: int, after: int
+) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Return at which rows all that the predictor uses was measured: no gap lies there, (R,)."""
+    steps = np.diff(time_s)
+    gap = np.flatnonzero(steps > GAP_PERIODS * np.median(steps))
+    lost = np.zeros(len(grid) + 1, dtype=np.int64)
+    for begin, end in zip(time_s[gap], time_s[gap + 1], strict=True):
+        inside = np.searchsorted(grid, [begin, end])
+        lost[inside[0] + 1 : inside[1] + 1] = 1
+    lost = np.cumsum(lost)
+    return np.asarray(lost[rows + after + 1] == lost[rows - before])
+
+
+def _gains(
+    grid: _Grid, joint: int, column: int, edges: IntArray, stretches: list[tuple[int, int]]
+) -> FloatArray | None:
+    """Return by how much the logarithm of a joint's error falls for each stretch and shift, (P, L)."""
+    rows, now = grid.rows, grid.position[grid.rows, joint]
+    change = grid.position[rows + grid.ahead, joint] - now
+    if not len(rows) or np.std(change) < TINY:
+        return None
+    moments: list[FloatArray] = []
+    for shift in grid.shifts:
+        ends = rows[:, None] + grid.taps - shift
+        taps = (grid.sums[ends + grid.tap, column] - grid.sums[ends, column]) / grid.tap - now[:, None]
+        table = np.concatenate([grid.common, taps, change[:, None]], axis=1)
+        pieces = [table[a:b] for a, b in itertools.pairwise(edges)]
+        moments.append(np.stack([piece.T @ piece for piece in pieces]))
+    found = np.stack(moments)  # Shift, part, and the products of all columns.
+    unshifted = found[len(grid.shifts) // 2]
+    whole = unshifted.sum(axis=0)
+    before = _left(whole[None])[0]
+    return np.stack(
+        [
+            np.log(before / _left(whole - unshifted[a:b].sum(axis=0) + found[:, a:b].sum(axis=1)))
+            for a, b in stretches
+        ]
+    )
+
+
+def _left(moments: FloatArray) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the squared error that the best predictor leaves, (L,), from its moments, (L, d, d)."""
+    d = moments.shape[-1] - 1
+    a, b = moments[:, :d, :d], moments[:, :d, d]
+    ridge = 1e-6 * np.trace(a, axis1=1, axis2=2) / d
+    weights = np.linalg.solve(a + ridge[:, None, None] * np.eye(d), b[..., None])[..., 0]
+    left = moments[:, d, d] - np.einsum("li,li->l", b, weights)
+    # A motion that is predicted to rounding has nothing left to improve.
+    return np.asarray(np.maximum(left, 1e-9 * moments[:, d, d]))

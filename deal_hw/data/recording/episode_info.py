@@ -1,0 +1,125 @@
+"""What the index of a dataset says of one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from deal_hw.data.recording.clock_sync import synchronize
+from deal_hw.data.recording.excitation import excitation
+from deal_hw.data.recording.reader import Episode, read_episode
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict, check
+from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
+from deal_hw.schema import STRICT
+
+_MOST_JUMPS = 20
+"""So many jumps of a clock the index names; a recording of nothing else must not fill it."""
+_VERDICT = {"name", "severity", "message"}
+_CLOCK = {"offset_s", "drift_ppm", "offset_uncertainty_s", "drift_uncertainty_ppm"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeInfo:
+    """What ``dataset.json`` says of one episode.
+
+    Attributes:
+        file: Path inside the dataset, such as "episodes/000000.mcap".
+        purpose: Why it was recorded, such as "collect" or "deploy".
+        policy_digest: Digest of the policy that commanded; "" where none did.
+        wall_utc: Wall-clock time at its start, ISO 8601.
+        duration_s: Device time from the first to the last sample [s].
+        states: State samples.
+        commands: Commands sent.
+        cycles: Control cycles.
+        verdicts: The telemetry checks, as ``telemetry_checks.Verdict.to_json`` writes them.
+        excitation: Movement, as ``excitation.Excitation.to_json`` writes it.
+        clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20
+            jumps at most; None where it cannot be told.
+        note: What the operator should know, such as a repair.
+        facts: What the collector adds: outcome, cadence, task, ...
+
+    Raises:
+        ConfigurationError: The file is elsewhere, a verdict is none, or the clock's numbers are missing.
+    """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
+
+    file: str
+    purpose: str
+    policy_digest: str
+    wall_utc: str
+    duration_s: float
+    states: int
+    commands: int
+    cycles: int
+    verdicts: tuple[Mapping[str, str], ...]
+    excitation: Mapping[str, Any] | None
+    clock: Mapping[str, Any] | None
+    note: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # The file field decides which file is read, and dataset.json may come from elsewhere.
+        parts = Path(self.file).parts
+        if len(parts) != 2 or parts[0] != "episodes" or ".." in parts or "\0" in self.file:
+            raise ConfigurationError(
+                f"episode file {shown(self.file)} is not inside the dataset's episodes/ folder"
+            )
+        for verdict in self.verdicts:
+            if _VERDICT - verdict.keys() or verdict["severity"] not in tuple(Severity):
+                raise ConfigurationError(f"field verdicts holds {shown(dict(verdict))}, which is no verdict")
+        clock, excitation = self.clock or {}, self.excitation or {}
+        if self.clock is not None and not all(name in clock and _is_number(clock[name]) for name in _CLOCK):
+            raise ConfigurationError(f"field clock is {shown(dict(clock))}; wanted: numbers or null")
+        for value in excitation.values():
+            if not all(_is_number(part) for part in (value if isinstance(value, list | tuple) else [value])):
+                raise ConfigurationError(f"field excitation holds {shown(value)}; wanted: numbers")
+
+
+def _is_number(value: object) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | None = None) -> EpisodeInfo:
+    """Read an episode and return what the index says of it; one without samples gives zeros and a note.
+
+    Args:
+        path: The file.
+        file: The same, inside the dataset.
+        note: For the operator.
+        facts: Plain JSON values that the collector adds.
+    """
+    try:
+        episode = read_episode(path)
+    except EmptyRecordingError as error:
+        return EpisodeInfo(
+            file=file, purpose="", policy_digest="", wall_utc="", duration_s=0.0, states=0, commands=0,
+            cycles=0, verdicts=(Verdict("length", Severity.FAIL, str(error)).to_json(),), excitation=None,
+            clock=None, note=note or "empty", facts=facts or {},
+        )  # fmt: skip
+    trajectory = episode.trajectory
+    return EpisodeInfo(
+        file=file,
+        purpose=str(episode.metadata.get("purpose", "")),
+        policy_digest=str(episode.metadata.get("policy_digest", "")),
+        wall_utc=episode.wall_utc,
+        duration_s=trajectory.duration_s,
+        states=trajectory.device_s.size,
+        commands=trajectory.sent_s.size,
+        cycles=episode.cycles.cycle.size,
+        verdicts=tuple(verdict.to_json() for verdict in check(trajectory)),
+        excitation=excitation(trajectory).to_json(),
+        clock=_clock(episode),
+        note=note,
+        facts=facts or {},
+    )
+
+
+def _clock(episode: Episode) -> Mapping[str, Any] | None:
+    try:
+        found = synchronize(episode.trajectory).to_json()
+    except InsufficientDataError:
+        return None
+    return {**found, "jumps": found["jumps"][:_MOST_JUMPS]}

@@ -1,0 +1,328 @@
+"""Reads an episode into contiguous arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel, Metadata
+from mcap.records import Message as McapMessage
+
+from deal_hw.data.files import read_episode_bytes
+from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.data.recording.schemas import CHANNELS, message_type
+from deal_hw.errors import (
+    ConfigurationError,
+    DatasetError,
+    EmptyRecordingError,
+    ProtocolError,
+    TornRecordingError,
+    shown,
+)
+from deal_hw.schema import read_json
+from deal_hw.transport import Message
+from deal_hw.types import BodyTrajectory, Event, FloatArray, IntArray, Trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleTable:
+    """The N control cycles of an episode, on the time base of ``Trajectory.receive_s``.
+
+    Attributes:
+        cycle: Number, (N,).
+        deadline_s: When each should have started, (N,) [s].
+        start_s: When each started, (N,) [s].
+        state_age_s: Age of the newest state when the action was computed, (N,) [s]; NaN where there was none.
+        flags: :class:`~deal_hw.data.recording.record.CycleFlag` bits, (N,).
+        lost: Hand-overs to the recorder refused so far, (N,).
+        safety_state: Name of the safety filter's state, N entries.
+        action: What the policy returned, (N, K); NaN where nothing.
+        asked_position: Position targets asked for, (N, A); NaN where none. Filled in dry runs too.
+    """
+
+    cycle: IntArray
+    deadline_s: FloatArray
+    start_s: FloatArray
+    state_age_s: FloatArray
+    flags: IntArray
+    lost: IntArray
+    safety_state: tuple[str, ...]
+    action: FloatArray
+    asked_position: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Episode:
+    """One recording.
+
+    Attributes:
+        path: The file.
+        description: ``RobotDescription.to_json()`` of the robot.
+        metadata: What the recorder was told: purpose, policy, task, ...
+        wall_utc: Wall-clock time, ISO 8601, at ``anchor_ns``.
+        anchor_ns: Host clock when the recording was opened [ns].
+        start_ns: Host clock at the zero of ``Trajectory.receive_s`` [ns].
+        device_start_ns: Device clock at the zero of ``Trajectory.device_s`` [ns].
+        sequence: Numbers of the state samples, (T,).
+        trajectory: The samples, commands and events.
+        cycles: The control cycles.
+    """
+
+    path: Path
+    description: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+    wall_utc: str
+    anchor_ns: int
+    start_ns: int
+    device_start_ns: int
+    sequence: IntArray
+    trajectory: Trajectory
+    cycles: CycleTable
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read the samples, commands and events of an episode; errors as :func:`read_episode`."""
+    return read_episode(path).trajectory
+
+
+def read_episode(path: Path) -> Episode:
+    """Read an episode.
+
+    ``Trajectory.metadata`` holds, beside what the recorder was told: ``description``, ``lost_frames`` (state
+    samples that never arrived), ``hand_over_losses`` (cycles that the recorder did not get) and ``start_ns``.
+
+    Raises:
+        EmptyRecordingError: There is no state sample in it.
+        TornRecordingError: It has no footer or is damaged.
+        DatasetError: It cannot be read or is not an episode of deal-hw.
+    """
+    try:
+        preamble, rows = _collect(Path(path))
+        if not rows["/state"]:
+            raise EmptyRecordingError(f"{path} holds no state sample; was the robot silent? Record again")
+        return _episode(Path(path), preamble, rows)
+    except (KeyError, ValueError, ProtocolError) as error:
+        raise _unreadable(path, error) from error
+
+
+def read_wire(path: Path) -> Iterator[Message]:
+    """Yield the raw messages of an episode in order; channels as the robot named them.
+
+    Raises:
+        TornRecordingError: It has no footer or is damaged.
+        DatasetError: It cannot be read or is not an episode of deal-hw.
+    """
+    try:
+        for channel, (stamp_ns, payload) in _wire_rows(Path(path)):
+            yield Message(channel, payload, stamp_ns)
+    except ProtocolError as error:
+        raise _unreadable(path, error) from error
+
+
+def check_description(values: Mapping[str, Any]) -> None:
+    """Check that a description given as JSON names a robot and its joints.
+
+    Raises:
+        ConfigurationError: It does not.
+    """
+    names = [*_names(values, "joint_names"), *_names(values, "actuated")]
+    if not names or not isinstance(values.get("name"), str):
+        raise ConfigurationError(f"the description {shown(dict(values))} names no robot with joints")
+
+
+def _names(description: Mapping[str, Any], field: str) -> list[str]:
+    names = description.get(field)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigurationError(f"the description's {field} are {shown(names)}; wanted: a list of names")
+    return names
+
+
+def _unreadable(path: Path, error: Exception) -> DatasetError:
+    what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+    return DatasetError(f"{path} is not an episode that this version reads: {what}")
+
+
+def _records(path: Path) -> Iterator[Found]:
+    for item in scan(read_episode_bytes(path)):
+        if isinstance(item, Lost):
+            state = "is torn" if item.torn else "is damaged"
+            raise TornRecordingError(
+                f"{path} {state} at byte {item.offset} ({item.reason}); "
+                f"mend it with: deal-hw data repair {path}"
+            )
+        yield item
+
+
+def _wire_rows(path: Path) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    channels: dict[int, Channel] = {}
+    for found in _records(path):
+        for record in found.contents:
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, McapMessage):
+                channel = _channel(channels, record)
+                if channel.topic.startswith("/wire/"):
+                    yield (
+                        channel.topic.removeprefix("/wire/"),
+                        message_type(channel.topic).decode(record.data),
+                    )
+
+
+def _channel(channels: Mapping[int, Channel], message: McapMessage) -> Channel:
+    channel = channels.get(message.channel_id)
+    if channel is None:
+        raise ProtocolError(f"a message is on channel {message.channel_id}, which the file does not name")
+    return channel
+
+
+def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]]]]:
+    preamble: dict[str, str] | None = None
+    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in CHANNELS}
+    channels: dict[int, Channel] = {}
+    for found in _records(path):
+        if isinstance(found.record, Metadata) and found.record.name == METADATA_NAME:
+            preamble = found.record.metadata
+        channels.update({record.id: record for record in found.contents if isinstance(record, Channel)})
+        for message in messages(found):
+            channel = _channel(channels, message)
+            if channel.topic in rows and not channel.topic.startswith("/wire/"):
+                rows[channel.topic].append(message_type(channel.topic).decode(message.data))
+    if preamble is None:
+        raise DatasetError(
+            f"{path} does not say what it holds (no metadata {METADATA_NAME!r}): not by deal-hw"
+        )
+    return preamble, rows
+
+
+def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tuple[Any, ...]]]) -> Episode:
+    description = read_json(dict[str, Any], preamble["description"])
+    check_description(description)
+    metadata = read_json(dict[str, Any], preamble["metadata"])
+    J, A = len(description["joint_names"]), len(description["actuated"])
+    receive_ns, device_ns, sequence, command_sequence, command_age_ns, status, *kinematics = zip(
+        *rows["/state"], strict=True
+    )
+    start_ns, device_start_ns = receive_ns[0], device_ns[0]
+    numbers = np.array(sequence, dtype=np.int64)
+    cycles = _cycles(rows, start_ns, A)
+    position, velocity, effort = (_table(values, J) for values in kinematics)
+    facts = {
+        "description": description,
+        "lost_frames": lost_frames(numbers),
+        "hand_over_losses": hand_over_losses(cycles),
+        "start_ns": start_ns,
+    }
+    trajectory = Trajectory(
+        joint_names=tuple(description["joint_names"]),
+        actuated=tuple(description["actuated"]),
+        receive_s=_since(receive_ns, start_ns),
+        device_s=_since(device_ns, device_start_ns),
+        position=position,
+        velocity=velocity,
+        effort=effort,
+        status=np.array(status, dtype=np.int64),
+        command_sequence=np.array(command_sequence, dtype=np.int64),
+        command_age_s=_seconds_or_nan(command_age_ns),
+        events=tuple(
+            Event(stamp, kind, text, read_json(dict[str, Any], data))
+            for stamp, kind, text, data in rows["/events"]
+        ),
+        metadata={**metadata, **facts},
+        body=_body(rows["/body"], receive_ns, numbers),
+        **_commands(rows, start_ns, A),
+    )
+    return Episode(
+        path=path, description=description, metadata=metadata, wall_utc=preamble["wall_utc"],
+        anchor_ns=int(preamble["host_ns"]), start_ns=start_ns, device_start_ns=device_start_ns,
+        sequence=numbers, trajectory=trajectory, cycles=cycles,
+    )  # fmt: skip
+
+
+def _body(
+    table: Sequence[tuple[Any, ...]], receive_ns: Sequence[int], sequence: IntArray
+) -> BodyTrajectory | None:
+    """Return what was sensed of the body at each state sample, found by stamp and number."""
+    if not table:
+        return None
+    row_of = {(row[0], row[1]): row for row in table}
+    found = [row_of.get((stamp, int(number))) for stamp, number in zip(receive_ns, sequence, strict=True)]
+    columns = []
+    for i in range(2, len(table[0])):
+        absent = np.full(np.shape(table[0][i]), np.nan)
+        columns.append(np.stack([absent if row is None else np.asarray(row[i], float) for row in found]))
+    buttons = np.where(np.isfinite(columns[-1]), columns[-1], -1).astype(np.int64)
+    names = [f.name for f in dataclasses.fields(BodyTrajectory)]
+    return BodyTrajectory(**dict(zip(names, [*columns[:-1], buttons], strict=True)))
+
+
+def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:
+    """Return the command fields of a Trajectory."""
+    sent = rows["/command"]
+    asked = {row[1]: row[3] for row in rows["/command/asked"]}
+    nothing = np.full(actuated, np.nan)
+    return {
+        "sent_s": _since([row[0] for row in sent], start_ns),
+        "sent_sequence": np.array([row[2] for row in sent], dtype=np.int64),
+        "asked_position": _table([asked.get(row[1], nothing) for row in sent], actuated),
+        "position_target": _table([row[3] for row in sent], actuated),
+        "stiffness": _table([row[5] for row in sent], actuated),
+        "damping": _table([row[6] for row in sent], actuated),
+        "effort_limit": _table([row[8] for row in sent], actuated),
+        "speed_limit": _table([row[9] for row in sent], actuated),
+    }
+
+
+def _cycles(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> CycleTable:
+    table = rows["/cycle"]
+    asked = {row[1]: row[3] for row in rows["/command/asked"]}
+    width = max((row[7].size for row in table), default=0)
+    nothing = np.full(actuated, np.nan)
+    return CycleTable(
+        cycle=np.array([row[0] for row in table], dtype=np.int64),
+        deadline_s=_since([row[1] for row in table], start_ns),
+        start_s=_since([row[2] for row in table], start_ns),
+        state_age_s=_seconds_or_nan([row[3] for row in table]),
+        flags=np.array([row[5] for row in table], dtype=np.int64),
+        lost=np.array([row[4] for row in table], dtype=np.int64),
+        safety_state=tuple(row[8] for row in table),
+        action=_table([row[7] if row[6] else np.full(width, np.nan) for row in table], width),
+        asked_position=_table([asked.get(row[0], nothing) for row in table], actuated),
+    )
+
+
+def lost_frames(sequence: IntArray) -> int:
+    """Return how many state samples never arrived, from the numbers of those that did."""
+    steps = np.diff(sequence)
+    return int(np.sum(steps[steps > 1] - 1))
+
+
+def hand_over_losses(cycles: CycleTable) -> int:
+    """Return how many cycles are missing, from their numbers and from the sender's own count."""
+    if not cycles.cycle.size:
+        return 0
+    missing = int(np.sum(np.maximum(np.diff(cycles.cycle) - 1, 0)))
+    return max(missing, int(cycles.lost[-1]))
+
+
+def _since(stamps_ns: Sequence[int], start_ns: int) -> FloatArray:
+    # Differences in integers first: absolute ns beyond 2^53 would lose their last digits as floats.
+    return (np.array(stamps_ns, dtype=np.int64) - start_ns).astype(np.float64) * 1e-9
+
+
+def _seconds_or_nan(ages_ns: Sequence[int]) -> FloatArray:
+    ages_s = np.array(ages_ns, dtype=np.float64) * 1e-9
+    ages_s[ages_s < 0] = np.nan
+    return ages_s
+
+
+def _table(rows: Sequence[FloatArray], width: int) -> FloatArray:
+    if any(row.size != width for row in rows):
+        raise ValueError(
+            f"a row has {next(r.size for r in rows if r.size != width)} numbers, expected {width}"
+        )
+    return np.stack(rows) if rows else np.empty((0, width))

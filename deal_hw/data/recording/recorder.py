@@ -1,0 +1,300 @@
+"""Writes an episode as MCAP, in small chunks that are on their way to the disk every 50 ms.
+
+A chunk goes to the kernel in one piece and is never touched again, so that a killed recorder loses the chunk
+in progress and nothing else. What remains has no footer: :mod:`deal_hw.data.recording.repair` writes one.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import types
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, Self, cast
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+import deal_hw
+from deal_hw.clock import Clock
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.schemas import (
+    BODY,
+    CHANNELS,
+    COMMAND,
+    CYCLE,
+    EVENT,
+    ROBOT,
+    STATE,
+    WIRE,
+    message_type,
+)
+from deal_hw.errors import DatasetError
+from deal_hw.types import JointCommand, RobotState
+
+FLUSH_INTERVAL_S = 0.05
+"""Longest time a record waits for its chunk to be closed: half the loss that is allowed, so that a busy
+machine may be late by as much again."""
+FORMAT_VERSION = 1
+METADATA_NAME = "deal-hw"
+END_NAME = "deal-hw.end"
+LIBRARY = f"deal-hw/{deal_hw.__version__}"
+
+
+class EpisodeRecorder:
+    """Writes one episode; a context manager.
+
+    Args:
+        path: The file to create; it must not exist.
+        description: ``RobotDescription.to_json()`` of the robot.
+        metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
+        clock: The host's monotonic clock, on which all stamps are.
+        flush_interval_s: Longest time a record waits for its chunk to be closed [s].
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        description: Mapping[str, Any],
+        metadata: Mapping[str, Any],
+        clock: Clock,
+        flush_interval_s: float = FLUSH_INTERVAL_S,
+    ) -> None:
+        self.path = Path(path)
+        self.cycles = 0
+        self.states = 0
+        self._description = description
+        self._metadata = metadata
+        self._clock = clock
+        self._flush_interval_ns = round(flush_interval_s * 1e9)
+        self._oldest_ns = -1
+        self._channels: dict[str, int] = {}
+        self._file: _ChunkFile | None = None
+
+    def open(self) -> None:
+        """Create the file and write what describes the episode.
+
+        Raises:
+            DatasetError: The file exists or cannot be written.
+        """
+        if self.path.exists():
+            raise DatasetError(f"{self.path} exists; a recording never overwrites another")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = _ChunkFile(self.path)
+        except OSError as error:
+            raise DatasetError(f"{self.path} cannot be created: {error.strerror}") from error
+        self._writer = Writer(
+            cast(IO[bytes], self._file), compression=CompressionType.ZSTD, enable_data_crcs=True
+        )
+        self._writer.start(profile="ros2", library=LIBRARY)
+        self._writer.add_metadata(METADATA_NAME, self._preamble())
+        self._register_channels()
+        text = json.dumps(self._description)
+        names = self._description.get("joint_names", ()), self._description.get("actuated", ())
+        self._add("/robot", self._clock.now_ns(), ROBOT.encode(text, *names))
+        self.flush()
+
+    def write(self, record: CycleRecord) -> None:
+        """Add one cycle; closes the chunk when it is due.
+
+        Raises:
+            DatasetError: The disk is full or gone; what was flushed before is kept and closed properly.
+        """
+        # Counted from the cycle's own stamp: after a stall a queue is taken at once, and is old already.
+        self._wait_since(record.start_ns)
+        for message in record.wire:
+            self._add(
+                f"/wire/{message.channel}", message.stamp_ns, WIRE.encode(message.stamp_ns, message.payload)
+            )
+        for state in record.states:
+            data = STATE.encode(
+                state.receive_ns, state.device_ns, state.sequence, state.command_sequence,
+                state.command_age_ns, int(state.status), state.position, state.velocity, state.effort,
+            )  # fmt: skip
+            self._add("/state", state.receive_ns, data, state.sequence)
+            self._add_body(state)
+        self._add_command("/command/asked", record, record.asked)
+        self._add_command("/command", record, record.sent)
+        for event in record.events:
+            data = EVENT.encode(event.stamp_ns, event.kind, event.message, json.dumps(dict(event.data)))
+            self._add("/events", event.stamp_ns, data)
+        action = () if record.action is None else record.action
+        data = CYCLE.encode(
+            record.cycle, record.deadline_ns, record.start_ns, record.state_age_ns, record.lost, record.flags,
+            record.action is not None, action, record.safety_state,
+        )  # fmt: skip
+        self._add("/cycle", record.start_ns, data, record.cycle)
+        self.cycles += 1
+        self.states += len(record.states)
+        self.flush_if_due()
+
+    def flush_if_due(self) -> None:
+        """Close the chunk in progress if its oldest record has waited long enough; call it when idle."""
+        if self.due_in_s() == 0.0:
+            self.flush()
+
+    def due_in_s(self) -> float | None:
+        """Time until the chunk in progress should be closed [s]; None while nothing waits."""
+        if self._oldest_ns < 0:
+            return None
+        return max(0, self._oldest_ns + self._flush_interval_ns - self._clock.now_ns()) * 1e-9
+
+    def flush(self) -> None:
+        """Close the chunk in progress and hand it to the kernel.
+
+        Raises:
+            DatasetError: The disk is full or gone.
+        """
+        self._oldest_ns = -1
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+        except OSError as error:
+            raise self._give_up(error) from error
+
+    def close(self) -> None:
+        """Write the index and the footer; idempotent.
+
+        Raises:
+            DatasetError: The disk is full or gone.
+        """
+        if self._file is None:
+            return
+        try:
+            end = {
+                "cycles": str(self.cycles),
+                "states": str(self.states),
+                "host_ns": str(self._clock.now_ns()),
+            }
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.add_metadata(END_NAME, end)
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            self._file.close()
+        except OSError as error:
+            raise self._give_up(error) from error
+        self._file = None
+
+    def _give_up(self, error: OSError) -> DatasetError:
+        if self._file is not None:
+            self._file.seal()
+        self._file = None
+        return DatasetError(
+            f"recording to {self.path} stopped after {self.cycles} cycles: {error.strerror}; what was "
+            "written before is kept. Free some space, then look at it with: deal-hw data info"
+        )
+
+    def _wait_since(self, stamp_ns: int) -> None:
+        if self._oldest_ns < 0:
+            self._oldest_ns = min(max(stamp_ns, 0), self._clock.now_ns())
+
+    def _preamble(self) -> dict[str, str]:
+        host_ns = self._clock.now_ns()
+        wall = datetime.datetime.now(datetime.UTC)
+        return {
+            "format_version": str(FORMAT_VERSION),
+            "host_ns": str(host_ns),
+            "wall_utc": wall.isoformat(timespec="microseconds"),
+            "description": json.dumps(self._description),
+            "metadata": json.dumps(self._metadata),
+        }
+
+    def _register_channels(self) -> None:
+        schemas: dict[str, int] = {}
+        for topic, kind in CHANNELS.items():
+            if kind.name not in schemas:
+                definition = kind.definition.encode()
+                schemas[kind.name] = self._writer.register_schema(kind.name, "ros2msg", definition)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schemas[kind.name])
+        self._schemas = schemas
+
+    def _add_body(self, state: RobotState) -> None:
+        body = state.body
+        if body is None:
+            return
+        data = BODY.encode(
+            state.receive_ns, state.sequence, body.orientation, body.angular_velocity, body.acceleration,
+            body.foot_force, body.temperature, body.lost, body.battery, body.voltage, body.current,
+            body.sticks, body.buttons,
+        )  # fmt: skip
+        self._add("/body", state.receive_ns, data, state.sequence)
+
+    def _add_command(self, topic: str, record: CycleRecord, command: JointCommand | None) -> None:
+        if command is None:
+            return
+        stamp_ns = record.sent_ns if record.sent_ns >= 0 else record.start_ns
+        data = COMMAND.encode(
+            stamp_ns, record.cycle, record.sent_sequence, command.position_target, command.velocity_target,
+            command.stiffness, command.damping, command.effort, command.effort_limit, command.speed_limit,
+        )  # fmt: skip
+        self._add(topic, stamp_ns, data, record.cycle)
+
+    def _add(self, topic: str, stamp_ns: int, data: bytes, sequence: int = 0) -> None:
+        if topic not in self._channels:
+            kind = message_type(topic)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind.name])
+        self._wait_since(self._clock.now_ns())
+        stamp_ns = max(stamp_ns, 0)
+        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: types.TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class _ChunkFile:
+    """A file that is appended to whole flush by whole flush, so that it can always be cut at the last one."""
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._buffer = bytearray()
+        self._flushed = [0]
+
+    def write(self, data: bytes) -> int:
+        self._buffer += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._flushed[-1] + len(self._buffer)
+
+    def flush(self) -> None:
+        if not self._buffer:
+            return
+        left = memoryview(bytes(self._buffer))
+        while left:
+            left = left[os.write(self._descriptor, left) :]
+        self._flushed.append(self.tell())
+        self._buffer.clear()
+
+    def close(self) -> None:
+        os.fsync(self._descriptor)
+        os.close(self._descriptor)
+
+    def seal(self) -> None:
+        """Cut what a failed flush left and end the file properly; the last chunks make room if they must."""
+        end = _ending()
+        for size in self._flushed[:0:-1]:
+            try:
+                os.ftruncate(self._descriptor, size)
+                if os.pwrite(self._descriptor, end, size) == len(end):
+                    break
+                os.ftruncate(self._descriptor, size)
+            except OSError:
+                continue  # Without an ending the file is torn but whole up to here; repair reads it.
+        os.close(self._descriptor)
+
+
+def _ending() -> bytes:
+    """Bytes that end an MCAP file without a summary."""
+    builder = RecordBuilder()
+    DataEnd(0).write(builder)
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    return bytes(builder.end()) + MCAP0_MAGIC  # type: ignore[no-untyped-call]

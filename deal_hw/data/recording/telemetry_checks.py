@@ -1,0 +1,238 @@
+"""Telemetry checks: what in a recording would mislead a calibration.
+
+A check returns one :class:`Verdict`: "ok", "warn" (usable, but know it) or "fail" (calibrate refuses).
+Clamping by the device is data and never fails; clamping by our own safety filter is flagged, because the
+policy was not obeyed.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.data.recording.clock_sync import find_jumps
+from deal_hw.types import Status, Trajectory
+
+MIN_DURATION_S = 2.0
+MAX_GAP_S = 0.05
+FROZEN_S = 0.5
+CLIP_TOLERANCE = 1e-5
+"""Differences between asked and sent below this are the wire's rounding [m or rad]."""
+
+
+class Severity(enum.StrEnum):
+    """How bad it is."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The result of one check.
+
+    Attributes:
+        name: The check.
+        severity: How bad it is.
+        message: One sentence with the numbers and, where something is wrong, what to do.
+    """
+
+    name: str
+    severity: Severity
+    message: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {key: str(value) for key, value in asdict(self).items()}
+
+
+def check(trajectory: Trajectory) -> tuple[Verdict, ...]:
+    """Run all checks on a recording; the order is fixed."""
+    if trajectory.device_s.size < 2:
+        count = trajectory.device_s.size
+        return (
+            Verdict("length", Severity.FAIL, f"{count} state samples; record at least {MIN_DURATION_S:g} s"),
+        )
+    return (
+        _length(trajectory),
+        _finite(trajectory),
+        _clock(trajectory),
+        _gaps(trajectory),
+        _lost_frames(trajectory),
+        _jitter(trajectory),
+        _frozen(trajectory),
+        _commands(trajectory),
+        _clamped_by_device(trajectory),
+        _clamped_by_us(trajectory),
+        _stopped(trajectory),
+        _hand_over(trajectory),
+    )
+
+
+def worst(verdicts: Sequence[Verdict]) -> Severity:
+    """Return the worst severity."""
+    order = list(Severity)
+    return max((verdict.severity for verdict in verdicts), key=order.index, default=Severity.OK)
+
+
+def nominal_period_s(trajectory: Trajectory) -> float:
+    """Return the time between state samples: by the description, else the median of the recording [s]."""
+    rate_hz = trajectory.metadata.get("description", {}).get("state_rate_hz")
+    return 1.0 / rate_hz if rate_hz else float(np.median(np.diff(trajectory.device_s)))
+
+
+def _length(trajectory: Trajectory) -> Verdict:
+    duration_s, count = trajectory.duration_s, trajectory.device_s.size
+    text = f"{duration_s:.2f} s, {count} state samples, {trajectory.sent_s.size} commands"
+    if duration_s >= MIN_DURATION_S:
+        return Verdict("length", Severity.OK, text)
+    return Verdict("length", Severity.FAIL, f"{text}; too short, record at least {MIN_DURATION_S:g} s")
+
+
+def _finite(trajectory: Trajectory) -> Verdict:
+    bad = {
+        f"{channel} of {joint}": int(np.sum(~np.isfinite(getattr(trajectory, channel)[:, index])))
+        for channel in ("position", "velocity", "effort")
+        for index, joint in enumerate(trajectory.joint_names)
+    }
+    # The file of an import may have no effort at all.
+    if "import" in trajectory.metadata and np.isnan(trajectory.effort).all():
+        bad = {name: count for name, count in bad.items() if not name.startswith("effort")}
+    found = [f"{name}: {count}" for name, count in bad.items() if count]
+    if not found:
+        return Verdict("finite", Severity.OK, "all values are finite")
+    # Effort is the device's own estimate; a robot without one reports NaN, and calibration does not read it.
+    severity = Severity.WARN if all(name.startswith("effort") for name in found) else Severity.FAIL
+    return Verdict("finite", severity, f"values that are not finite ({', '.join(found)}); check the sensors")
+
+
+def _clock(trajectory: Trajectory) -> Verdict:
+    back = int(np.sum(np.diff(trajectory.device_s) < 0))
+    if back:
+        text = f"the device clock ran backwards {back} times; did the device restart? Record again"
+        return Verdict("clock", Severity.FAIL, text)
+    jumps = find_jumps(trajectory.device_s, trajectory.receive_s - trajectory.device_s)
+    if jumps:
+        places = ", ".join(f"{jump.size_s * 1e3:+.1f} ms at {jump.device_s:.2f} s" for jump in jumps[:5])
+        text = f"{len(jumps)} clock jumps ({places}); do not set clocks while recording. Record again"
+        return Verdict("clock", Severity.FAIL, text)
+    repeated = int(np.sum(np.diff(trajectory.device_s) == 0))
+    if repeated:
+        severity = Severity.FAIL if repeated > 0.02 * trajectory.device_s.size else Severity.WARN
+        text = f"{repeated} samples repeat the device time of the one before; is the device stuck?"
+        return Verdict("clock", severity, text)
+    return Verdict("clock", Severity.OK, "the clocks of device and host run evenly")
+
+
+def _gaps(trajectory: Trajectory) -> Verdict:
+    steps = np.diff(trajectory.device_s)
+    period_s = nominal_period_s(trajectory)
+    count, longest_s = int(np.sum(steps > 1.5 * period_s)), float(np.max(steps))
+    text = f"{count} gaps in the state stream, the longest {longest_s * 1e3:.1f} ms"
+    if longest_s > max(MAX_GAP_S, 2.5 * period_s):
+        return Verdict(
+            "gaps", Severity.FAIL, f"{text}; more than {MAX_GAP_S * 1e3:g} ms is too long. Check the cable"
+        )
+    return Verdict("gaps", Severity.WARN if count > 0.02 * steps.size else Severity.OK, text)
+
+
+def _lost_frames(trajectory: Trajectory) -> Verdict:
+    lost = int(trajectory.metadata.get("lost_frames", 0))
+    share = lost / (lost + trajectory.device_s.size)
+    text = f"{lost} state samples never arrived ({share:.1%})"
+    if share > 0.2:
+        return Verdict("lost_frames", Severity.FAIL, f"{text}; check the cable and the load of this computer")
+    return Verdict("lost_frames", Severity.WARN if share > 0.02 else Severity.OK, text)
+
+
+def _jitter(trajectory: Trajectory) -> Verdict:
+    delay_s = trajectory.receive_s - trajectory.device_s
+    lateness_s = delay_s - np.min(delay_s)
+    p50, p99 = np.percentile(lateness_s, [50, 99])
+    text = f"samples arrive {p50 * 1e3:.2f} ms (p50), {p99 * 1e3:.2f} ms (p99) after the fastest one"
+    if p99 > 0.02:
+        return Verdict("jitter", Severity.WARN, f"{text}; control was late, the device's own stamps are not")
+    return Verdict("jitter", Severity.OK, text)
+
+
+def _frozen(trajectory: Trajectory) -> Verdict:
+    moving = np.any(np.diff(trajectory.position, axis=0) != 0, axis=1)
+    found = []
+    for index, joint in enumerate(trajectory.joint_names):
+        still_s = _longest_still(trajectory, index, moving)
+        if still_s > FROZEN_S:
+            found.append(f"{joint} for {still_s:.2f} s")
+    if not found:
+        return Verdict("frozen", Severity.OK, "no position stands still while others move")
+    text = (
+        f"positions without any change while other joints move: {', '.join(found)}; is the sensor connected?"
+    )
+    whole = any(not np.any(np.diff(column)) for column in trajectory.position.T)
+    return Verdict("frozen", Severity.FAIL if whole else Severity.WARN, text)
+
+
+def _longest_still(trajectory: Trajectory, index: int, moving: np.ndarray[Any, np.dtype[np.bool_]]) -> float:
+    """Return the longest time that one position does not change at all while another one does [s]."""
+    changes = np.flatnonzero(np.diff(trajectory.position[:, index]) != 0) + 1
+    edges = np.concatenate(([0], changes, [trajectory.device_s.size - 1]))
+    spans = np.diff(trajectory.device_s[edges])
+    total = np.concatenate(([0], np.cumsum(moving)))
+    others = np.diff(total[edges]) > 0.5 * np.diff(edges)
+    return float(np.max(spans[others], initial=0.0))
+
+
+def _commands(trajectory: Trajectory) -> Verdict:
+    seen = np.unique(trajectory.command_sequence[trajectory.command_sequence >= 0])
+    sent = trajectory.sent_sequence
+    if not sent.size:
+        return Verdict("commands", Severity.WARN, "no command was sent; the motors were passive all along")
+    inside = sent[sent <= (seen[-1] if seen.size else -1)]
+    arrived = float(np.mean(np.isin(inside, seen))) if inside.size else 0.0
+    text = f"{arrived:.1%} of the commands were seen in force"
+    if arrived < 0.5:
+        return Verdict(
+            "commands", Severity.FAIL, f"{text}; the device does not get them. Check the line to it"
+        )
+    return Verdict("commands", Severity.WARN if arrived < 0.98 else Severity.OK, text)
+
+
+def _clamped_by_device(trajectory: Trajectory) -> Verdict:
+    effort = np.mean((trajectory.status & int(Status.EFFORT_CLAMPED)) != 0)
+    speed = np.mean((trajectory.status & int(Status.SPEED_CLAMPED)) != 0)
+    text = f"the device's own limits were in force: effort {effort:.1%}, speed {speed:.1%} of the time (data)"
+    return Verdict("clamped_by_device", Severity.OK, text)
+
+
+def _clamped_by_us(trajectory: Trajectory) -> Verdict:
+    asked, sent = trajectory.asked_position, trajectory.position_target
+    clipped = np.any(np.abs(asked - sent) > CLIP_TOLERANCE, axis=1)
+    count = int(np.sum(clipped))
+    text = f"our safety filter changed {count} of {clipped.size} commands"
+    if count > 0.05 * clipped.size:
+        return Verdict("clamped_by_us", Severity.WARN, f"{text}; ask for smaller targets or raise its limits")
+    return Verdict("clamped_by_us", Severity.OK, text)
+
+
+def _stopped(trajectory: Trajectory) -> Verdict:
+    watchdog = float(np.mean((trajectory.status & int(Status.WATCHDOG)) != 0))
+    fault = float(np.mean((trajectory.status & int(Status.FAULT)) != 0))
+    stops = float(np.mean((trajectory.status & int(Status.AT_END_STOP)) != 0))
+    text = f"watchdog {watchdog:.1%}, fault {fault:.1%}, at an end stop {stops:.1%} of the time"
+    if watchdog or fault:
+        return Verdict("stopped", Severity.WARN, f"{text}; the motors were off then, use the part before")
+    if stops:
+        return Verdict("stopped", Severity.WARN, f"{text}; the model's end stops must fit")
+    return Verdict("stopped", Severity.OK, text)
+
+
+def _hand_over(trajectory: Trajectory) -> Verdict:
+    lost = int(trajectory.metadata.get("hand_over_losses", 0))
+    text = f"{lost} control cycles did not reach the recorder"
+    if lost:
+        text += "; their samples are missing. Is the disk slow or the computer overloaded?"
+    return Verdict("hand_over", Severity.WARN if lost else Severity.OK, text)

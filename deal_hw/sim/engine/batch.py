@@ -1,0 +1,291 @@
+"""Batched simulation of one robot: N members with their own parameters on one thread pool.
+
+States are tangent coordinates (module of this name), (N, C): for a floating base position, rotation vector
+and then the joints, for a fixed base the joints alone; velocities are MuJoCo's, in the same order. Joint
+positions are as the robot reports them: each member's encoder bias is added to what comes out and taken from
+what goes in.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco.batch import Batch
+
+from deal_hw.errors import CalibrationError, short
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
+from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
+from deal_hw.sim.parameters.fields import BatchFields
+from deal_hw.types import FloatArray
+
+ENCODER_BIAS = "encoder_bias"
+"""Kind of parameter that no MuJoCo field holds: reported minus true joint position."""
+
+COMMAND_DELAY = "command_delay"
+"""Kind that no MuJoCo field holds: what an actuator is sent acts later by it, on top of the latency."""
+
+SIZES_KEPT = 6
+"""Simulators of so many sizes are kept: one iteration of a search or polish needs up to four."""
+
+
+def default_threads() -> int:
+    """Return the number of CPUs this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+class ServoBatch:
+    """N simulations of one robot; the one place where the calibrator and the trainer meet the engine.
+
+    Args:
+        robot: The robot's model.
+        space: The parameters that members differ in.
+        count: Members N.
+        threads: Threads; None for all CPUs.
+    """
+
+    def __init__(
+        self, robot: RobotModel, space: ParameterSpace, count: int, threads: int | None = None
+    ) -> None:
+        self.robot = robot
+        self.space = space
+        self.count = count
+        self.batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())
+        self._fields = BatchFields(self.batch, robot.model)
+        self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._warmstart = self.batch.bind("qacc_warmstart")
+        self._nominal = np.array([p.nominal for p in space.parameters])
+        self._dof = list(robot.qvel)
+        if robot.base is not None:
+            self._dof = [*range(robot.base[1], robot.base[1] + 6), *self._dof]
+        description = robot.description
+        self._default = {
+            "servo_stiffness": np.array(description.stiffness),
+            "servo_damping": np.array(description.damping),
+            "servo_effort_limit": np.array(description.effort_limit),
+            "servo_speed_limit": np.array(description.speed_limit),
+        }
+        self.steps = 0
+        self.set_parameters(np.repeat(space.nominal[None], count, axis=0))
+
+    def set_parameters(self, theta: FloatArray, where: npt.NDArray[np.intp] | None = None) -> None:
+        """Set the free parameters of all members, or of those in ``where``.
+
+        Args:
+            theta: Physical values, (N, K), for all members even where only some are set.
+            where: Indices of the members whose derived constants change; None for all.
+        """
+        self._theta = np.array(theta, dtype=float)
+        apply_parameters(self._fields, self.space, self._theta)
+        self.batch.set_const(ids=where)
+        columns = {name: self._theta[:, k] for k, name in enumerate(self.space.names)}
+        description = self.robot.description
+        self._acting = {
+            kind: np.repeat(self._default[kind][None], self.count, axis=0) for kind in SERVO_KINDS
+        }
+        self._bias = np.zeros((self.count, len(description.joint_names)))
+        self._delay_s: FloatArray | None = None
+        for p in self.space.parameters:
+            values = columns.get(p.name, np.full(self.count, p.nominal))
+            for name in p.elements:
+                if p.kind in SERVO_KINDS:
+                    self._acting[p.kind][:, self.robot.actuator_names.index(name)] = values
+                elif p.kind == ENCODER_BIAS:
+                    self._bias[:, description.joint_names.index(name)] = values
+                elif p.kind == COMMAND_DELAY:
+                    if self._delay_s is None:
+                        self._delay_s = np.zeros((self.count, len(self.robot.actuator_names)))
+                    self._delay_s[:, self.robot.actuator_names.index(name)] = values
+        self._biased = bool(np.any(self._bias))
+        self.set_sent(
+            self._default["servo_stiffness"],
+            self._default["servo_damping"],
+            self._default["servo_effort_limit"],
+        )
+
+    def servo_factor(self, kind: str) -> FloatArray:
+        """Return what the device makes of a sent gain or limit: acting value = factor * sent, (N, A)."""
+        default = self._default[kind]
+        # A gain of zero or a limit of infinity has no factor; what is sent then acts as it is.
+        scalable = np.isfinite(default) & (default != 0)
+        factor = self._acting[kind] / np.where(scalable, default, 1.0)
+        return np.where(scalable, factor, 1.0)
+
+    def lag_s(self, latency_s: FloatArray) -> FloatArray:
+        """Return by how much what is sent acts late: the latency, and each actuator's command delay on top.
+
+        Args:
+            latency_s: Total latency of each member, (N,) [s].
+
+        Returns:
+            (N,) where no parameter is a command delay, else (N, A) [s].
+        """
+        latency = np.asarray(latency_s, dtype=float)
+        return latency if self._delay_s is None else latency[:, None] + self._delay_s
+
+    def _act(self, kind: str, sent: FloatArray) -> FloatArray:
+        default = self._default[kind]
+        scalable = np.isfinite(default) & (default != 0)
+        ratio = np.where(scalable, sent / np.where(scalable, default, 1.0), 1.0)
+        return np.asarray(self._acting[kind] * ratio)
+
+    def set_sent(self, stiffness: FloatArray, damping: FloatArray, effort_limit: FloatArray) -> None:
+        """Set the gains and limits that the host sends from now on, (A,) each; motors take none."""
+        if self.robot.description.actuation != "position":
+            return
+        gain, bias = self._fields.get("actuator_gainprm"), self._fields.get("actuator_biasprm")
+        force = self._fields.get("actuator_forcerange")
+        kp, kd = self._act("servo_stiffness", stiffness), self._act("servo_damping", damping)
+        limit = self._act("servo_effort_limit", effort_limit)
+        actuator = list(self.robot.actuator)
+        gain[:, actuator, 0] = kp
+        bias[:, actuator, 1] = -kp
+        bias[:, actuator, 2] = -kd
+        if np.isfinite(limit).all():
+            force[:, actuator, 0] = -limit
+            force[:, actuator, 1] = limit
+
+    def set_state(
+        self,
+        position: FloatArray,
+        velocity: FloatArray,
+        where: npt.NDArray[np.intp] | slice = slice(None),
+        reference: FloatArray | None = None,
+    ) -> None:
+        """Set the state, (N, C) or (C,) each, of the members in ``where``.
+
+        Args:
+            position: Chart coordinates.
+            velocity: Their velocities: linear in the world, angular in the base's frame, joints.
+            where: The members.
+            reference: Reference orientation of the chart, (4,) or (N, 4); the identity by default.
+        """
+        rows = np.arange(self.count)[where][:, None]
+        joints = position[..., self.robot.joints]
+        self._qpos[rows, list(self.robot.qpos)] = joints - self._bias[rows[:, 0]] if self._biased else joints
+        if self.robot.base is not None:
+            at = self.robot.base[0]
+            self._qpos[rows, [at, at + 1, at + 2]] = position[..., :3]
+            orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
+            self._qpos[rows, [at + 3, at + 4, at + 5, at + 6]] = orientation
+        self._qvel[rows, self._dof] = velocity
+        # A warm start left by another episode would make results depend on history in the last digits.
+        self._warmstart[rows[:, 0]] = 0.0
+
+    @property
+    def position(self) -> FloatArray:
+        """Chart coordinates now, (N, C), around the identity."""
+        return self._chart(self._qpos, None)
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Velocities now, (N, C)."""
+        return np.asarray(self._qvel[:, self._dof])
+
+    def _chart(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
+        """Return qpos, (N, ..., nq), as reported chart coordinates, (N, ..., C)."""
+        joints = qpos[..., list(self.robot.qpos)]
+        if self._biased:
+            joints = joints + self._bias.reshape(self.count, *(1,) * (qpos.ndim - 2), -1)
+        if self.robot.base is None:
+            return np.asarray(joints)
+        at = self.robot.base[0]
+        turned = to_vector(qpos[..., at + 3 : at + 7], IDENTITY if reference is None else reference)
+        return np.concatenate([qpos[..., at : at + 3], turned, joints], axis=-1)
+
+    def advance(
+        self, setpoint: FloatArray, every: int = 0, reference: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Advance all members in open loop.
+
+        Args:
+            setpoint: Set-point (or motor command) in force at each step, (N, S, A).
+            every: Record each ``every``-th step; 0 records only the last.
+            reference: Reference orientations of the charts at the recorded steps, (S // every, 4); the
+                identity by default.
+
+        Returns:
+            Positions and velocities after steps every, 2 every, ..., (N, S // every, C) each. A member that
+            diverged (MuJoCo's warning counters rose) is NaN from there on.
+        """
+        if self._biased and self.robot.description.actuation == "position":
+            # The servo compares the set-point with the biased reading.
+            setpoint = setpoint - self._bias[:, None, list(self.robot.description.actuated_index)]
+        count, steps, _ = setpoint.shape
+        nu = self.robot.model.nu
+        if nu != setpoint.shape[2] or list(self.robot.actuator) != list(range(nu)):
+            control = np.zeros((count, steps, nu))
+            control[:, :, list(self.robot.actuator)] = setpoint
+        else:
+            control = setpoint
+        before = self._warnings()
+        self.steps += count * steps
+        if not every:
+            # Stepping by rollout with a record of one field costs nothing over bare stepping.
+            every = steps
+        try:
+            record = self.batch.rollout(steps, control=control, record=("qpos", "qvel"))
+        except mujoco.FatalError as err:
+            raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
+        position = self._chart(record["qpos"][:, every - 1 :: every], reference)
+        velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
+        bad = self._warnings() > before
+        if bad.any():
+            position, velocity = position.copy(), velocity.copy()
+            position[bad], velocity[bad] = np.nan, np.nan
+        return position, velocity
+
+    def _warnings(self) -> npt.NDArray[np.int64]:
+        # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): a rise is a divergence, which MuJoCo answers
+        # by a reset.
+        return np.asarray(self.batch.warning[..., 1].sum(axis=-1), dtype=np.int64)
+
+
+class BatchPool:
+    """Simulators of one robot and space by their number of members, the last used ones.
+
+    A simulator holds an MjData a thread, of tens of megabytes of addresses and up to some megabytes in use.
+    Searches whose stages differ in size would keep one for every size that they ever had.
+
+    Args:
+        make: Makes a simulator of so many members.
+        most: Simulators that are kept.
+    """
+
+    def __init__(self, make: Callable[[int], ServoBatch], most: int = SIZES_KEPT) -> None:
+        self._make, self._most = make, most
+        self._kept: dict[int, ServoBatch] = {}
+        self._steps = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def steps(self) -> int:
+        """Physics steps of all simulators so far, of those that were given up too."""
+        return self._steps + sum(batch.steps for batch in self._kept.values())
+
+    def get(self, count: int) -> ServoBatch:
+        """Return the simulator of ``count`` members; parameters and state are whatever its last user left."""
+        batch = self._kept.pop(count, None) or self._make(count)
+        # Last in order is last used.
+        self._kept[count] = batch
+        if len(self._kept) > self._most:
+            self._steps += self._kept.pop(next(iter(self._kept))).steps
+        return batch
+
+
+def bare_steps_per_second(robot: RobotModel, count: int, steps: int, threads: int | None = None) -> float:
+    """Measure the engine alone: physics steps a second of ``count`` members, open loop."""
+    import time
+
+    batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())
+    batch.bind("qpos")[:, list(robot.qpos)] = 0.05
+    start = time.perf_counter()
+    batch.step(nstep=steps)
+    return count * steps / (time.perf_counter() - start)

@@ -1,0 +1,138 @@
+"""Compiles a user's MJCF: whatever is in it ends in a model that moves, or in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, short
+from deal_hw.reading import MIB, check_size, reading
+
+MJCF_BYTES: Final = 64 * MIB
+"""Largest top file of a model; what it includes counts as memory."""
+MEMORY_BYTES: Final = 4096 * MIB
+"""Memory that compiling a model and its first steps may take."""
+SECONDS: Final = 60.0
+"""Processor time of the same."""
+STEPS: Final = 10
+"""So many steps are simulated before a model is used."""
+_DIVERGED: Final = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+_ROOM: Final = "keep bodies apart (contype, exclude), or write a larger <size memory=.../>"
+_OVERFULL: Final = ("mjWARN_CONTACTFULL", "mjWARN_CNSTRFULL")
+
+
+def compile_mjcf(mjcf: Path) -> mujoco.MjModel:
+    """Compile the MJCF of a user.
+
+    A process of its own tries it first, with bounded memory and time: a texture of a million pixels a side, a
+    body replicated a milliard times or a mistake in MuJoCo's own code would otherwise cost this one.
+
+    Raises:
+        ConfigurationError: It does not exist, does not compile, takes too much, or does not stand ten steps.
+    """
+    path = Path(mjcf)
+    if not path.exists():
+        raise ConfigurationError(f"model {path} does not exist")
+    with reading(f"model {path}", "MJCF", error=ConfigurationError):
+        check_size(path, MJCF_BYTES)
+        _try(path)
+        return load_mjcf(path)
+
+
+def load_mjcf(mjcf: Path) -> mujoco.MjModel:
+    """Compile an MJCF that is trusted.
+
+    Raises:
+        ConfigurationError: It does not compile.
+    """
+    try:
+        return mujoco.MjModel.from_xml_path(str(mjcf))
+    except (ValueError, mujoco.FatalError) as err:
+        raise ConfigurationError(f"model {mjcf} does not compile: {short(str(err))}") from err
+
+
+def _try(path: Path) -> None:
+    """Compile and step in a process of its own.
+
+    Raises:
+        ConfigurationError: It did not go well.
+    """
+    words = [sys.executable, "-m", "deal_hw.sim.engine.compiling", os.path.abspath(path)]
+    # MuJoCo leaves its log where it works; that shall not be the user's folder.
+    with tempfile.TemporaryDirectory(prefix="deal-hw-") as folder:
+        try:
+            done = subprocess.run(
+                words, stdin=subprocess.DEVNULL, capture_output=True, timeout=4 * SECONDS, check=False,
+                cwd=folder,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired as err:
+            raise ConfigurationError(f"model {path} takes longer than {4 * SECONDS:g} s to compile") from err
+    answer = done.stdout.rpartition(b"\n")[2]
+    if done.returncode == 0 and answer.startswith(b"{"):
+        problem = json.loads(answer)["problem"]
+        if problem:
+            raise ConfigurationError(f"model {path} {problem}")
+        return
+    raise ConfigurationError(
+        f"model {path} cannot be compiled in {MEMORY_BYTES / MIB:g} MiB and {SECONDS:g} s (status "
+        f"{done.returncode}: {short(done.stderr.decode(errors='replace')[-80:]) or 'no word'}); is there a "
+        "size or a count with too many digits?"
+    )
+
+
+def problem_of(path: str) -> str:
+    """Return what is wrong with a model, "" for nothing."""
+    try:
+        model = mujoco.MjModel.from_xml_path(path)
+    except (ValueError, mujoco.FatalError) as err:
+        return f"does not compile: {short(str(err))}"
+    for name in ("qpos0", "body_mass", "body_inertia", "body_pos", "geom_pos", "jnt_axis", "dof_armature"):
+        if not np.isfinite(getattr(model, name)).all():
+            return f"holds a number that is not finite ({name}); MuJoCo's own warning names the line"
+    if not 0 < model.opt.timestep < 1:
+        return f"has a timestep of {model.opt.timestep:g} s; write one above 0 and below 1 s"
+    try:
+        data = mujoco.MjData(model)
+        for _ in range(STEPS):
+            mujoco.mj_step(model, data)
+    except (MemoryError, mujoco.FatalError) as err:
+        return f"compiles, but cannot be simulated: {short(str(err))}; {_ROOM}"
+    warned = {
+        name for name in (*_DIVERGED, *_OVERFULL) if data.warning[getattr(mujoco.mjtWarning, name)].number
+    }
+    if warned & set(_OVERFULL):
+        return f"has more contacts than its memory holds; {_ROOM}"
+    if warned:
+        return f"diverges in its first {STEPS} steps; reduce the timestep, or mend masses and gains"
+    return ""
+
+
+def _main() -> None:
+    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    _limit(resource.RLIMIT_AS, used + MEMORY_BYTES)
+    _limit(resource.RLIMIT_CPU, int(SECONDS))
+    _limit(resource.RLIMIT_CORE, 0)
+    answer: dict[str, Any] = {"problem": problem_of(sys.argv[1])}
+    print("\n" + json.dumps(answer), end="", flush=True)
+    # Whatever was damaged on the way shall not speak at the end.
+    os._exit(0)
+
+
+def _limit(what: int, most: int) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        _, hard = resource.getrlimit(what)
+        resource.setrlimit(what, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+
+
+if __name__ == "__main__":
+    _main()

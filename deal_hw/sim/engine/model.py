@@ -1,0 +1,137 @@
+"""MuJoCo models of servo-driven robots: loading, joints and actuators by name."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.parameters import apply_parameters
+from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
+from deal_hw.sim.parameters.kind import joint_of
+from deal_hw.types import FloatArray
+
+BASE_COORDINATES = ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz")
+"""Position in the world [m]; rotation vector from the reference orientation, in the base's frame [rad]."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotModel:
+    """A compiled MuJoCo model with the indices that follow a robot's description.
+
+    Attributes:
+        description: The robot.
+        model: The nominal model; treat as read-only.
+        qpos: Index into qpos of each joint, (J,).
+        qvel: Index into qvel of each joint, (J,).
+        actuator: Index of the actuator that drives each actuated joint, (A,).
+        base: Where the floating base's entries begin in qpos and qvel; None for a fixed base.
+    """
+
+    description: RobotDescription
+    model: mujoco.MjModel
+    qpos: tuple[int, ...]
+    qvel: tuple[int, ...]
+    actuator: tuple[int, ...]
+    base: tuple[int, int] | None = None
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        """Names of the actuators in the order of the actuated joints, (A,)."""
+        names = element_names(self.model, "actuator")
+        return tuple(names[i] for i in self.actuator)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the C chart coordinates of a state: base position and rotation, then the joints."""
+        return (BASE_COORDINATES if self.base is not None else ()) + self.description.joint_names
+
+    @property
+    def coordinate_units(self) -> tuple[str, ...]:
+        """Units of the chart coordinates, (C,)."""
+        base = ("m", "m", "m", "rad", "rad", "rad") if self.base is not None else ()
+        return base + self.description.position_units
+
+    @property
+    def rotation(self) -> slice:
+        """Which coordinates are the base's rotation vector; none of them for a fixed base."""
+        return slice(3, 6) if self.base is not None else slice(0, 0)
+
+    @property
+    def joints(self) -> slice:
+        """Which coordinates are joints."""
+        return slice(0 if self.base is None else 6, None)
+
+    @property
+    def step_s(self) -> float:
+        """Physics step [s]."""
+        return float(self.model.opt.timestep)
+
+
+def load_model(description: RobotDescription, step_s: float | None = None) -> RobotModel:
+    """Compile a robot's MJCF and find its joints and actuators by name.
+
+    Args:
+        description: The robot.
+        step_s: Physics step [s]; None for the MJCF's, or for the device period where that is no multiple.
+
+    Raises:
+        ConfigurationError: The MJCF does not compile, or the device period is no multiple of the step.
+        UnknownNameError: A joint of the description is not in the model.
+    """
+    model = load_mjcf(description.mjcf)
+    if step_s is None:
+        # Two robots may share an MJCF whose step fits only one of them.
+        steps = 1.0 / (description.device_rate_hz * model.opt.timestep)
+        step_s = model.opt.timestep if abs(steps - round(steps)) < 1e-6 else 1.0 / description.device_rate_hz
+    model.opt.timestep = step_s
+    joints = [element_id(model, "joint", name) for name in description.joint_names]
+    base = None
+    if description.floating_base is not None:
+        free = element_id(model, "joint", description.floating_base)
+        base = int(model.jnt_qposadr[free]), int(model.jnt_dofadr[free])
+    return RobotModel(
+        description=description,
+        model=model,
+        qpos=tuple(int(model.jnt_qposadr[j]) for j in joints),
+        qvel=tuple(int(model.jnt_dofadr[j]) for j in joints),
+        actuator=tuple(actuator_of(model, name) for name in description.actuated),
+        base=base,
+    )
+
+
+def actuator_of(model: mujoco.MjModel, joint: str) -> int:
+    """Return the id of the actuator that drives a joint, whatever the actuator's own name.
+
+    Raises:
+        UnknownNameError: There is no such joint.
+        ConfigurationError: No actuator drives it, or several do.
+    """
+    index = element_id(model, "joint", joint)
+    found = [i for i in range(model.nu) if joint_of(model, i) == index]
+    if len(found) == 1:
+        return found[0]
+    names = element_names(model, "actuator")
+    if not found:
+        raise ConfigurationError(
+            f"no actuator of the model drives joint {joint!r}; actuators: {', '.join(names) or '(none)'}. "
+            f'Give it one in the MJCF, such as <position joint="{joint}" kp="..."/>'
+        )
+    raise ConfigurationError(
+        f"actuators {', '.join(names[i] or f'number {i}' for i in found)} all drive joint {joint!r}; "
+        "keep the one that takes the recorded commands"
+    )
+
+
+def model_with(robot: RobotModel, space: ParameterSpace, theta: FloatArray) -> mujoco.MjModel:
+    """Return a copy of the model with the parameters set, (K,)."""
+    model = copy.copy(robot.model)
+    apply_parameters(ModelFields(model, robot.model), space, np.asarray(theta, dtype=float)[None])
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model

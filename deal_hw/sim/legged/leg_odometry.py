@@ -1,0 +1,103 @@
+"""Base velocity and height of a legged robot from its joints and its IMU: feet that stand do not move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
+from deal_hw.sim.parameters.fields import element_id
+from deal_hw.types import FloatArray
+
+STANCE_M = 0.008
+"""Feet within this height of the lowest one count as standing [m]."""
+
+VELOCITY_STD = 0.04
+"""Standard deviation of a base velocity from the legs [m/s]: joint noise, soft contacts, a little slip."""
+
+HEIGHT_STD = 0.004
+"""Standard deviation of a base height from the legs [m]: how far contacts give way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """What the legs say of the base.
+
+    Attributes:
+        velocity: Of the base's origin in the world, (T, 3) [m/s].
+        height: Of the base's origin over the floor, (T,) [m].
+    """
+
+    velocity: FloatArray
+    height: FloatArray
+
+
+def leg_odometry(
+    robot: RobotModel,
+    feet: tuple[str, ...],
+    orientation: FloatArray,
+    angular_velocity: FloatArray,
+    joint_position: FloatArray,
+    joint_velocity: FloatArray,
+) -> Odometry:
+    """Estimate base velocity and height on a level floor at height 0.
+
+    A foot that stands rolls about its contact point: the velocity of the sphere's lowest point is zero. The
+    standing feet's answers are combined by their median.
+
+    Args:
+        robot: A robot with a floating base.
+        feet: Names of the feet's sphere geoms.
+        orientation: Of the base, (T, 4).
+        angular_velocity: In the base's frame, (T, 3) [rad/s].
+        joint_position: (T, J).
+        joint_velocity: (T, J).
+
+    Raises:
+        ConfigurationError: The robot's base is fixed.
+    """
+    if robot.base is None:
+        raise ConfigurationError(f"{robot.description.name}: leg odometry needs a floating base")
+    model, data = robot.model, mujoco.MjData(robot.model)
+    at, dof = robot.base
+    geoms = [element_id(model, "geom", name) for name in feet]
+    radius = np.array([model.geom_size[g, 0] for g in geoms])
+    T = len(orientation)
+    velocity, height = np.empty((T, 3)), np.empty(T)
+    both = np.empty(6)
+    for t in range(T):
+        data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = 0.0, orientation[t]
+        data.qpos[list(robot.qpos)] = joint_position[t]
+        data.qvel[dof : dof + 3], data.qvel[dof + 3 : dof + 6] = 0.0, angular_velocity[t]
+        data.qvel[list(robot.qvel)] = joint_velocity[t]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        lowest = np.array([data.geom_xpos[g, 2] for g in geoms]) - radius
+        stands = lowest < lowest.min() + STANCE_M
+        found = []
+        for i, g in enumerate(geoms):
+            if stands[i]:
+                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, g, both, 0)
+                found.append(both[3:] + np.cross(both[:3], (0.0, 0.0, -radius[i])))
+        velocity[t], height[t] = -np.median(found, axis=0), -np.median(lowest[stands])
+    return Odometry(velocity, height)
+
+
+def smooth_orientation(orientation: FloatArray, weights: FloatArray) -> FloatArray:
+    """Smooth orientations, (T, 4), by a moving polynomial; the ends stay as they are reported.
+
+    Args:
+        orientation: Reported orientations.
+        weights: Weights of the samples around each, (2 n + 1,), that sum to 1.
+    """
+    half = len(weights) // 2
+    smooth = orientation.copy()
+    for t in range(half, len(orientation) - half):
+        near = to_vector(orientation[t - half : t + half + 1], orientation[t])
+        smooth[t] = to_quaternion(weights @ near, orientation[t])
+    return smooth

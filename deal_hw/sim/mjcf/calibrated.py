@@ -1,0 +1,212 @@
+"""The calibrated model as a change of the user's own MJCF: his text, includes and meshes are kept.
+
+Only attributes that hold a changed value are touched; :mod:`deal_hw.sim.mjcf.text` says how.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, short
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.model import RobotModel, model_with
+from deal_hw.sim.mjcf import tables
+from deal_hw.sim.mjcf.changes import MjcfChanges, differences, numbers
+from deal_hw.sim.mjcf.paths import Relocation
+from deal_hw.sim.mjcf.text import Element, SourceFile, read_files
+from deal_hw.sim.parameters import DEVICE_KINDS, check_kinds
+from deal_hw.types import FloatArray
+
+SPEED_LIMIT_NUMERIC = "deal_hw.speed_limit"
+LATENCY_NUMERIC = "deal_hw.latency_s"
+
+ROUNDS = 4
+"""Writing one value may take another out of the compiler's hands (``dampratio``, ``settotalmass``): what then
+differs is written in the next round."""
+
+_CHECK = 1e-9
+_CHECK_DERIVED = 1e-5
+
+
+def write_calibrated_mjcf(
+    robot: RobotModel,
+    space: ParameterSpace,
+    theta: FloatArray,
+    path: Path,
+    latency_s: float,
+    source: str = "",
+) -> tuple[Path, ...]:
+    """Write the robot's MJCF with calibrated values.
+
+    What MuJoCo has no field for goes into ``<custom>``: the latency as ``deal_hw.latency_s``, and for each
+    kind of parameter outside MuJoCo (speed limit, encoder bias) one number an element, beside a ``<text>``
+    of the same name that lists the elements.
+
+    Args:
+        robot: The robot's model.
+        space: The parameters.
+        theta: Calibrated values, (K,).
+        path: File to write; included files that change are written beside it.
+        latency_s: Total latency [s].
+        source: What found the values, for the comment at the top.
+
+    Returns:
+        The files written, ``path`` first.
+
+    Raises:
+        ConfigurationError: A value has no place in MJCF, or the written file does not compile to the
+            calibrated model.
+    """
+    check_kinds(space)
+    return change_mjcf(
+        robot.description.mjcf,
+        path,
+        model_with(robot, space, theta),
+        device_values(space, theta) | {LATENCY_NUMERIC: ([latency_s], [])},
+        source,
+    )
+
+
+def device_values(space: ParameterSpace, theta: FloatArray) -> dict[str, tuple[list[float], list[str]]]:
+    """Return what no MuJoCo field holds by its name in ``<custom>``: values and elements."""
+    values = dict(zip(space.names, np.asarray(theta, dtype=float), strict=True)) | space.known
+    found: dict[str, tuple[list[float], list[str]]] = {}
+    for parameter in space.parameters:
+        if parameter.kind in DEVICE_KINDS:
+            data, elements = found.setdefault(f"deal_hw.{parameter.kind.removeprefix('servo_')}", ([], []))
+            for element in parameter.elements:
+                data.append(float(values[parameter.name]))
+                elements.append(element)
+    return found
+
+
+def change_mjcf(
+    path: Path,
+    target: Path,
+    want: Any,
+    custom: Mapping[str, tuple[Sequence[float], Sequence[str]]],
+    source: str = "",
+) -> tuple[Path, ...]:
+    """Write an MJCF so that it compiles to another model.
+
+    Args:
+        path: The user's file.
+        target: The file to write.
+        want: The MjModel it is to compile to; the same elements as the file's.
+        custom: Numbers for ``<custom>`` and the elements they belong to, by name.
+        source: For the comment at the top.
+
+    Returns:
+        The files written, ``target`` first.
+
+    Raises:
+        ConfigurationError: As :func:`write_calibrated_mjcf`.
+    """
+    require_other(target, path)
+    top = read_files(path)
+    spec = mujoco.MjSpec.from_file(str(top.path))
+    have = spec.compile()
+    changes = MjcfChanges(top.root, have, bool(spec.compiler.degree))
+    relocation = Relocation(top, target)
+    relocation.adapt()
+    _set_custom(top.root, custom)
+    written: dict[Path, SourceFile] = {}
+    try:
+        for _ in range(ROUNDS):
+            open_ = changes.apply(have, want)
+            top.header = _header(path, changes, custom, source)
+            written = relocation.files()
+            for file, content in written.items():
+                file.write_bytes(content.render())
+            if not open_:
+                break
+            have = _compile(target)
+        _check(target, have, want)
+    except (ConfigurationError, OSError):
+        for file in written:
+            file.unlink(missing_ok=True)
+        raise
+    return tuple(sorted(written, key=lambda file: file.name != target.name))
+
+
+def require_other(target: Path, path: Path) -> None:
+    """Check that a file to write is not the model itself.
+
+    Raises:
+        ConfigurationError: It is.
+    """
+    if target.exists() and target.samefile(path):
+        raise ConfigurationError(f"{target} is the model itself; write the calibrated one to another file")
+
+
+def _compile(path: Path) -> Any:
+    try:
+        # Where MuJoCo finds what included files refer to depends on whether this path is absolute.
+        return mujoco.MjModel.from_xml_path(os.path.abspath(path))
+    except (ValueError, mujoco.FatalError) as err:
+        raise ConfigurationError(
+            f"the calibrated model {path} does not compile: {short(str(err))}; the values are in "
+            "result.json beside it"
+        ) from err
+
+
+def _check(path: Path, written: Any, want: Any) -> None:
+    wrong = differences(written, want, _CHECK)
+    # Values near zero after a rotation or a scaling are rounding.
+    wrong = {
+        k: v
+        for k, v in wrong.items()
+        if not np.allclose(getattr(written, k), getattr(want, k), _CHECK, 1e-12)
+    }
+    for name in tables.FOLLOWS:
+        have, wish = getattr(written, name), getattr(want, name)
+        if not np.allclose(have, wish, rtol=_CHECK_DERIVED, atol=1e-9):
+            wrong[name] = ~np.isclose(have, wish, rtol=_CHECK_DERIVED, atol=1e-9)
+    for name, mask in wrong.items():
+        have, wish = getattr(written, name)[mask], getattr(want, name)[mask]
+        raise ConfigurationError(f"{path}: {name} came out as {have.tolist()}, expected {wish.tolist()}")
+
+
+def _header(
+    path: Path, changes: MjcfChanges, custom: Mapping[str, tuple[Sequence[float], Sequence[str]]], source: str
+) -> str:
+    lines = [f"Calibrated by deal-hw{': ' + source if source else ''}. A change of {path.name}:"]
+    for (_, element, attribute), (old, new) in changes.log.items():
+        lines.append(f"  {element}: {attribute} {_short(old)} -> {_short(new)}")
+    for name, (data, elements) in custom.items():
+        of = f" of {', '.join(elements)}" if elements else ""
+        lines.append(f"  custom: {name} {_short(numbers(data))}{of}")
+    return "\n".join([*lines, ""])
+
+
+def _short(values: str) -> str:
+    """Round an attribute's numbers for reading; the attribute itself has all digits."""
+    try:
+        return " ".join(f"{float(v):.5g}" for v in values.split())
+    except ValueError:
+        return values
+
+
+def _set_custom(root: Element, custom: Mapping[str, tuple[Sequence[float], Sequence[str]]]) -> None:
+    section = Element("custom")
+    for name, (data, elements) in custom.items():
+        # A file that was calibrated before has them already.
+        wanted = [("numeric", name, {"size": str(len(data)), "data": numbers(data)})]
+        if elements:
+            wanted.append(("text", f"{name}.elements", {"data": " ".join(elements)}))
+        for tag, full_name, attributes in wanted:
+            there = [e for e in root.walk() if e.tag == tag and e.get("name") == full_name]
+            element = there[0] if there else Element(tag)
+            if not there:
+                section.last.append(element)
+                element.set("name", full_name)
+            for key, value in attributes.items():
+                element.set(key, value)
+    if section.last:
+        root.last.append(section)

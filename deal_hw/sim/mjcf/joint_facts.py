@@ -1,0 +1,95 @@
+"""Names, units and limits of the joints of any MJCF: what a recording is compared with before it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.sim.engine.compiling import compile_mjcf
+from deal_hw.sim.parameters.kind import joint_of
+from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointFacts:
+    """The joints of a model that have one coordinate each, in the model's order.
+
+    Attributes:
+        names: (J,).
+        units: "rad" or "m", (J,).
+        limits: Lowest and highest position, (J, 2) [rad or m]; infinite where free.
+        left_out: Free and ball joints, which a recording gives no single position of.
+        servo: Whether an actuator of each joint takes positions, (J,).
+        motor: Whether one takes efforts, (J,).
+        command: Lowest and highest command that the actuator takes by its ctrlrange, as recordings hold it
+            (positions, or efforts at the joint), (J, 2); infinite where free.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    limits: FloatArray
+    left_out: tuple[str, ...]
+    servo: np.ndarray[Any, np.dtype[np.bool_]]
+    motor: np.ndarray[Any, np.dtype[np.bool_]]
+    command: FloatArray
+
+
+def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
+    """Read the joints of a model.
+
+    Args:
+        mjcf: Its file.
+        model: The same, compiled; None to compile it.
+
+    Raises:
+        ConfigurationError: The file does not exist or does not compile, or has no hinge or slide.
+    """
+    model = compile_mjcf(mjcf) if model is None else model
+    names: list[str] = []
+    units, limits, left_out = [], [], []
+    index_of: dict[int, int] = {}
+    for index in range(model.njnt):
+        joint = model.joint(index)
+        kind = mujoco.mjtJoint(int(joint.type[0]))
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            left_out.append(joint.name or f"joint {index}")
+            continue
+        if not joint.name:
+            raise ConfigurationError(
+                f"model {mjcf}: joint {index} has no name; name it, recordings need names"
+            )
+        index_of[index] = len(names)
+        names.append(joint.name)
+        units.append("m" if kind == mujoco.mjtJoint.mjJNT_SLIDE else "rad")
+        limits.append(joint.range if bool(joint.limited[0]) else (-np.inf, np.inf))
+    if not names:
+        raise ConfigurationError(f"model {mjcf} has no hinge or slide joint")
+    servo, motor, command = _actuation(model, index_of)
+    return JointFacts(
+        tuple(names), tuple(units), np.array(limits, dtype=np.float64), tuple(left_out), servo, motor, command
+    )
+
+
+def _actuation(
+    model: mujoco.MjModel, column: Mapping[int, int]
+) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], np.ndarray[Any, np.dtype[np.bool_]], FloatArray]:
+    """Return which joints have servos and motors, and what these take; columns are those of the joints."""
+    servo, motor = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
+    command = np.tile([-np.inf, np.inf], (len(column), 1))
+    for actuator in range(model.nu):
+        joint = joint_of(model, actuator)
+        if joint not in column:
+            continue
+        at = column[joint]
+        closes = bool(model.actuator_biasprm[actuator, 1] < 0)
+        servo[at], motor[at] = servo[at] or closes, motor[at] or not closes
+        if model.actuator_ctrllimited[actuator]:
+            full = 1.0 if closes else model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0]
+            command[at] = np.sort(model.actuator_ctrlrange[actuator] * full)
+    return servo, motor, command

@@ -1,0 +1,104 @@
+"""Parts of an episode: stretches short enough for many members, and a last part to judge by."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from deal_hw.sim.recordings.episode import SENT, Episode
+
+LEAD_S = 0.1
+"""Commands kept before a part's first sample: as long as any latency reaches back [s]."""
+
+
+SAMPLED = {
+    "sample": 1, "position": 2, "velocity": 2, "usable": 1, "reported": 1, "reference": 2, "estimate_std": 2,
+}  # fmt: skip
+"""Axes of what an episode has for each sample; what is the same for all samples has fewer."""
+
+
+def part(episode: Episode, first: int, last: int) -> Episode:
+    """Return the samples first .. last - 1 of an episode, with the commands that act on them.
+
+    Set-points without a speed limit depend on nothing older than the latency. With a limit the set-point at
+    the part's beginning is taken to have reached its target.
+    """
+    lead = round(LEAD_S / episode.step_s)
+    origin = max(int(episode.sample[first]) - lead, 0)
+    until = max(int(episode.sample[last - 1]), origin + 1)
+    start = episode.start_setpoint if origin == 0 else episode.target[origin - 1]
+    return dataclasses.replace(
+        episode.cut(slice(first, last), slice(origin, until)),
+        sample=episode.sample[first:last] - origin,
+        start_setpoint=start,
+        first_row=episode.first_row + first,
+        origin=episode.origin + origin,
+    )
+
+
+def stretches(episode: Episode, seconds: float) -> list[Episode]:
+    """Cut an episode into parts of equal length, none longer than ``seconds``; they share end samples."""
+    T = len(episode.sample)
+    count = max(int(np.ceil((T - 1) * episode.period_s / seconds)), 1)
+    edges = np.linspace(0, T - 1, count + 1).round().astype(int)
+    return [part(episode, int(a), int(b) + 1) for a, b in itertools.pairwise(edges) if b > a]
+
+
+def joined(parts: Sequence[Episode]) -> list[Episode]:
+    """Return parts with those put together again that follow each other: the reverse of `stretches`."""
+    found: list[Episode] = []
+    for after in parts:
+        if found and _follows(found[-1], after):
+            found[-1] = _joined(found[-1], after)
+        else:
+            found.append(after)
+    return found
+
+
+def _follows(before: Episode, after: Episode) -> bool:
+    """Say whether a part begins with the sample that another ends with."""
+    return (
+        after.first_row == before.first_row + len(before.sample) - 1
+        and after.origin + int(after.sample[0]) == before.origin + int(before.sample[-1])
+        and 0 <= after.origin - before.origin <= before.steps
+        and np.array_equal(after.position[0], before.position[-1])
+    )
+
+
+def _joined(before: Episode, after: Episode) -> Episode:
+    shift = after.origin - before.origin
+    samples: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name)[:-1], getattr(after, name)])
+        for name, axes in SAMPLED.items()
+        if np.ndim(getattr(before, name)) == np.ndim(getattr(after, name)) == axes
+    }
+    samples["sample"] = np.concatenate([before.sample[:-1], after.sample + shift])
+    sent: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name)[:shift], getattr(after, name)]) for name in SENT
+    }
+    return dataclasses.replace(before, **samples, **sent)
+
+
+def split_last(episode: Episode, share: float) -> tuple[Episode, Episode]:
+    """Return an episode without its last part, and that part.
+
+    Args:
+        episode: The episode.
+        share: Share of the samples in the last part, between 0 and 1.
+    """
+    at = round((1.0 - share) * (len(episode.sample) - 1))
+    return part(episode, 0, at + 1), part(episode, at, len(episode.sample))
+
+
+def spread(parts: Sequence[Episode], seconds: float) -> list[Episode]:
+    """Return parts that lie evenly over all and add up to about so many seconds; all where they are fewer."""
+    lengths = np.array([(len(p.sample) - 1) * p.period_s for p in parts])
+    if lengths.sum() <= seconds:
+        return list(parts)
+    count = max(int(seconds / lengths.mean()), 1)
+    chosen = np.unique(((np.arange(count) + 0.5) * len(parts) / count).astype(int))
+    return [parts[i] for i in chosen]

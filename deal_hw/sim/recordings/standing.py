@@ -1,0 +1,46 @@
+"""Where a robot with legs is drawn, from what it senses: orientation, and a floor under the lowest foot."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion
+from deal_hw.sim.parameters.fields import element_id
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.imu_base import with_base
+from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
+
+
+def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
+    """Return poses of the base, (T, 7), position and quaternion wxyz; None where nothing senses them.
+
+    Nobody measures where on the floor the robot is: it stays at the origin, as high as its lowest foot says.
+    """
+    body = trajectory.body
+    if body is None or robot.base is None:
+        return None
+    feet = [element_id(robot.model, "geom", name) for name in robot.description.feet]
+    data = mujoco.MjData(robot.model)
+    at = robot.base[0]
+    poses = np.zeros((len(trajectory.device_s), 7))
+    poses[:, 3:] = body.orientation
+    for t, q in enumerate(trajectory.position):
+        data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = 0.0, poses[t, 3:]
+        data.qpos[list(robot.qpos)] = q
+        mujoco.mj_kinematics(robot.model, data)
+        if feet:
+            poses[t, 2] = np.max(robot.model.geom_size[feet, 0] - data.geom_xpos[feet, 2])
+    return poses
+
+
+def with_sensed_base(episode: Episode, robot: RobotModel, body: BodyTrajectory) -> Episode:
+    """Return an episode of joints with the base from the body's sensors, as ``imu_base`` finds it."""
+    return with_base(episode, robot, robot.description.feet, body.orientation, body.angular_velocity)
+
+
+def chart_base(position: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return base poses, (..., 7), of chart coordinates, (..., >= 6), around references, (..., 4)."""
+    quaternion = to_quaternion(position[..., 3:6], reference)
+    return np.concatenate([position[..., :3], quaternion], axis=-1)

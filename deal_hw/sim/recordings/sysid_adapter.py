@@ -1,0 +1,384 @@
+"""DeepMind's ``mujoco.sysid`` on our models and recordings: the only place that imports it.
+
+What it gets: parameters in physical units with their ranges as bounds, joint positions as measured signals,
+set-points as controls, and each window of a recording as one of its sequences, which starts at a given state.
+What it does is its own: finite differences, optimiser, confidence intervals.
+
+It has no command latency and no limit on a set-point's speed. A latency is given by controls that are late
+already; the speed limit goes through its hook for rollouts. Its hook for residuals is used for two facts of
+MuJoCo 3.17: sensors that a rollout returns are those before the step whose time they carry, so positions are
+taken from the state; and the residual is normalised window by window, which divides by zero where a joint
+rests at zero, so it is normalised over the whole recording.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.batch import ServoBatch, default_threads
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.parameters import KINDS, apply_parameters
+from deal_hw.sim.parameters.fields import BatchFields, ModelFields
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.windows import Windows, setpoints
+from deal_hw.types import FloatArray
+
+SPEED_LIMIT = "servo_speed_limit"
+SENT_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Windows of one episode, with the states they start from.
+
+    Attributes:
+        episode: The episode.
+        windows: W windows.
+        position: Chart coordinates at the starts, (W, C).
+        velocity: (W, C).
+    """
+
+    episode: Episode
+    windows: Windows
+    position: FloatArray
+    velocity: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """What ``mujoco.sysid`` found.
+
+    Attributes:
+        theta: Physical values, (K,).
+        half_width: Of its confidence intervals, (K,); infinite where its Jacobian is blind.
+        jacobian: Of its residual by the physical values, (R, K).
+        residual: Its normalised residual, (R,).
+        iterations: Iterations of its optimiser.
+        message: Why that stopped, in its own words.
+        steps: Physics steps simulated.
+    """
+
+    theta: FloatArray
+    half_width: FloatArray
+    jacobian: FloatArray
+    residual: FloatArray
+    iterations: int
+    message: str
+    steps: int
+
+
+def require_sysid() -> Any:
+    """Return the ``mujoco.sysid`` package.
+
+    Raises:
+        MissingExtraError: What it needs is not installed.
+    """
+    try:
+        # By name, or type checkers take the typed subpackage for the whole of mujoco.
+        sysid = importlib.import_module("mujoco.sysid")
+    except ImportError as err:
+        raise MissingExtraError("mujoco[sysid]", "bench") from err
+    # Without its dependencies the package imports, but is empty.
+    if not hasattr(sysid, "optimize"):
+        raise MissingExtraError("mujoco[sysid]", "bench")
+    return sysid
+
+
+def check_space(space: ParameterSpace) -> None:
+    """Check that ``mujoco.sysid`` can express every parameter.
+
+    Raises:
+        ConfigurationError: It cannot.
+    """
+    foreign = [p for p in space.parameters if p.kind not in KINDS and p.kind != SPEED_LIMIT]
+    if foreign:
+        named = ", ".join(f"{p.name} ({p.kind})" for p in foreign)
+        raise ConfigurationError(
+            f"mujoco.sysid has no counterpart for {named}; it takes {', '.join((*KINDS, SPEED_LIMIT))}: "
+            "leave the others out of the space or choose another method"
+        )
+
+
+def identify(
+    robot: RobotModel,
+    space: ParameterSpace,
+    recordings: Sequence[Recording],
+    *,
+    latency_s: float = 0.0,
+    iterations: int = 50,
+    alpha: float = 0.1,
+    threads: int | None = None,
+) -> Identified:
+    """Run ``mujoco.sysid`` from the nominal values on.
+
+    Args:
+        robot: The nominal model.
+        space: The parameters.
+        recordings: What to fit.
+        latency_s: Latency by which the set-points are late [s].
+        iterations: Most iterations of its optimiser.
+        alpha: Its intervals hold 1 - alpha.
+        threads: Threads of its rollouts; None for all CPUs.
+
+    Raises:
+        ConfigurationError: A parameter has no counterpart.
+        MissingExtraError: ``mujoco.sysid`` is not installed.
+    """
+    sysid = require_sysid()
+    check_space(space)
+    bridge = _Bridge(sysid, robot, space, recordings, latency_s)
+    hooks: dict[str, Any] = {"custom_rollout": bridge.rollout} if bridge.slewed else {}
+    residual = sysid.build_residual_fn(
+        models_sequences=bridge.sequences(),
+        build_model=bridge.build_model,
+        modify_residual=bridge.residual,
+        n_threads=threads or default_threads(),
+        resample_true=False,
+        **hooks,
+    )
+    output = io.StringIO()
+    found, result = sysid.optimize(
+        bridge.parameters().move_off_bounds(),
+        residual,
+        optimizer="mujoco",
+        verbose=False,
+        max_iters=max(iterations, 1),
+        # Its guide's advice where parameters differ by orders of magnitude.
+        x_scale="jac",
+        output=output,
+    )
+    theta = np.clip(found.as_vector(), space.low, space.high)
+    left = residual(theta, found)[0]
+    jacobian = np.asarray(result.jac, dtype=float)
+    with np.errstate(all="ignore"):
+        half_width = sysid.calculate_intervals(left, jacobian, alpha=alpha)[1]
+    said = [line for line in output.getvalue().splitlines() if line.startswith("Terminated")]
+    return Identified(
+        theta=theta,
+        half_width=np.nan_to_num(np.asarray(half_width, dtype=float), nan=np.inf, posinf=np.inf),
+        jacobian=jacobian,
+        residual=np.concatenate(left),
+        iterations=len(result.extras["objective"]) - 1,
+        message=said[-1] if said else "no message",
+        steps=bridge.steps,
+    )
+
+
+@dataclass(slots=True)
+class _Bridge:
+    """Translates between our model, space and recordings and those of ``mujoco.sysid``.
+
+    Args:
+        sysid: The package.
+        robot: The nominal model.
+        space: The parameters.
+        recordings: What to fit.
+        latency_s: Latency by which the set-points are late [s].
+    """
+
+    sysid: Any
+    robot: RobotModel
+    space: ParameterSpace
+    recordings: Sequence[Recording]
+    latency_s: float
+    steps: int = field(init=False, default=0)
+    slewed: bool = field(init=False)
+    _spec: mujoco.MjSpec = field(init=False)
+    _nominal: mujoco.MjModel = field(init=False)
+    _batch: ServoBatch = field(init=False)
+    _scale: FloatArray = field(init=False)
+    _every: list[int] = field(init=False)
+    _origin: dict[int, tuple[int, int]] = field(init=False, default_factory=dict)
+    _sent: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = field(init=False, default_factory=dict)
+    _models: dict[tuple[bytes, int], mujoco.MjModel] = field(init=False, default_factory=dict)
+    _paths: dict[tuple[int, bytes], FloatArray] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.slewed = any(p.kind == SPEED_LIMIT for p in self.space.free)
+        self._spec = self._with_sensors()
+        self._nominal = self._spec.compile()
+        self._batch = ServoBatch(self.robot, self.space, 1, threads=1)
+        measured = np.concatenate([self._measured(r).reshape(-1, len(self._joints)) for r in self.recordings])
+        size = np.sqrt(np.nanmean(measured**2, axis=0))
+        self._scale = np.where(size > 0, size, 1.0)
+
+    @property
+    def _joints(self) -> tuple[str, ...]:
+        return self.robot.description.joint_names
+
+    def _with_sensors(self) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec.from_file(str(self.robot.description.mjcf))
+        spec.option.timestep = self.robot.step_s
+        for sensor in spec.sensors:
+            spec.delete(sensor)
+        for joint in self._joints:
+            spec.add_sensor(
+                name=f"{joint}.position",
+                type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                objname=joint,
+            )
+        return spec
+
+    def _measured(self, recording: Recording) -> FloatArray:
+        """Return each window's joint positions, start included, (W, 1 + H, J); NaN where not reported."""
+        episode, start = recording.episode, recording.windows.start
+        rows = start[:, None] + np.arange(recording.windows.length + 1)
+        values = episode.position[:, self.robot.joints]
+        if episode.reported is not None:
+            values = np.where(episode.reported[:, None], values, np.nan)
+        return np.asarray(values[rows])
+
+    def parameters(self) -> Any:
+        """Return the free parameters in physical units, at their nominal values."""
+        made = self.sysid.ParameterDict()
+        for p in self.space.free:
+            made.add(self.sysid.Parameter(p.name, p.nominal, p.low, p.high))
+        return made
+
+    def _values(self, parameters: Any) -> FloatArray:
+        return np.asarray(parameters.as_vector(), dtype=float)
+
+    def sequences(self) -> list[Any]:
+        """Return the windows as sequences, those sent the same gains and limits in one group."""
+        groups: dict[tuple[bytes, ...], list[tuple[int, int]]] = {}
+        for r, recording in enumerate(self.recordings):
+            for w in range(len(recording.windows)):
+                sent = self._sent_at(r, w)
+                groups.setdefault(tuple(values.tobytes() for values in sent), []).append((r, w))
+        return [self._group(i, members) for i, members in enumerate(groups.values())]
+
+    def _sent_at(self, r: int, w: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        episode = self.recordings[r].episode
+        at = int(episode.sample[self.recordings[r].windows.start[w]])
+        return episode.stiffness[at], episode.damping[at], episode.effort_limit[at]
+
+    def _group(self, index: int, members: list[tuple[int, int]]) -> Any:
+        spec = self._spec.copy()
+        self._sent[id(spec)] = self._sent_at(*members[0])
+        names = [f"recording {r} window {w}" for r, w in members]
+        states = [self._initial_state(r, w) for r, w in members]
+        controls = [self._control(r, w) for r, w in members]
+        measured = [self._sensors(r, w) for r, w in members]
+        return self.sysid.ModelSequences(f"sent {index}", spec, names, states, controls, measured)
+
+    def _initial_state(self, r: int, w: int) -> FloatArray:
+        recording, batch = self.recordings[r], self._batch
+        reference = recording.episode.reference
+        start = recording.windows.start[w]
+        batch.set_state(
+            recording.position[w],
+            recording.velocity[w],
+            reference=None if reference is None else reference[start],
+        )
+        qpos, qvel = batch.batch.bind("qpos")[0], batch.batch.bind("qvel")[0]
+        return np.asarray(self.sysid.create_initial_state(self._nominal, qpos.copy(), qvel.copy()))
+
+    def _times(self, r: int) -> tuple[int, int]:
+        """Return physics steps from sample to sample, and of a whole window."""
+        episode, windows = self.recordings[r].episode, self.recordings[r].windows
+        every = windows.stride * round(episode.step_s / self.robot.step_s)
+        return every, every * windows.length
+
+    def _control(self, r: int, w: int) -> Any:
+        _, steps = self._times(r)
+        times = np.arange(steps + 1) * self.robot.step_s
+        made = self.sysid.TimeSeries.from_control_names(
+            times, self._cut(self._path(r, self.space.nominal), r, w), self._nominal
+        )
+        self._origin[id(made)] = r, w
+        return made
+
+    def _sensors(self, r: int, w: int) -> Any:
+        every, steps = self._times(r)
+        times = np.arange(0, steps + 1, every) * self.robot.step_s
+        return self.sysid.TimeSeries.from_names(times, self._measured(self.recordings[r])[w], self._nominal)
+
+    def _path(self, r: int, theta: FloatArray) -> FloatArray:
+        """Return the set-points of a whole episode, (S, A); made once for each set of speed limits."""
+        limits = np.array([theta[k] for k, p in enumerate(self.space.free) if p.kind == SPEED_LIMIT])
+        key = r, limits.tobytes()
+        if key not in self._paths:
+            if len(self._paths) > 4 * (len(self.space) + 1) * len(self.recordings):
+                self._paths.clear()
+            self._batch.set_parameters(theta[None])
+            self._paths[key] = setpoints(self._batch, self.recordings[r].episode, np.array([self.latency_s]))[
+                0
+            ]
+        return self._paths[key]
+
+    def _cut(self, path: FloatArray, r: int, w: int) -> FloatArray:
+        """Return the controls of one window, one for each physics step and one that is never applied."""
+        episode, windows = self.recordings[r].episode, self.recordings[r].windows
+        at = int(episode.sample[windows.start[w]])
+        repeat = round(episode.step_s / self.robot.step_s)
+        held = np.repeat(path[at : at + windows.length * windows.stride], repeat, axis=0)
+        control = np.zeros((len(held) + 1, self.robot.model.nu))
+        control[:-1, list(self.robot.actuator)] = held
+        control[-1] = control[-2]
+        return control
+
+    def build_model(self, parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        """Return the model with parameters and sent gains set: their hook in place of recompiling a spec."""
+        theta = self._values(parameters)
+        key = theta.tobytes(), id(spec)
+        if key not in self._models:
+            # One iteration asks for the same few models window after window.
+            if len(self._models) > 4 * (len(self.space) + 1) * len(self._sent):
+                self._models.clear()
+            model = copy.copy(self._nominal)
+            apply_parameters(ModelFields(model, self._nominal), self.space, theta[None])
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+            if self.robot.description.actuation == "position":
+                self._batch.set_parameters(theta[None])
+                self._batch.set_sent(*self._sent[id(spec)])
+                fields = BatchFields(self._batch.batch, self.robot.model)
+                for name in SENT_FIELDS:
+                    getattr(model, name)[:] = fields.get(name)[0]
+            self._models[key] = model
+        return self._models[key]
+
+    def rollout(self, *, control_signal: Sequence[Any], param_dicts: Sequence[Any], **given: Any) -> Any:
+        """Roll out with set-points slewed at each candidate's own speed limit: their hook."""
+        slewed = []
+        for signal, parameters in zip(control_signal, param_dicts, strict=True):
+            r, w = self._origin[id(signal)]
+            data = self._cut(self._path(r, self._values(parameters)), r, w)
+            slewed.append(self.sysid.TimeSeries(signal.times, data, signal.signal_mapping))
+        return self.sysid.sysid_rollout(control_signal=slewed, **given)
+
+    def residual(
+        self,
+        parameters: Any,
+        predicted: Any,
+        measured: Any,
+        model: Any,
+        return_all: bool,
+        *,
+        state: FloatArray,
+    ) -> tuple[FloatArray, Any, Any]:
+        """Return measured minus predicted joint positions, normalised: their hook.
+
+        Args:
+            parameters: Not used.
+            predicted: Sensors of each physics step.
+            measured: Samples of the window, its start included.
+            model: Not used.
+            return_all: Not used.
+            state: Time, positions, velocities after each physics step.
+        """
+        self.steps += len(predicted.times)
+        every = len(predicted.times) // (len(measured.times) - 1)
+        # A state begins with the time.
+        ahead = state[every - 1 :: every, [1 + q for q in self.robot.qpos]]
+        return np.nan_to_num((measured.data[1:] - ahead) / self._scale), predicted, measured

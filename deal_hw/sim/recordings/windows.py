@@ -1,0 +1,152 @@
+"""Open-loop prediction in short windows that restart from given states.
+
+An unstable robot's open-loop replay diverges from its own record within a second, whatever the model; windows
+of some ticks do not. All members of a population predict all windows of an episode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.types import FloatArray, IntArray
+
+SETPOINT_MARGIN_S = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Windows:
+    """W windows of H samples each.
+
+    Attributes:
+        start: Index of the sample each window starts at, (W,).
+        length: Samples H predicted in each window, not counting the start.
+        stride: Device periods from one sample to the next.
+    """
+
+    start: IntArray
+    length: int
+    stride: int
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def samples(self) -> IntArray:
+        """Return the sample indices that are predicted, (W, H)."""
+        return np.asarray(self.start[:, None] + 1 + np.arange(self.length))
+
+
+def cut_windows(episode: Episode, length: int, hop: int | None = None, first: int = 0) -> Windows:
+    """Cut an episode into windows in which every sample is usable and what is sent stays the same.
+
+    Args:
+        episode: The episode.
+        length: Samples a window predicts, H.
+        hop: Samples from one window's start to the next's; H by default, so that no sample is used twice.
+        first: First sample that may start a window.
+
+    Returns:
+        The windows; a window never straddles a gap, a lost frame or a change of gains or effort limit.
+
+    Raises:
+        InsufficientDataError: There is none.
+    """
+    stride = episode.stride
+    sent = np.concatenate([episode.stiffness, episode.damping, episode.effort_limit], axis=1)
+    changed = np.concatenate([[0], np.cumsum(np.any(sent[1:] != sent[:-1], axis=1))])
+    last_step = len(changed) - 1
+    starts: list[int] = []
+    at = first
+    while at + length < len(episode.sample):
+        span = slice(at, at + length + 1)
+        step = episode.sample[span]
+        whole = bool(episode.usable[span].all()) and bool((np.diff(step) == stride).all())
+        # A change of what is sent acts up to one latency later, so keep clear of it by a margin.
+        late = max(int(step[0]) - round(SETPOINT_MARGIN_S / 3 / episode.step_s), 0)
+        constant = changed[late] == changed[min(int(step[-1]), last_step)]
+        if whole and constant:
+            starts.append(at)
+            at += hop or length
+        else:
+            at += 1
+    if not starts:
+        raise InsufficientDataError(
+            f"no window of {length} samples ({length * stride * episode.step_s:.2f} s) without a gap in "
+            f"{len(episode.sample)} samples; record a longer episode"
+        )
+    return Windows(start=np.array(starts, dtype=np.int64), length=length, stride=stride)
+
+
+def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> FloatArray:
+    """Return each member's set-point over the whole episode, (N, S, A).
+
+    Args:
+        batch: The members; their speed limits and command delays count.
+        episode: The episode.
+        latency_s: Total latency of each member, (N,) [s].
+    """
+    if batch.robot.description.actuation == "motor":
+        # Efforts are not slewed; before the first one the motors are off.
+        efforts = np.repeat(episode.target[None], batch.count, axis=0)
+        return delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
+    factor = batch.servo_factor("servo_speed_limit")
+    rate = factor[:, None] * episode.speed_limit[None] * episode.step_s
+    start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
+    path = slew(start, episode.target, rate)
+    return delay(path, batch.lag_s(latency_s) / episode.step_s, start)
+
+
+def predict_windows(
+    batch: ServoBatch,
+    episode: Episode,
+    windows: Windows,
+    position: FloatArray,
+    velocity: FloatArray,
+    setpoint: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict all windows with all members.
+
+    Args:
+        batch: The members, parameters set.
+        episode: The episode.
+        windows: The windows.
+        position: Positions at the windows' starts, (W, C) or (N, W, C).
+        velocity: Velocities at the windows' starts, (W, C) or (N, W, C).
+        setpoint: Set-points of the whole episode, (N, S, A), from :func:`setpoints`.
+
+    Returns:
+        Positions and velocities at the samples after each start, (N, W, H, C) each, in the chart of each
+        sample's reference orientation; NaN where a member diverged.
+    """
+    N, W, H = batch.count, len(windows), windows.length
+    C = episode.position.shape[1]
+    x = np.broadcast_to(position, (N, W, C))
+    v = np.broadcast_to(velocity, (N, W, C))
+    out_x, out_v = np.empty((N, W, H, C)), np.empty((N, W, H, C))
+    reference = episode.reference
+    steps = H * windows.stride
+    per_step = episode.step_s / batch.robot.step_s
+    repeat = round(per_step)
+    sent: tuple[bytes, bytes, bytes] | None = None
+    for w, start in enumerate(windows.start):
+        at = int(episode.sample[start])
+        now = (
+            episode.stiffness[at].tobytes(),
+            episode.damping[at].tobytes(),
+            episode.effort_limit[at].tobytes(),
+        )
+        if now != sent:
+            batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
+            sent = now
+        batch.set_state(x[:, w], v[:, w], reference=None if reference is None else reference[start])
+        control = setpoint[:, at : at + steps]
+        if repeat > 1:
+            control = np.repeat(control, repeat, axis=1)
+        charts = None if reference is None else reference[start + 1 : start + 1 + H]
+        out_x[:, w], out_v[:, w] = batch.advance(control, windows.stride * repeat, charts)
+    return out_x, out_v

@@ -1,0 +1,120 @@
+"""The commands on their way to the motors: encoded, numbered, held in force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
+from deal_hw.drivers.go2.state_stream import CommandEcho
+from deal_hw.errors import FrameError, SafetyError
+from deal_hw.transport import Message, TopicTransport
+from deal_hw.types import FloatArray, JointCommand
+
+PASSIVE_COPIES: Final = 3
+"""Messages get lost, and the last command must not: it is held for ever."""
+
+
+class CommandSender:
+    """Sends commands, keeps the bytes of the last for its repeats, and numbers the behaviour's own.
+
+    Attributes:
+        in_force: Bytes of the command that the motors hold; b"" before the first.
+        sequence: Number of the behaviour's last command; -1 before the first.
+        echo: Which of them was in force when.
+        damping: Gains of the passive command, (J,) [N·m·s/rad].
+        effort_limit: Effort limits of the description, (J,) [N·m].
+
+    Args:
+        transport: Topics of the robot.
+        clock: The clock of the messages' stamps.
+        description: The robot.
+        record: Takes each message that goes out, but no repeats.
+    """
+
+    def __init__(
+        self,
+        transport: TopicTransport,
+        clock: Clock,
+        description: RobotDescription,
+        record: Callable[[Message], object],
+    ) -> None:
+        self._transport, self._clock, self._record = transport, clock, record
+        self._encoder = LowCommandEncoder()
+        self.damping = np.array(description.passive_damping)
+        self.effort_limit = np.array(description.effort_limit)
+        self._speed_limit = np.array(description.speed_limit)
+        self.echo = CommandEcho()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all commands."""
+        self.in_force, self.sequence = b"", -1
+        self.echo.reset()
+
+    def publish(self, topic: str, payload: bytes) -> int:
+        """Send a message, record it and return when that was, by the clock [ns]."""
+        stamp_ns = self._clock.now_ns()
+        self._transport.send(Message(topic, payload, stamp_ns))
+        self._record(Message("tx", payload, stamp_ns))
+        return stamp_ns
+
+    def send(self, command: JointCommand, *, damp_at: FloatArray | None = None) -> JointCommand:
+        """Send the behaviour's next command.
+
+        Args:
+            command: What it asks for.
+            damp_at: The joints' positions, (J,) [rad], where the robot is passive and damping goes out
+                instead; None where it is armed.
+
+        Returns:
+            What was sent, rounded as on the wire, with the description's limits: the wire has none.
+
+        Raises:
+            SafetyError: A value is not finite, or the robot is passive and was never commanded.
+        """
+        low = LowCommand(
+            command.position_target,
+            command.velocity_target,
+            command.stiffness,
+            command.damping,
+            command.effort,
+        )
+        try:
+            payload = self._encoder.encode(low)
+        except FrameError as error:
+            raise SafetyError(f"go2: {error}") from error
+        if damp_at is not None:
+            if not self.in_force:
+                raise SafetyError("go2: not armed; call arm() before the first command")
+            low = self._passive_command(damp_at)
+            payload = self._encoder.encode(low)
+        stamp_ns = self.publish(topics.LOW_COMMAND, payload)
+        self.in_force = payload
+        self.sequence += 1
+        self.echo.note(self.sequence, stamp_ns)
+        q, dq, kp, kd, tau = (
+            part.astype(np.float32).astype(np.float64)
+            for part in (low.position, low.velocity, low.stiffness, low.damping, low.effort)
+        )
+        return JointCommand(q, dq, kp, kd, tau, self.effort_limit.copy(), self._speed_limit.copy())
+
+    def damp(self, position: FloatArray) -> None:
+        """Send the passive command for joints there, (J,) [rad]; it is none of the behaviour's: no number."""
+        self.in_force = self._encoder.encode(self._passive_command(position))
+        self.publish(topics.LOW_COMMAND, self.in_force)
+
+    def repeat(self) -> None:
+        """Send the command in force again, the same bytes; nothing before the first."""
+        if self.in_force:
+            self._transport.send(Message(topics.LOW_COMMAND, self.in_force, self._clock.now_ns()))
+
+    def _passive_command(self, position: FloatArray) -> LowCommand:
+        zero = np.zeros(len(self.damping))
+        pose = position if np.isfinite(position).all() else zero
+        return LowCommand(pose, zero, zero, self.damping, zero)

@@ -1,0 +1,75 @@
+"""Finding a Go2 on a wire: whether one is there, and only one, or why none is heard."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Final
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.state_stream import StateStream
+from deal_hw.errors import TransportTimeoutError, WrongDeviceError
+from deal_hw.transport import TopicTransport
+
+CONNECT_TIMEOUT_S: Final = 5.0
+_FIRST_STATES: Final = 20
+"""Sound states with a running clock that make a Go2."""
+_ONE_ROBOT: Final = 0.4
+"""A larger share of states that are not new, and two robots send them."""
+_TOO_MANY: Final = 20
+"""Messages that are no states, without one that is: then it is no Go2."""
+
+
+def await_robot(
+    transport: TopicTransport, clock: Clock, stream: StateStream, pump: Callable[[float], None]
+) -> None:
+    """Wait until states of one Go2 have come whose clock runs.
+
+    Args:
+        transport: Topics of the robot; open.
+        clock: For waiting.
+        stream: Judges the states; as new.
+        pump: Receives one message, waiting at most so long [s], and gives states to the stream; raises
+            TransportTimeoutError where none comes.
+
+    Raises:
+        TransportTimeoutError: No states come, or their clock stands still.
+        WrongDeviceError: It is another robot, or there are two.
+        VersionMismatchError: The robot's firmware makes other checksums.
+    """
+    deadline_ns = clock.now_ns() + round(CONNECT_TIMEOUT_S * 1e9)
+    while stream.accepted < _FIRST_STATES and (left_ns := deadline_ns - clock.now_ns()) > 0:
+        if stream.errors >= _TOO_MANY and (error := stream.complaint()) is not None:
+            raise error
+        with contextlib.suppress(TransportTimeoutError):
+            pump(left_ns * 1e-9)
+    if stream.accepted < _FIRST_STATES:
+        raise stream.complaint() or TransportTimeoutError(_why_silent(transport, stream))
+    if stream.stale > _ONE_ROBOT * stream.accepted:
+        raise WrongDeviceError(
+            f"go2: two robots send {topics.LOW_STATE}, or one twice: {stream.stale} of "
+            f"{stream.accepted + stream.stale} states were no newer than the one before."
+            f"{_seen_writing(transport)} Choose another interface, domain or bridge"
+        )
+
+
+def _why_silent(transport: TopicTransport, stream: StateStream) -> str:
+    where = getattr(transport, "port", type(transport).__name__)
+    if stream.stale:
+        return (
+            f"go2 on {where}: states come, but their clock stands still at "
+            f"{stream.device_ns // 1_000_000} ms; a robot that hangs (restart it), or a simulator "
+            "that leaves the tick alone?"
+        )
+    return (
+        f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{_seen_writing(transport)} Is "
+        "the robot on and booted, the cable in, the interface the one with an address 192.168.123.x (the "
+        "robot is 192.168.123.161), and does the firewall let UDP through? Over Zenoh: does the bridge "
+        f"carry {topics.LOW_STATE}?"
+    )
+
+
+def _seen_writing(transport: TopicTransport) -> str:
+    writers = transport.writers(topics.LOW_STATE)
+    return f" Seen writing it: {'; '.join(writers)}." if writers else ""

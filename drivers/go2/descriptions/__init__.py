@@ -1,0 +1,1 @@
+"""Facts about the Go2 on the floor and with its base on a stand, and the geometry of its legs."""

@@ -1,0 +1,54 @@
+"""The real Go2 with its base on a stand: targets at 50 Hz, states at 500 Hz, no floor.
+
+The stand must hold the base level and still: the model's base does not move. The 200 Hz recording of
+iit-DLSLab is ``go2_suspended``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Final
+
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2.descriptions import on_stand_recording
+from deal_hw.drivers.go2.descriptions.driver import DRIVER, driver_limits, legs_on_stand
+from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as FLOOR
+from deal_hw.drivers.go2.descriptions.floor import STANDING_RAD, per_joint
+
+MOTOR_HZ: Final = 1000.0
+REACH_RAD: Final[Mapping[str, float]] = {"hip": 0.3, "thigh": 0.4, "calf": 0.5}
+"""Excitations keep so near the standing pose; the legs then stay 3 cm apart whatever the others do."""
+
+
+def _reach() -> tuple[tuple[float, float], ...]:
+    """Return where excitations may take each joint [rad]."""
+    pose, reach = per_joint(STANDING_RAD), per_joint(REACH_RAD)
+    return tuple((middle - way, middle + way) for middle, way in zip(pose, reach, strict=True))
+
+
+DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
+    DRIVER,
+    name="go2_hung",
+    stiffness=on_stand_recording.DESCRIPTION.stiffness,
+    damping=on_stand_recording.DESCRIPTION.damping,
+    device_rate_hz=MOTOR_HZ,
+    limits=driver_limits(FLOOR.limits, legs_on_stand()),
+    mjcf=on_stand_recording.DESCRIPTION.mjcf,
+    floating_base=None,
+    excitation_range=_reach(),
+    sources={
+        **DRIVER.sources,
+        "stiffness": on_stand_recording.DESCRIPTION.sources["stiffness"],
+        "damping": on_stand_recording.DESCRIPTION.sources["damping"],
+        "device_rate_hz": "1 kHz as the emulator's motors; the rate of the robot's own is not published",
+        "excitation_range": "corners and draws inside it: least distance of two legs' shapes in go2.xml 3 cm",
+        "legs.tilt": (
+            "assumed: the model's base is level; at 0.35 rad a third of a leg's weight pulls it aside"
+        ),
+        "legs.free_fall": "no limit: the base is held",
+    },
+)
+
+SPACES: Final = on_stand_recording.SPACES
+"""Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

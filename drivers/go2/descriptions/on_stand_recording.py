@@ -1,0 +1,124 @@
+"""Facts about the Unitree Go2 with its base on a stand, as in the public recording of iit-DLSLab.
+
+Twelve joints follow set-points at 200 Hz; no floor, no contact, a base that does not move.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2.descriptions import floor
+from deal_hw.parameters import Parameter, ParameterSpace
+
+STIFFNESS_NM_RAD: Final = 20.0
+DAMPING_NMS_RAD: Final = 1.5
+JOINT_DAMPING_NMS_RAD: Final = 0.6
+FRICTIONLOSS_NM: Final = 0.2
+ARMATURE_KGM2: Final = 0.01
+ENCODER_BIAS_RAD: Final = 0.1
+LINE_FRICTIONLOSS_N: Final = 5.0
+"""Of a knee's rod or strap."""
+KNEE_FRICTIONLOSS_NM: Final = (0.02, 4.0)
+"""Range of the calves' friction where the rods have some of their own."""
+
+DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
+    floor.DESCRIPTION,
+    name="go2_suspended",
+    stiffness=(STIFFNESS_NM_RAD,) * 12,
+    damping=(DAMPING_NMS_RAD,) * 12,
+    control_rate_hz=200.0,
+    device_rate_hz=400.0,
+    state_rate_hz=200.0,
+    mjcf=Path(__file__).parents[1] / "assets" / "go2_suspended.xml",
+    floating_base=None,
+    sources={
+        **floor.DESCRIPTION.sources,
+        "stiffness": "configuration of iit-DLSLab/sim2real-robot-identification: kp 20",
+        "damping": "the same: kd 1.5",
+        "control_rate_hz": "sampling rate of that project's recording",
+        "device_rate_hz": "twice that; the motor's own rate is higher and not published",
+        "state_rate_hz": "sampling rate of that project's recording",
+    },
+)
+
+
+def _space(groups: Sequence[tuple[str, tuple[str, ...]]], *, bias: bool) -> ParameterSpace:
+    rows = (
+        ("stiffness", "servo_stiffness", "N·m/rad", STIFFNESS_NM_RAD),
+        ("damping", "servo_damping", "N·m·s/rad", DAMPING_NMS_RAD + JOINT_DAMPING_NMS_RAD),
+        ("frictionloss", "dof_frictionloss", "N·m", FRICTIONLOSS_NM),
+        ("armature", "dof_armature", "kg·m²", ARMATURE_KGM2),
+    )
+    parameters = [
+        Parameter.around(f"{group}.{name}", kind, elements, unit, value)
+        for name, kind, unit, value in rows
+        for group, elements in groups
+    ]
+    if bias:
+        parameters += [
+            Parameter(
+                name=f"{joint}.encoder_bias", kind="encoder_bias", elements=(joint,), unit="rad", nominal=0.0,
+                low=-ENCODER_BIAS_RAD, high=ENCODER_BIAS_RAD, scale="linear",
+            )
+            for joint in floor.JOINTS
+        ]  # fmt: skip
+    return ParameterSpace(parameters)
+
+
+_EACH: Final = tuple((joint, (joint,)) for joint in floor.JOINTS)
+
+
+def parameter_space() -> ParameterSpace:
+    """Return 48 parameters: stiffness, damping, frictionloss and armature of each joint.
+
+    Damping is what acts at the joint when the motor is sent kd = 1.5: the motor's own and the joint's viscous
+    friction (0.6 in the source's model) together, as no recording can tell them apart. Delay and armature are
+    confounded in this recording: read both with the report's correlation.
+    """
+    return _space(_EACH, bias=False)
+
+
+def biased_space() -> ParameterSpace:
+    """Return the 48 parameters and an encoder bias of each joint, 60 in all."""
+    return _space(_EACH, bias=True)
+
+
+def shared_space() -> ParameterSpace:
+    """Return 12 parameters: the same four, shared by the four hips, the four thighs and the four calves."""
+    groups = [(part, tuple(f"{leg}_{part}_joint" for leg in floor.LEGS)) for part in floor.PARTS]
+    return _space(groups, bias=False)
+
+
+def linkage_space() -> ParameterSpace:
+    """Return the 48 parameters, calf friction up to 4 N·m, and that of the knees' rods and straps, 56 in all.
+
+    A rod's friction makes that of its knee grow as it flexes, a strap's to both ends of the travel; in the
+    model both are 0.
+    """
+    low, high = KNEE_FRICTIONLOSS_NM
+    parameters = [
+        dataclasses.replace(p, low=low, high=high) if p.name.endswith("calf_joint.frictionloss") else p
+        for p in parameter_space()
+    ]
+    parameters += [
+        Parameter.around(
+            f"{leg}_calf_{line}.frictionloss", "tendon_frictionloss", (f"{leg}_calf_{line}",), "N",
+            LINE_FRICTIONLOSS_N, ratio=10.0,
+        )
+        for line in ("rod", "strap")
+        for leg in floor.LEGS
+    ]  # fmt: skip
+    return ParameterSpace(parameters)
+
+
+SPACES: Final = {
+    "default": parameter_space,
+    "biased": biased_space,
+    "shared": shared_space,
+    "linkage": linkage_space,
+}
+"""Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

@@ -1,0 +1,284 @@
+"""What can be told of a Go2 and the link to it by listening, and by asking who moves it; no motor command.
+
+Works over every transport of topics; over DDS it also reads the domain's discovery.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.control.clock_check import judge_clock
+from deal_hw.control.leg_checks import tilt
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.refusals import ANOTHER_ROBOT, OTHER_RULE, Refusals, StateCheck
+from deal_hw.drivers.go2.messages.remote import decode_remote
+from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, Services
+from deal_hw.drivers.go2.state_stream import PERIOD_MS
+from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
+from deal_hw.findings import Finding, Level
+from deal_hw.transport import Message, TopicTransport
+
+ROUND_TRIPS: Final = 20
+_STATE_HZ: Final = 1000.0 / PERIOD_MS
+_SLOW_ROUND_TRIP_S: Final = 0.02
+_ANSWER_S: Final = 1.0
+_LATE_S: Final = 0.01
+_FEW_REFUSED: Final = 0.01
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What came while listening."""
+
+    stamps: list[int] = field(default_factory=list)
+    ticks: list[int] = field(default_factory=list)
+    last: LowStateFrame | None = None
+    refused: Refusals = field(default_factory=Refusals)
+    commands: int = 0
+
+
+class Doctor:
+    """Listens to a Go2 and asks its motion switcher.
+
+    Args:
+        link: A transport of topics, not opened.
+        clock: The clock of its stamps.
+        seconds: How long to listen [s].
+        state_check: What a state must pass.
+    """
+
+    def __init__(
+        self, link: TopicTransport, clock: Clock, seconds: float, state_check: StateCheck = "strict"
+    ) -> None:
+        self._link, self._clock, self._seconds = link, clock, seconds
+        self._strict = state_check == "strict"
+
+    def run(self) -> Iterator[Finding]:
+        """Yield what was found; the transport is closed at the end.
+
+        Raises:
+            TransportError: It cannot be opened.
+        """
+        if not isinstance(self._link, TopicTransport):
+            raise TransportError(f"{type(self._link).__name__} carries no topics")
+        self._link.declare(
+            publish=[topics.request(SWITCHER)],
+            subscribe=[topics.LOW_STATE, topics.LOW_COMMAND, topics.response(SWITCHER)],
+        )
+        with self._link:
+            yield Finding("link", Level.OK, "the transport is open")
+            heard = self._listen()
+            yield from self._discovery()
+            if not self._strict:
+                yield Finding(
+                    "states", Level.WARN, "head and checksum of the states are not checked",
+                    "leave --state-check out where the robot makes both as deal-hw expects",
+                )  # fmt: skip
+            yield from _judge_states(heard, self._seconds)
+            mode = yield from self._ask_mode()
+            yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode or "")
+            if heard.last is not None:
+                yield from _judge_robot(heard.last)
+
+    def _listen(self) -> _Heard:
+        heard = _Heard()
+        end_ns = self._clock.now_ns() + round(self._seconds * 1e9)
+        while (left_ns := end_ns - self._clock.now_ns()) > 0:
+            try:
+                _take(heard, self._link.receive(left_ns * 1e-9), self._strict)
+            except TransportTimeoutError:
+                break
+        return heard
+
+    def _discovery(self) -> Iterator[Finding]:
+        survey = getattr(self._link, "survey", None)
+        if survey is None:
+            return
+        seen = survey()
+        if not seen.peers:
+            yield Finding(
+                "dds", Level.FAIL, "no other participant is on the domain",
+                "is the robot on, is this its network (192.168.123.x), is the domain 0, does a firewall "
+                "block UDP 7400 to 7500?",
+            )  # fmt: skip
+        for peer in seen.peers:
+            yield Finding("dds", Level.OK, str(peer))
+        for complaint in seen.complaints:
+            yield Finding("dds", Level.FAIL, complaint, "see docs/go2-dds.md")
+        typed: dict[str, set[str]] = {}
+        for end in seen.endpoints:
+            if end.topic in topics.TYPES:
+                typed.setdefault(end.shown_hash, set()).add(end.topic)
+        for shown, names in typed.items():
+            yield Finding("dds", Level.OK, f"{', '.join(sorted(names))}: {shown}")
+
+    def _ask_mode(self) -> Generator[Finding, None, str | None]:
+        """Yield what the motion switcher tells; return the active mode's name, None without an answer."""
+        services = Services(
+            self._send, lambda timeout_s: services.take(self._link.receive(timeout_s)), self._clock
+        )
+        times: list[float] = []
+        name = None
+        for _ in range(ROUND_TRIPS):
+            begun_ns = self._clock.now_ns()
+            try:
+                name = str(services.ask(SWITCHER, CHECK_MODE, {}, _ANSWER_S).get("name", ""))
+            except TransportTimeoutError:
+                break
+            except (RefusedError, FrameError) as error:
+                yield Finding("services", Level.WARN, str(error), "restart the robot if it persists")
+                return None
+            times.append((self._clock.now_ns() - begun_ns) * 1e-9)
+        if name is None:
+            yield Finding(
+                "services", Level.WARN, f"the service {SWITCHER} does not answer",
+                "older firmware has the service robot_state instead; deal-hw tries that one, too",
+            )  # fmt: skip
+            return None
+        p50, most = float(np.median(times)), max(times)
+        text = (
+            f"round trip of a request: {p50 * 1e3:.2f} ms median, {most * 1e3:.2f} ms longest of {len(times)}"
+        )
+        slow = p50 > _SLOW_ROUND_TRIP_S
+        yield Finding(
+            "link", Level.WARN if slow else Level.OK, text,
+            "a cable instead of wireless; stop what else loads network and computer" if slow else "",
+        )  # fmt: skip
+        yield _judge_mode(name)
+        return name
+
+    def _send(self, topic: str, payload: bytes) -> None:
+        self._link.send(Message(topic, payload, self._clock.now_ns()))
+
+
+def _take(heard: _Heard, message: Message, strict: bool) -> None:
+    if message.channel == topics.LOW_COMMAND:
+        heard.commands += 1
+    if message.channel != topics.LOW_STATE:
+        return
+    try:
+        frame = decode_low_state(message.payload, strict)
+    except FrameError as error:
+        heard.refused.add(message.payload, error)
+        return
+    heard.stamps.append(message.stamp_ns)
+    heard.ticks.append(frame.tick_ms)
+    heard.last = frame
+
+
+def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
+    if heard.refused.count:
+        yield _judge_refused(heard.refused, len(heard.stamps))
+        if not heard.stamps:
+            return
+    if len(heard.stamps) < 2:
+        yield Finding(
+            "states", Level.FAIL, f"no states came on {topics.LOW_STATE} within {seconds:g} s",
+            "is the robot on and started up (one minute), is this the right interface or endpoint, does a "
+            "firewall stand between?",
+        )  # fmt: skip
+        return
+    gaps = np.diff(heard.stamps) * 1e-9
+    rate = (len(heard.stamps) - 1) / ((heard.stamps[-1] - heard.stamps[0]) * 1e-9)
+    text = (
+        f"{rate:.0f} states a second; time between two: {np.median(gaps) * 1e3:.2f} ms median, "
+        f"{np.percentile(gaps, 99) * 1e3:.2f} ms p99, {gaps.max() * 1e3:.2f} ms longest"
+    )
+    sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
+    remedy = "a cable instead of wireless, a faster or less busy computer" if sparse or late else ""
+    yield Finding("states", Level.WARN if remedy else Level.OK, text, remedy)
+    ticks = np.diff(np.array(heard.ticks, dtype=np.int64).astype(np.uint32))
+    steps = ticks.astype(np.int32)
+    if (steps == 0).all():
+        yield Finding("states", Level.FAIL, "the robot's clock (tick) stands still", "restart the robot")
+        return
+    missing = int(np.sum(np.maximum(steps // PERIOD_MS - 1, 0)))
+    back = int(np.sum(steps <= 0))
+    if missing or back:
+        yield Finding(
+            "states", Level.NOTE,
+            f"{missing} states lost and {back} repeated or out of order of {len(heard.ticks)}",
+        )  # fmt: skip
+    device_ms = np.concatenate(((0,), np.cumsum(steps.astype(np.int64))))
+    yield judge_clock(np.array(heard.stamps), 1_000_000 * device_ms)
+
+
+def _judge_refused(refused: Refusals, sound: int) -> Finding:
+    """Return the one finding about all states that were refused, beside those that were sound."""
+    share = refused.count / (refused.count + sound)
+    text = (
+        f"{refused.count} of {refused.count + sound} messages on {topics.LOW_STATE} ({share:.1%}) are no Go2 "
+        f"states; the first: {refused.first}"
+    )
+    if sound:
+        remedy = (
+            "states are corrupted on the way: another cable, no wireless; or does a second program send them?"
+        )
+    else:
+        remedy = OTHER_RULE if refused.by_rule else ANOTHER_ROBOT
+    return Finding("states", Level.FAIL if share > _FEW_REFUSED else Level.WARN, text, remedy)
+
+
+def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str) -> Iterator[Finding]:
+    if heard.commands and mode:
+        yield Finding(
+            "commands", Level.NOTE,
+            f"{heard.commands} motor commands came while sport mode {mode!r} is active, probably its own",
+            "run doctor again after the release: nobody may command the motors then",
+        )  # fmt: skip
+    elif heard.commands:
+        who = f" ({'; '.join(writers)})" if writers else ""
+        yield Finding(
+            "commands", Level.FAIL, f"somebody else commands the motors: {heard.commands} messages{who}",
+            "stop that program",
+        )  # fmt: skip
+    elif writers:
+        yield Finding(
+            "commands", Level.WARN, f"silent writers of {topics.LOW_COMMAND}: {'; '.join(writers)}",
+            "stop them if they are not deal-hw's own",
+        )  # fmt: skip
+    else:
+        yield Finding("commands", Level.OK, "nobody else commands the motors")
+
+
+def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
+    charge = frame.battery_percent
+    text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
+    low = charge < 20
+    yield Finding("robot", Level.WARN if low else Level.OK, text, "charge it" if low else "")
+    hottest = int(np.max(frame.temperature))
+    hot = hottest > 70
+    yield Finding(
+        "robot", Level.WARN if hot else Level.OK, f"hottest motor {hottest} °C",
+        "let it cool down" if hot else "",
+    )  # fmt: skip
+    lean = math.degrees(tilt(frame.orientation))
+    tilted = not lean < 30.0 or not abs(float(frame.orientation @ frame.orientation) - 1.0) < 0.01
+    yield Finding(
+        "robot", Level.WARN if tilted else Level.OK, f"the body leans by {lean:.0f} degrees",
+        "set it down level" if tilted else "",
+    )  # fmt: skip
+    remote = decode_remote(frame.remote)
+    if remote is None:
+        yield Finding(
+            "robot", Level.NOTE, "no remote is heard: L2+B cannot stop the robot",
+            "switch the remote on and pair it before you arm",
+        )  # fmt: skip
+    else:
+        yield Finding("robot", Level.OK, "the remote is heard: L2+B makes the robot passive")
+
+
+def _judge_mode(name: str) -> Finding:
+    if not name:
+        return Finding("services", Level.OK, "no sport mode is active: the low level is free")
+    return Finding(
+        "services", Level.NOTE, f"sport mode {name!r} is active",
+        "deal-hw releases it when it arms, after the robot has lain down; keep the robot on the floor",
+    )  # fmt: skip

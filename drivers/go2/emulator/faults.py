@@ -1,0 +1,149 @@
+"""What goes wrong with an emulated Go2 on request: on the wire, in the firmware, in the motors, around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.errors import ConfigurationError, UnknownNameError
+
+SHARES: Final = ("drop", "duplicate", "reorder", "corrupt")
+MOMENTS: Final = (
+    "wire", "freeze", "cut", "stale", "lost", "sport", "battery", "nan", "hot", "stop", "push",
+)  # fmt: skip
+"""Faults that begin at a moment, as in ``<name>_after_s``; ``wire`` is that of the four shares."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Go2Faults:
+    """Faults of an emulated Go2; times count from the first stiff command."""
+
+    reorder: float = 0.0
+    """Share of states that come after their successor."""
+
+    wire_after_s: float | None = None
+    """When the shares --drop, --duplicate, --reorder and --corrupt begin [s]; by default at once."""
+
+    stale_after_s: float | None = None
+    """When the same state begins to be sent again and again [s]."""
+
+    lost_after_s: float | None = None
+    """When a motor gives no torque any more and counts lost commands [s]."""
+
+    lost_joint: str = "FL_calf_joint"
+    """That motor."""
+
+    sport_after_s: float | None = None
+    """When sport mode comes back and stands the robot up [s]."""
+
+    battery_after_s: float | None = None
+    """When the battery is nearly empty [s]."""
+
+    nan_after_s: float | None = None
+    """When a joint's position and velocity become NaN [s]."""
+
+    nan_joint: str = "FL_calf_joint"
+    """That joint."""
+
+    hot_after_s: float | None = None
+    """When a motor reports 95 degrees [s]."""
+
+    hot_joint: str = "FL_calf_joint"
+    """That motor."""
+
+    stop_after_s: float | None = None
+    """When the operator presses L2 and B and holds them [s]."""
+
+    push_after_s: float | None = None
+    """When somebody pushes the base to its left [s]."""
+
+    push: float = 25.0
+    """The push's impulse, over 0.1 s [N*s]."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name in SHARES and not 0.0 <= value <= 1.0:
+                raise ConfigurationError(f"{entry.name} is a share from 0 to 1, got {value}")
+            if entry.name.endswith("_after_s") and value is not None and not 0.0 <= value <= 1e7:
+                raise ConfigurationError(f"{entry.name} must be 0 to 1e7 seconds, got {value}")
+            if entry.name == "push" and not abs(value) <= 1e4:
+                raise ConfigurationError(f"push must be -1e4 to 1e4 N*s, got {value}")
+            if entry.name.endswith("_joint") and value not in JOINTS:
+                raise UnknownNameError("Go2 joint", value, JOINTS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultPlan(Go2Faults):
+    """All of an emulated Go2's faults: those that every emulated robot has, and its own."""
+
+    drop: float = 0.0
+    """Share of states that are lost."""
+
+    duplicate: float = 0.0
+    """Share of states that come twice."""
+
+    corrupt: float = 0.0
+    """Share of states in which one byte is changed."""
+
+    freeze_after_s: float | None = None
+    """When the robot says nothing any more; it still hears [s]."""
+
+    cut_after_s: float | None = None
+    """When the wire is cut: nothing goes out or is heard; the robot does what it was last told [s]."""
+
+    cut_s: float = 1.0
+    """How long the wire is cut [s]."""
+
+    def due(self) -> list[tuple[int, str]]:
+        """Return when faults begin, in ms since the first stiff command, and which; earliest first."""
+        found = []
+        for name in MOMENTS:
+            after_s = getattr(self, f"{name}_after_s")
+            if after_s is not None:
+                found.append((round(after_s * 1e3), name))
+        return sorted(found)
+
+
+class StateFaults:
+    """Applies the four shares to messages of one topic.
+
+    Attributes:
+        counts: How often each happened.
+
+    Args:
+        plan: The shares.
+        rng: Source of randomness.
+    """
+
+    def __init__(self, plan: FaultPlan, rng: np.random.Generator) -> None:
+        self.counts = dict.fromkeys(SHARES, 0)
+        self._shares = np.array([getattr(plan, name) for name in SHARES])
+        self.any = bool(self._shares.any())
+        self._rng = rng
+        self._held: bytes | None = None
+
+    def apply(self, payload: bytes) -> list[bytes]:
+        """Return what goes out instead of this message, in order."""
+        drop, duplicate, reorder, corrupt = self._rng.random(4) < self._shares
+        late = [] if self._held is None else [self._held]
+        self._held = None
+        if drop:
+            self.counts["drop"] += 1
+            return late
+        if corrupt:
+            self.counts["corrupt"] += 1
+            changed = bytearray(payload)
+            changed[int(self._rng.integers(len(payload)))] ^= int(self._rng.integers(1, 256))
+            payload = bytes(changed)
+        if reorder and not late:
+            self.counts["reorder"] += 1
+            self._held = payload
+            return []
+        if duplicate:
+            self.counts["duplicate"] += 1
+            return [payload, payload, *late]
+        return [payload, *late]

@@ -1,0 +1,149 @@
+"""What an emulated Go2 reports of itself: the mechanics through noise, bias and quantisation."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from deal_hw.drivers.go2.emulator.motors import Motors
+from deal_hw.drivers.go2.emulator.profiles import Profile
+from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.messages.protocol import LowState
+from deal_hw.sim.legged.simulation import LeggedSimulation
+from deal_hw.types import FloatArray
+
+CELLS: Final = 8
+_CAPACITY_AS: Final = 15.0 * 3600.0
+_IDLE_A: Final = 1.2
+_LOSS_W_PER_NM2: Final = 0.3
+_RESISTANCE_OHM: Final = 0.05
+IMU_TEMPERATURE_C: Final = 58
+_HOT_C: Final = 95
+_LOW_CHARGE: Final = 0.04
+
+
+class Battery:
+    """A battery of 8 cells that the motors drain.
+
+    Attributes:
+        charge: State of charge, 0 to 1.
+        current: Drawn now [A].
+    """
+
+    def __init__(self) -> None:
+        self.charge = 0.86
+        self.current = _IDLE_A
+
+    @property
+    def cell_mv(self) -> int:
+        """Voltage of one cell [mV]."""
+        return round(3200 + 780 * self.charge)
+
+    @property
+    def voltage(self) -> float:
+        """Voltage of the supply under load [V]."""
+        return CELLS * self.cell_mv * 1e-3 - _RESISTANCE_OHM * self.current
+
+    def drain(self, effort: FloatArray, velocity: FloatArray, seconds: float) -> None:
+        """Deliver what the motors take, for a while [s]."""
+        watts = max(0.0, float(effort @ velocity)) + _LOSS_W_PER_NM2 * float(effort @ effort)
+        self.current = _IDLE_A + watts / (CELLS * 3.7)
+        self.charge = max(0.0, self.charge - self.current * seconds / _CAPACITY_AS)
+
+
+class Sensing:
+    """Makes LowStates of the mechanics, and what broken sensors make of them.
+
+    Attributes:
+        battery: The battery.
+        motors: The motors.
+        hot: Joint whose motor reports 95 °C; None for none.
+        broken: Joint whose encoder reports NaN; None for none.
+
+    Args:
+        sim: The mechanics.
+        motors: The motors.
+        truth: Encoder biases.
+        profile: Noise and resolution.
+        rng: Source of the noise.
+    """
+
+    def __init__(
+        self, sim: LeggedSimulation, motors: Motors, truth: Truth, profile: Profile, rng: np.random.Generator
+    ) -> None:
+        self.battery = Battery()
+        self.hot: int | None = None
+        self.broken: int | None = None
+        self._sim, self.motors, self._rng = sim, motors, rng
+        self._bias = np.array(truth.encoder_bias)
+        self._resolution = profile.position_resolution
+        p = profile
+        self._noise = np.repeat(
+            (p.position_noise, p.velocity_noise, p.acceleration_noise, p.effort_noise,
+             p.orientation_noise, p.gyro_noise, p.specific_force_noise),
+            (12, 12, 12, 12, 3, 3, 3),
+        )  # fmt: skip
+        self._cells = np.zeros(15, np.int64)
+
+    def empty_battery(self) -> None:
+        """Leave 4 % in the battery."""
+        self.battery.charge = min(self.battery.charge, _LOW_CHARGE)
+
+    def state(self, tick_ms: int, remote: bytes) -> LowState:
+        """Return the state of now.
+
+        Args:
+            tick_ms: The robot's clock.
+            remote: What the remote control sent, 40 bytes.
+        """
+        sim, motors, battery = self._sim, self.motors, self.battery
+        noise = self._noise * self._rng.standard_normal(57)
+        position = sim.position() + self._bias + noise[0:12]
+        if self._resolution:
+            position = np.rint(position / self._resolution) * self._resolution
+        velocity = sim.velocity() + noise[12:24]
+        temperature = motors.temperature.astype(np.int64)
+        if self.hot is not None:
+            temperature[self.hot] = _HOT_C
+        if self.broken is not None:
+            position[self.broken] = velocity[self.broken] = math.nan
+        w, x, y, z = orientation = _turned(sim.orientation(), noise[48:51])
+        force = np.rint(np.minimum(sim.foot_force(), 32767.0)).astype(np.int64)
+        self._cells[:CELLS] = battery.cell_mv
+        return LowState(
+            position=position, velocity=velocity, acceleration=sim.acceleration() + noise[24:36],
+            effort=motors.effort + noise[36:48], temperature=temperature, lost=motors.lost, mode=motors.mode,
+            orientation=orientation, angular_velocity=sim.angular_velocity() + noise[51:54],
+            specific_force=sim.specific_force() + noise[54:57], rpy=_roll_pitch_yaw(w, x, y, z),
+            imu_temperature=IMU_TEMPERATURE_C, foot_force=force, foot_force_estimate=force,
+            tick_ms=tick_ms, remote=remote, battery_percent=round(100 * battery.charge),
+            battery_current_ma=-round(1e3 * battery.current), battery_status=8, battery_cycles=42,
+            cell_voltage_mv=self._cells, voltage=battery.voltage, current=battery.current,
+        )  # fmt: skip
+
+
+def _turned(orientation: FloatArray, angles: FloatArray) -> FloatArray:
+    """Return a quaternion turned by small angles about its own axes, to first order."""
+    w, x, y, z = orientation
+    a, b, c = angles / 2
+    turned = np.array(
+        (
+            w - x * a - y * b - z * c,
+            x + w * a + y * c - z * b,
+            y + w * b + z * a - x * c,
+            z + w * c + x * b - y * a,
+        )
+    )
+    return np.asarray(turned / math.sqrt(turned @ turned))
+
+
+def _roll_pitch_yaw(w: float, x: float, y: float, z: float) -> FloatArray:
+    return np.array(
+        (
+            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x)))),
+            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        )
+    )

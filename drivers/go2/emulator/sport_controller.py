@@ -1,0 +1,96 @@
+"""The vendor's sport mode, as far as an emulator needs it: it stands up, lies down, damps, and never lets go.
+
+It commands the motors every 2 ms, whoever else does. It does not walk: a Move is answered, and the robot
+stays where it stands.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Final
+
+import numpy as np
+
+from deal_hw.drivers.go2.messages.protocol import LowCommand
+from deal_hw.types import FloatArray
+
+PERIOD_MS: Final = 2
+STIFFNESS_NM_RAD: Final = 60.0
+DAMPING_NMS_RAD: Final = 5.0
+RELEASED_DAMPING_NMS_RAD: Final = 3.0
+STANDING: Final = np.tile((0.0, 0.67, -1.3), 4)
+LYING: Final = np.tile((0.0, 1.36, -2.65), 4)
+"""Poses and gains of unitree_sdk2_python's go2_stand_example."""
+_ZEROS: Final = np.zeros(12)
+_STIFF, _DAMPED = np.full(12, STIFFNESS_NM_RAD), np.full(12, DAMPING_NMS_RAD)
+_RELEASED: Final = np.full(12, RELEASED_DAMPING_NMS_RAD)
+
+
+class Posture(enum.Enum):
+    """What sport mode does; the value is SportModeState's ``mode``."""
+
+    STANDING = 6
+    """Joints locked, as after StandUp."""
+    BALANCING = 1
+    DOWN = 5
+    DAMPING = 7
+    RECOVERING = 8
+
+
+_WAYS: Final = {
+    Posture.STANDING: ((1.2, STANDING),),
+    Posture.BALANCING: ((1.2, STANDING),),
+    Posture.DOWN: ((1.5, LYING),),
+    Posture.RECOVERING: ((1.0, LYING), (1.2, STANDING)),
+}
+"""Poses on the way, each with the time to get there [s]."""
+_UPRIGHT: Final = (Posture.STANDING, Posture.BALANCING, Posture.RECOVERING)
+
+
+class SportController:
+    """A stand controller that moves along straight lines in joint space and holds where they end.
+
+    Attributes:
+        posture: What it does.
+        velocity: Walking speed that was asked for last: ahead, left, turn [m/s, rad/s]; never walked.
+    """
+
+    def __init__(self) -> None:
+        self.posture = Posture.DAMPING
+        self.velocity = (0.0, 0.0, 0.0)
+        self._begin_ms = 0
+        self._from = _ZEROS
+
+    def take(self, posture: Posture, position: FloatArray, now_ms: int) -> None:
+        """Go into a posture from measured positions, (12,) [rad]."""
+        self.velocity = (0.0, 0.0, 0.0)
+        if posture is self.posture:
+            # The vendor's example asks for StandDown every second until the mode is released: beginning anew
+            # each time would never end.
+            return
+        stands = self.posture in _UPRIGHT and self.progress(now_ms) >= 1.0
+        self.posture = posture
+        if stands and posture in _UPRIGHT:
+            return
+        self._begin_ms, self._from = now_ms, position.copy()
+
+    def progress(self, now_ms: int) -> float:
+        """Return how far the way to the posture is done, 0 to 1."""
+        total_s = sum(seconds for seconds, _ in _WAYS.get(self.posture, ()))
+        return min(1.0, (now_ms - self._begin_ms) * 1e-3 / total_s) if total_s else 1.0
+
+    def command(self, now_ms: int) -> LowCommand:
+        """Return what the motors get now."""
+        if self.posture is Posture.DAMPING:
+            return LowCommand(_ZEROS, _ZEROS, _ZEROS, _RELEASED, _ZEROS)
+        since_s = (now_ms - self._begin_ms) * 1e-3
+        before = self._from
+        for seconds, pose in _WAYS[self.posture]:
+            if since_s < seconds:
+                target = before + (pose - before) * (since_s / seconds)
+                return LowCommand(target, _ZEROS, _STIFF, _DAMPED, _ZEROS)
+            since_s -= seconds
+            before = pose
+        if self.posture is Posture.DOWN:
+            return LowCommand(_ZEROS, _ZEROS, _ZEROS, _RELEASED, _ZEROS)
+        return LowCommand(before, _ZEROS, _STIFF, _DAMPED, _ZEROS)

@@ -1,0 +1,149 @@
+"""The hidden truth of an emulated Go2; for the emulator and for benches, never for a calibrator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+
+from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
+from deal_hw.errors import ConfigurationError
+from deal_hw.reading import number, reading
+
+JOINT_DAMPING_NMS_RAD: Final = 0.6
+FRICTIONLOSS_NM: Final = 0.2
+ARMATURE_KGM2: Final = 0.01
+DEFAULT_XI: Final = 2.0
+"""Hidden quantities lie within this ratio of the nominal ones, unless told otherwise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """What a calibrator has to find out; tuples follow the 12 joints in model order.
+
+    Attributes:
+        profile: Name of the profile.
+        seed: Seed of the draw, of noise and of jitter.
+        stiffness: What the motor does over what it is told, kp.
+        damping: The same, kd.
+        joint_damping: Viscous friction [N·m·s/rad].
+        frictionloss: Coulomb friction of the gears [N·m].
+        armature: Inertia of the rotors at the joint [kg·m²].
+        encoder_bias: Reported minus true position [rad]; a motor closes its loop on the reported one.
+        latency_ms: A command acts that long after it was received, jitter aside [ms].
+    """
+
+    profile: str
+    seed: int
+    stiffness: tuple[float, ...] = (1.0,) * 12
+    damping: tuple[float, ...] = (1.0,) * 12
+    joint_damping: tuple[float, ...] = (JOINT_DAMPING_NMS_RAD,) * 12
+    frictionloss: tuple[float, ...] = (FRICTIONLOSS_NM,) * 12
+    armature: tuple[float, ...] = (ARMATURE_KGM2,) * 12
+    encoder_bias: tuple[float, ...] = (0.0,) * 12
+    latency_ms: int = 0
+
+    def __post_init__(self) -> None:
+        for name in _PER_JOINT:
+            if len(getattr(self, name)) != len(JOINTS):
+                raise ConfigurationError(
+                    f"the truth of a Go2: {name} has {len(getattr(self, name))} entries, expected 12"
+                )
+
+    def parameters(self, stiffness: float, damping: float) -> dict[str, float]:
+        """Return the true values under the names in the parameter sets of the robot on a stand.
+
+        Args:
+            stiffness: kp that the motors are sent [N·m/rad].
+            damping: kd that they are sent [N·m·s/rad]; the joint's own viscous friction adds to it.
+        """
+        motor = np.array(self.damping) * damping + self.joint_damping
+        rows = {
+            "stiffness": np.array(self.stiffness) * stiffness,
+            "damping": motor,
+            "frictionloss": np.array(self.frictionloss),
+            "armature": np.array(self.armature),
+            "encoder_bias": np.array(self.encoder_bias),
+        }
+        return {
+            f"{joint}.{name}": float(value)
+            for name, values in rows.items()
+            for joint, value in zip(JOINTS, values, strict=True)
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; joints by name."""
+        values: dict[str, Any] = {"robot": "go2"}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            values[entry.name] = dict(zip(JOINTS, value, strict=True)) if entry.name in _PER_JOINT else value
+        return values
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Truth:
+        """Return the truth that :meth:`to_json` wrote; other keys are ignored.
+
+        Raises:
+            ConfigurationError: A value is missing or means nothing.
+        """
+        with reading("the values", "the truth of a Go2", "--reveal-to writes one", error=ConfigurationError):
+            arrays = {
+                name: tuple(number(values[name][joint], f"{name} of {joint}", -1e3, 1e3) for joint in JOINTS)
+                for name in _PER_JOINT
+            }
+            return cls(
+                profile=find_profile(values["profile"]).name,
+                seed=int(number(values["seed"], "seed", 0)),
+                latency_ms=int(number(values["latency_ms"], "latency_ms", 0, 1000)),
+                **arrays,
+            )
+
+
+_PER_JOINT: Final = ("stiffness", "damping", "joint_damping", "frictionloss", "armature", "encoder_bias")
+
+
+def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:
+    """Return a truth that equals the description, without latency unless given among the changes."""
+    return Truth(profile=find_profile(profile).name, seed=seed, **changes)
+
+
+def draw_truth(profile: str, seed: int, *, xi: float = DEFAULT_XI) -> Truth:
+    """Draw a hidden truth: each quantity log-uniformly in the middle 80 % of [nominal/xi, nominal*xi].
+
+    Args:
+        profile: Name of the profile.
+        seed: Seed of the draw.
+        xi: Ratio of the range around the nominal values.
+
+    Raises:
+        UnknownNameError: There is no such profile.
+        ConfigurationError: ``xi`` is not above 1, or the seed is negative.
+    """
+    found = find_profile(profile)
+    if seed < 0:
+        raise ConfigurationError(f"a seed is 0 or more, got {seed}")
+    if not 1.0 < xi < math.inf:
+        raise ConfigurationError(f"xi is a ratio above 1, got {xi}")
+    rng = np.random.default_rng([seed, 0x602])
+
+    def around(nominal: float) -> tuple[float, ...]:
+        exponent = rng.uniform(-0.8, 0.8, len(JOINTS))
+        return tuple(float(v) for v in nominal * xi**exponent)
+
+    low, high = found.latency_ms
+    bias = found.encoder_bias_rad
+    return Truth(
+        profile=profile,
+        seed=seed,
+        stiffness=around(1.0),
+        damping=around(1.0),
+        joint_damping=around(JOINT_DAMPING_NMS_RAD),
+        frictionloss=around(FRICTIONLOSS_NM),
+        armature=around(ARMATURE_KGM2),
+        encoder_bias=tuple(float(v) for v in rng.uniform(-bias, bias, len(JOINTS))),
+        latency_ms=int(rng.integers(low, high + 1)),
+    )

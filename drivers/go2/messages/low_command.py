@@ -1,0 +1,136 @@
+"""LowCmd: P-D targets for the motors. Import its names from ``messages.protocol``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.drivers.go2.messages import layout
+from deal_hw.drivers.go2.messages.layout import LOW_COMMAND_BYTES
+from deal_hw.drivers.go2.messages.wire import (
+    CDR_HEADER,
+    CRC_START,
+    HEAD,
+    LEVEL_LOW,
+    SLOT,
+    WIRE_JOINTS,
+    check_frame,
+    low_command_image,
+    verify_crc,
+    words_crc,
+)
+from deal_hw.errors import FrameError
+from deal_hw.types import FloatArray, IntArray
+
+MODE_OFF: Final = 0x00
+MODE_SERVO: Final = 0x01
+POSITION_STOP: Final = 2.146e9
+VELOCITY_STOP: Final = 16000.0
+"""What the vendor's examples write to motors that are not commanded, with kp = kd = 0."""
+_LARGEST: Final = 1e30
+"""Squares of a command's numbers add up to less than this; stop values to 5.5e19."""
+
+
+@dataclass(frozen=True, slots=True)
+class LowCommand:
+    """P-D targets for the 12 motors, arrays (12,) in model order.
+
+    Attributes:
+        position: Targets q [rad].
+        velocity: Targets dq [rad/s].
+        stiffness: kp [N·m/rad].
+        damping: kd [N·m·s/rad].
+        effort: Feed-forward tau [N·m].
+        mode: 1 servo, 0 off.
+        level: 0xFF: to the motors themselves.
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+    effort: FloatArray
+    mode: IntArray = field(default_factory=lambda: np.ones(12, np.int64))
+    level: int = LEVEL_LOW
+
+
+class LowCommandEncoder:
+    """Writes LowCommands into a buffer of its own and returns copies; one for each thread."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray(LOW_COMMAND_BYTES)
+        record = np.frombuffer(self._buffer, layout.LOW_COMMAND)[0]
+        record["encapsulation"] = tuple(CDR_HEADER)
+        record["head"] = tuple(HEAD)
+        motors = record["motor"]
+        motors["q"], motors["dq"] = POSITION_STOP, VELOCITY_STOP
+        # (20, 8) floats, whose rows' first five are q, dq, tau, kp, kd; the rest is reserved and stays 0.
+        rows: np.ndarray[tuple[int, int], np.dtype[np.float32]] = np.ndarray(
+            (layout.SLOTS, 5), "<f4", self._buffer, offset=28, strides=(36, 4)
+        )
+        self._rows = rows[: len(JOINTS)]
+        self._bytes = np.frombuffer(self._buffer, "u1")
+        self._bytes[layout.COMMAND_MODE_AT] = MODE_SERVO
+        self._values = np.empty((5, len(JOINTS)))
+        self._flat = self._values.reshape(-1)
+        self._mode, self._level = b"", -1
+        self._start = CRC_START
+
+    def encode(self, command: LowCommand) -> bytes:
+        """Return the command as CDR with header and checksum, 812 bytes.
+
+        Raises:
+            FrameError: A number is not finite, or absurd.
+        """
+        values = self._values
+        values[0], values[1], values[2] = command.position, command.velocity, command.effort
+        values[3], values[4] = command.stiffness, command.damping
+        if not self._flat.dot(self._flat) < _LARGEST:
+            raise FrameError("a LowCmd's numbers must be finite and of this world; refusing to send others")
+        self._rows[...] = values.take(_WIRE_ROWS)
+        if (mode := command.mode.tobytes()) != self._mode or command.level != self._level:
+            self._set_modes(command)
+            self._mode, self._level = mode, command.level
+        crc = words_crc(self._buffer[28:808], self._start)
+        self._buffer[808:] = crc.to_bytes(4, "little")
+        return bytes(self._buffer)
+
+    def _set_modes(self, command: LowCommand) -> None:
+        self._bytes[layout.COMMAND_MODE_AT[SLOT]] = command.mode
+        self._buffer[6] = command.level
+        # The struct's first 28 bytes hold no motor's numbers: their share of the checksum is kept.
+        self._start = words_crc(low_command_image(bytes(self._buffer))[:28])
+
+
+_FIELD_COUNT: Final = 5
+_MODEL_OF_SLOT: Final = np.array([JOINTS.index(joint) for joint in WIRE_JOINTS])
+_WIRE_ROWS: Final = _MODEL_OF_SLOT[:, None] + len(JOINTS) * np.arange(_FIELD_COUNT)[None, :]
+"""Where in a flat (5, 12) array in model order each number of the wire's rows comes from, (12, 5)."""
+
+
+def decode_low_command(payload: bytes) -> LowCommand:
+    """Return the command in a LowCmd, as a robot would take it.
+
+    Raises:
+        FrameError: Wrong length, header, head, level flag or checksum, or a reserved field that is not 0.
+    """
+    check_frame(payload, "LowCmd")
+    record = np.frombuffer(payload, layout.LOW_COMMAND)[0]
+    verify_crc(payload, "LowCmd")
+    if payload[6] != LEVEL_LOW:
+        raise FrameError(
+            f"LowCmd: level_flag is 0x{payload[6]:02X}; commands to the motors have 0x{LEVEL_LOW:02X}"
+        )
+    if (
+        payload[7] or record["reserve"] or record["bms_reserve"].any() or record["motor"]["reserve"].any()
+    ):  # fmt: skip
+        raise FrameError(
+            "LowCmd: reserved fields are set; the sender uses another version, or another layout"
+        )
+    motors = record["motor"][SLOT]
+    modes = np.frombuffer(payload, "u1")[layout.COMMAND_MODE_AT[SLOT]]
+    q, dq, kp, kd, tau = (motors[name].astype(np.float64) for name in ("q", "dq", "kp", "kd", "tau"))
+    return LowCommand(q, dq, kp, kd, tau, modes.astype(np.int64), payload[6])

@@ -1,0 +1,61 @@
+"""States that were refused by their bytes: how many, why, and what to do about it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final, Literal
+
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.layout import LOW_STATE_BYTES
+from deal_hw.drivers.go2.messages.wire import CDR_HEADER
+from deal_hw.errors import FrameError, ProtocolError, VersionMismatchError, WrongDeviceError
+
+StateCheck = Literal["strict", "length"]
+"""What a LowState must pass: all, or all but head and checksum."""
+OTHER_RULE: Final = (
+    "the robot's firmware, or a simulator in its place, makes head or checksum by another rule; update "
+    "deal-hw, or go on with `--state-check length`: neither counts then, and a state that was corrupted on "
+    "the way is taken for a true one"
+)
+ANOTHER_ROBOT: Final = "another robot type (G1 and H1 use this topic, too)? Choose the right robot or network"
+
+
+class Refusals:
+    """Counts them.
+
+    Attributes:
+        count: How many.
+        first: Why the first one was refused, in words; "" before.
+    """
+
+    def __init__(self) -> None:
+        self.count, self.first = 0, ""
+        self._ruled = 0
+        self._lengths: Counter[int] = Counter()
+
+    def add(self, payload: bytes, error: FrameError) -> None:
+        """Take a refused message and why it was refused."""
+        self.count += 1
+        self.first = self.first or str(error)
+        self._lengths[len(payload)] += 1
+        self._ruled += len(payload) == LOW_STATE_BYTES and payload[:4] == CDR_HEADER
+
+    @property
+    def by_rule(self) -> bool:
+        """Whether most have a Go2's length and encoding, but not its head or checksum."""
+        return 2 * self._ruled > self.count
+
+    def error(self) -> ProtocolError:
+        """Return what is wrong where every state was refused."""
+        if self.by_rule:
+            return VersionMismatchError(
+                f"go2: {self._ruled} states have the right length, and none the right head and checksum (the "
+                f"first: {self.first}): {OTHER_RULE}"
+            )
+        length = self._lengths.most_common(1)[0][0]
+        if length != LOW_STATE_BYTES:
+            return WrongDeviceError(
+                f"go2: the messages on {topics.LOW_STATE} have {length} bytes, those of a Go2 "
+                f"{LOW_STATE_BYTES}: {ANOTHER_ROBOT}"
+            )
+        return WrongDeviceError(f"go2: what comes on {topics.LOW_STATE} is no state of a Go2: {self.first}")
