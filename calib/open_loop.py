@@ -21,7 +21,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 
 from deal_hw.calib.baselines.simple import Nominal
 from deal_hw.calib.data.checks import check_excitation
@@ -36,7 +35,7 @@ from deal_hw.calib.uncertainty.correlated import confounded
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, uncertainty
 from deal_hw.calib.validation.checks import with_causes, with_step
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks, motion_numbers, time_masks
-from deal_hw.calib.validation.split_half import FALSE_ALARMS, Halves, HalvesRow, heed
+from deal_hw.calib.validation.split_half import Halves, agreement, heed
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,
@@ -390,39 +389,4 @@ def _halves(problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertaint
         estimates.append(half.theta)
         stds.append(np.sqrt(np.diag(told.covariance)))
         intervals.append(told.interval)
-    return compared(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)
-
-
-def compared(
-    problem: Problem,
-    theta: FloatArray,
-    known: Uncertainty,
-    estimates: list[FloatArray],
-    stds: list[FloatArray],
-    intervals: list[FloatArray],
-    steps: int,
-) -> Halves:
-    """Return whether two halves agree.
-
-    Args:
-        problem: All data.
-        theta: The estimate of all data, (K,).
-        known: What is known there; what the data cannot tell is not compared.
-        estimates: Of each half, (K,).
-        stds: Of each half, in the parameters' own scale, (K,).
-        intervals: Of each half, (K, 2).
-        steps: Physics steps that it cost.
-    """
-    space = problem.space
-
-    def three(half: int, k: int) -> tuple[float, float, float]:
-        low, high = intervals[half][k]
-        return float(estimates[half][k]), float(low), float(high)
-
-    rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
-    told = ~known.shape.blind
-    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(told.sum()), 1)))
-    scaled = space.to_scale(np.stack(estimates))
-    far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
-    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
-    return Halves(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
+    return agreement(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)

@@ -143,21 +143,41 @@ def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> 
         estimates.append(found.theta)
         stds.append(np.sqrt(np.diag(told.covariance)))
         intervals.append(told.interval)
-    scaled = problem.space.to_scale(np.stack(estimates))
-    rows = tuple(
-        HalvesRow(
-            name=name,
-            first=_three([estimates[0][k], *intervals[0][k]]),
-            second=_three([estimates[1][k], *intervals[1][k]]),
-        )
-        for k, name in enumerate(problem.space.names)
-    )
-    compared = ~known.shape.blind
-    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(compared.sum()), 1)))
+    return agreement(problem, polished.theta, known, estimates, stds, intervals, problem.steps - before)
+
+
+def agreement(
+    problem: Problem,
+    theta: FloatArray,
+    known: Uncertainty,
+    estimates: Sequence[FloatArray],
+    stds: Sequence[FloatArray],
+    intervals: Sequence[FloatArray],
+    steps: int,
+) -> Halves:
+    """Return whether two halves agree.
+
+    Args:
+        problem: All data.
+        theta: The estimate of all data, (K,).
+        known: What is known there; what the data cannot tell is not compared.
+        estimates: Of each half, (K,).
+        stds: Of each half, in the parameters' own scale, (K,).
+        intervals: Of each half, (K, 2).
+        steps: Physics steps that it cost.
+    """
+    space = problem.space
+
+    def three(half: int, k: int) -> tuple[float, float, float]:
+        return _three([estimates[half][k], *intervals[half][k]])
+
+    rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
+    told = ~known.shape.blind
+    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(told.sum()), 1)))
+    scaled = space.to_scale(np.stack(estimates))
     far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
-    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and compared[k] and not r.agree)
-    reach = np.max(np.abs(scaled - problem.space.to_scale(polished.theta)), axis=0)
-    return Halves(rows, flagged, reach, problem.steps - before)
+    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
+    return Halves(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
 
 
 def heed(problem: Problem, known: Uncertainty, theta: FloatArray, halves: Halves) -> Uncertainty:
