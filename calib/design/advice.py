@@ -6,6 +6,7 @@ is added to what the calibration knows already.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from deal_hw.control.excitation_plan import (
     ExcitationPlan,
     largest_factor,
     make_plan,
+    words,
 )
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
@@ -47,6 +49,7 @@ class Advice:
         after: The one that another recording would leave; as before where none helps.
         excitation: Which recording, in words; "" where none helps.
         sentence: All of it as one sentence.
+        command: `deal-hw` options that make the excitation; "" where none helps.
     """
 
     parameter: str
@@ -54,6 +57,7 @@ class Advice:
     after: float
     excitation: str
     sentence: str
+    command: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; a figure that was not computed is None."""
@@ -63,13 +67,22 @@ class Advice:
             "std_after": self.after if math.isfinite(self.after) else None,
             "excitation": self.excitation,
             "sentence": self.sentence,
+            "command": self.command,
         }
 
 
 def excitation_menu(
     description: RobotDescription, seconds: float = 4.0, *, balances: bool = False, seed: int = 1
 ) -> dict[str, ExcitationPlan]:
-    """Return excitations that a robot can be recorded with, by what they are in words.
+    """Return excitations that a robot can be recorded with, by what they are in words."""
+    found = menu_designs(description, seconds, balances=balances, seed=seed)
+    return {in_words: make_plan(description, design) for in_words, design in found.items()}
+
+
+def menu_designs(
+    description: RobotDescription, seconds: float = 4.0, *, balances: bool = False, seed: int = 1
+) -> dict[str, ExcitationDesign]:
+    """Return what the menu's excitations are made from, by what they are in words.
 
     Args:
         description: The robot.
@@ -88,8 +101,17 @@ def excitation_menu(
         for amplitude in (1.0, 0.4)
         for effort, speed in _variants(description)
     ]  # fmt: skip
-    plans = [make_plan(description, design) for design in designs]
-    return {plan.words: plan for plan in plans}
+    return {words(design): design for design in designs}
+
+
+def options(design: ExcitationDesign) -> str:
+    """Return the options of `deal-hw excite` that make a design of the menu."""
+    effort, speed = design.effort[0], design.speed[0]
+    limits = f" --effort {effort:.3g} --speed {speed:.3g} --split 0" if (effort, speed) != (1.0, 1.0) else ""
+    return (
+        f"--family {design.family} --seconds {design.seconds:g} --amplitude {design.amplitude:g} "
+        f"--high-hz {design.high_hz:.3g}{limits} --seed {design.seed}"
+    )
 
 
 def _variants(description: RobotDescription) -> list[tuple[tuple[float, float], tuple[float, float]]]:
@@ -139,8 +161,22 @@ def advise(
         else excitation_menu(robot.description, seconds, balances=balance is not None)
     )
     predictions = predict_menu(robot, known, before, plans, balance=balance, threads=threads)
-    usable = {words: found for words, found in predictions.items() if found.usable}
-    return tuple(_advice(space, k, float(before[k]), usable, len(predictions)) for k in open_)
+    usable = {name: found for name, found in predictions.items() if found.usable}
+    designs = menu_designs(robot.description, seconds, balances=balance is not None)
+    # What the model lacks will be in the next recording, too: it widens that interval like this one.
+    widened = result.provenance.get("clustered", {}).get("widened", {})
+    found = [
+        _advice(
+            space, k, float(before[k]), usable, len(predictions), max(widened.get(space.names[k], 1.0), 1.0)
+        )
+        for k in open_
+    ]
+    return tuple(
+        dataclasses.replace(one, command=options(designs[one.excitation]))
+        if one.excitation in designs
+        else one
+        for one in found
+    )
 
 
 def predict_menu(
@@ -180,7 +216,7 @@ def predict_menu(
     def maker(plan: ExcitationPlan) -> MakeBehaviour:
         return lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None)
 
-    return {words: experiment.predict(maker(plan)) for words, plan in menu.items()}
+    return {name: experiment.predict(maker(plan)) for name, plan in menu.items()}
 
 
 def _said_weak(result: CalibrationResult, k: int) -> bool:
@@ -192,7 +228,7 @@ def _told(space: ParameterSpace, k: int, std: float) -> bool:
 
 
 def _advice(
-    space: ParameterSpace, k: int, before: float, usable: Mapping[str, Prediction], tried: int
+    space: ParameterSpace, k: int, before: float, usable: Mapping[str, Prediction], tried: int, widened: float
 ) -> Advice:
     name, prior = space.names[k], float(space.width[k] / np.sqrt(12.0))
     if not usable:
@@ -201,8 +237,8 @@ def _advice(
             "the simulation with the values found, so no advice can be computed"
         )
         return Advice(name, before, before, "", sentence)
-    best = min(usable, key=lambda words: float(usable[words].std[k]))
-    after = float(usable[best].std[k])
+    best = min(usable, key=lambda name: float(usable[name].std[k]))
+    after = min(widened * float(usable[best].std[k]), before)
     if after > WORTH * before:
         how = (
             "measure it by other means (scale, ruler, stall torque), or give what it is bound to as known"
@@ -228,14 +264,34 @@ def _amount(space: ParameterSpace, k: int, std: float) -> str:
     return f"{std:.2g} {space.free[k].unit}"
 
 
-def sentences(advice: Sequence[Advice]) -> list[str]:
-    """Return the sentences; parameters that the same recording helps share one."""
-    groups: dict[str, list[Advice]] = {}
-    for one in advice:
-        groups.setdefault(one.excitation or one.parameter, []).append(one)
-    found = []
-    for parts in groups.values():
-        text = parts[0].sentence
-        text += "".join("; " + one.sentence.split(": ", 1)[1] for one in parts[1:])
-        found.append(text)
+def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]:
+    """Return the one thing to do next, in words and as commands.
+
+    Of all recordings the one that helps most parameters most; where none helps, what to measure.
+
+    Args:
+        advice: What :meth:`Advice.to_json` gave for each open parameter.
+        robot: The robot's name where `deal-hw` can record it; "" for no commands.
+    """
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in advice:
+        groups.setdefault(row["excitation"], []).append(row)
+    hopeless = groups.pop("", [])
+    if not groups:
+        return [row["sentence"] for row in hopeless[:1]]
+
+    def gain(rows: Sequence[Mapping[str, Any]]) -> float:
+        return sum(math.log(row["std"] / row["std_after"]) for row in rows)
+
+    best = max(groups, key=lambda name: gain(groups[name]))
+    helped = ", ".join(row["sentence"].split(": ", 1)[1].split(",")[0] for row in groups[best])
+    found = [f"record {best}: {helped}"]
+    if robot and groups[best][0].get("command"):
+        found += [
+            f"    deal-hw excite {robot} {groups[best][0]['command']} --out next.json",
+            f"    deal-hw collect {robot} --excite next.json",
+        ]
+    if hopeless:
+        names = ", ".join(row["parameter"] for row in hopeless)
+        found.append(f"no recording helps with {names}: measure it by other means, then --known NAME VALUE")
     return found

@@ -322,6 +322,7 @@ def prepare_dataset(config: Calibrate) -> Work:
         },
         advice="`deal-hw collect --profile chirp` records one",
         balance=balancer(robot.description, None),
+        name="" if robot.base is not None else robot.description.name,
     )
 
 

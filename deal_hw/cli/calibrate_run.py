@@ -46,6 +46,7 @@ class Work:
         provenance: Where all of it comes from: plain JSON values.
         advice: How to get a held-out recording where there is none.
         balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
+        name: Name under which `deal-hw collect` records this robot; "" where it does not.
     """
 
     robot: RobotModel
@@ -57,6 +58,7 @@ class Work:
     provenance: Mapping[str, Any]
     advice: str
     balance: Callable[[], Behaviour] | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -290,7 +292,7 @@ def finish(
             files = write_result(folder, work.robot, result, report)
             checkpoint.unlink(missing_ok=True)
         if not quiet:
-            print_result(result, work.advice)
+            print_result(result, work.advice, work.name)
             print("written: " + ", ".join(str(f) for f in files.values()))
     except KeyboardInterrupt:
         print(f"\ninterrupted after the end: the results in {folder} are whole", file=sys.stderr)
@@ -361,16 +363,18 @@ def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
         yield report
 
 
-def print_result(result: CalibrationResult, advice: str) -> None:
+def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
     """Print the parameters with their intervals, and what the data cannot tell.
 
     Args:
         result: What was found.
         advice: How to get a held-out recording where there is none.
+        name: Name under which `deal-hw collect` records this robot; "" where it does not.
     """
     from rich.console import Console
     from rich.table import Table
 
+    from deal_hw.calib.design.advice import next_step
     from deal_hw.calib.validation.verdict import trust
 
     table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
@@ -400,8 +404,9 @@ def print_result(result: CalibrationResult, advice: str) -> None:
     console.print(f"[bold]{told.colour}:[/bold] {told.sentence}")
     for words in result.null_directions:
         console.print(f"the data cannot tell: {words}")
-    for row in result.advice:
-        console.print(f"next: {row['sentence']}")
+    for number, line in enumerate(next_step(result.advice, name)):
+        # A command is to be copied: not wrapped.
+        console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
     for words in result.alarms:
         console.print(f"[bold]alarm:[/bold] {words}")
     if not result.heldout_nrmse:

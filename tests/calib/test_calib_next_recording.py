@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from deal_hw.calib.design.advice import menu_designs, next_step, options
 from deal_hw.calib.design.next_recording import next_recordings
 from deal_hw.calib.report.inputs import ReportInputs
 from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult
+from deal_hw.cli.main import main
+from deal_hw.control.excitation_plan import read_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.drivers.go2.descriptions.floor import parameter_space
@@ -62,3 +66,36 @@ def test_advice_survives_the_file(episode: Episode) -> None:
     assert CalibrationResult.from_json(values).advice == (row,)
     del values["advice"]
     assert CalibrationResult.from_json(values).advice == ()
+
+
+def row(name: str, after: float, excitation: str, command: str = "--family steps") -> dict[str, object]:
+    """Return one row of advice: 60 % now, ``after`` with a recording."""
+    sentence = f"record {excitation}: {name} goes from 60 % to {100 * after:.2g} %, which is still weak"
+    if not excitation:
+        sentence = f"{name} is open at 60 %"
+    return {"parameter": name, "std": 0.6, "std_after": after, "excitation": excitation,
+            "sentence": sentence, "command": command}  # fmt: skip
+
+
+def test_one_step_is_next_with_its_commands() -> None:
+    """The recording that helps most is named once with all it helps; what none helps is to be measured."""
+    rows = [row("a", 0.3, "steps"), row("b", 0.2, "a chirp"), row("c", 0.5, "steps"), row("m", 0.6, "")]
+    assert next_step(rows, "cartpole") == [
+        "record a chirp: b goes from 60 % to 20 %",
+        "    deal-hw excite cartpole --family steps --out next.json",
+        "    deal-hw collect cartpole --excite next.json",
+        "no recording helps with m: measure it by other means, then --known NAME VALUE",
+    ]
+    assert next_step([*rows, row("d", 0.3, "steps")])[0] == (
+        "record steps: a goes from 60 % to 30 %, c goes from 60 % to 50 %, d goes from 60 % to 30 %"
+    )
+    assert next_step(rows[3:]) == ["m is open at 60 %"]
+    assert next_step([]) == []
+
+
+def test_the_command_makes_the_recording_that_was_reckoned_with(tmp_path: Path) -> None:
+    """`deal-hw excite` with the options of each of the menu's designs writes that very plan."""
+    for name, design in menu_designs(DESCRIPTION, balances=True).items():
+        out = tmp_path / "next.json"
+        assert main(["excite", "cartpole", *options(design).split(), "--out", str(out), "--quiet"]) == 0
+        assert read_plan(out).words == name
