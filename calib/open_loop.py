@@ -27,7 +27,7 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
 from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.pipeline import PolishedMethod, conclusive, local_fit, without_search
+from deal_hw.calib.pipeline import PolishedMethod, conclusive, local_fit, offer, without_search
 from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import with_rows
@@ -119,6 +119,8 @@ class OpenLoop(CalibrationMethod[Problem]):
         began, before = time.perf_counter(), problem.steps
         check_excitation(problem)
         local = local_fit(problem, progress) if self.local_first else None
+        if local is not None:
+            offer("local fit", local.theta, local.latency_s, local.chi2, progress)
         if local is not None and conclusive(problem, local):
             explained = PolishedMethod(self.search, self.name).concluded(
                 problem, without_search(problem, budget, local), local, progress=progress
@@ -135,6 +137,7 @@ class OpenLoop(CalibrationMethod[Problem]):
         reduced = work.reduced(problem, first)
         attempts = Attempts(self.search, reduced, rng, checkpoint)
         searched = attempts.run(0, budget, progress)
+        offer("search", searched.estimate, searched.latency_s, searched.chi2, progress)
         # Drawn after the search, so that a resumed run draws the same.
         seed = int(rng.integers(2**32))
         choice = work.choose(seed) if self.folds else Choice("long", {}, LONG_S, note="without folds")

@@ -116,6 +116,8 @@ class PolishedMethod(CalibrationMethod[Problem]):
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
         local = local_fit(problem, progress) if self.settings.local_first else None
+        if local is not None:
+            offer("local fit", local.theta, local.latency_s, local.chi2, progress)
         earlier_steps, earlier_seconds = 0, 0.0
         if local is not None and conclusive(problem, local):
             result = self.concluded(problem, without_search(problem, budget, local), local, progress=progress)
@@ -275,6 +277,22 @@ def _spread(problem: Problem, seconds: float) -> Problem:
     return problem.part(kept) if every > 1 else problem
 
 
+def offer(
+    stage: str, theta: FloatArray, latency_s: float, chi2: float, progress: ProgressCallback | None
+) -> None:
+    """Report a fit that could be the answer.
+
+    Args:
+        stage: What found it.
+        theta: Physical parameters, (K,).
+        latency_s: Total latency [s].
+        chi2: Mean squared residual over the noise's.
+        progress: Who is told.
+    """
+    if progress is not None:
+        progress(Progress(stage, 1, 1, estimate=theta, latency_s=latency_s, values={"chi2": chi2}))
+
+
 def conclusive(problem: Problem, polished: Polished) -> bool:
     """Return whether a fit needs no other judge: what it leaves has the size of the sensors' noise.
 
@@ -305,8 +323,10 @@ def _until_explained(
     attempt, left = 0, budget.generations
     for attempt in range(1 + RESTARTS):
         searched = attempts.run(attempt, dataclasses.replace(budget, generations=left), progress)
+        offer("search", searched.estimate, searched.latency_s, searched.chi2, progress)
         left -= len(searched.trace)
         polished = polish_from(problem, searched, progress)
+        offer("refinement", polished.theta, polished.latency_s, polished.chi2, progress)
         previous = best[1].chi2 if best is not None else np.inf
         if best is None or _better(polished, best[1]):
             best = (searched, polished)

@@ -37,6 +37,8 @@ class Progress:
         population: The current population, (N, K) physical values, or None.
         latency_s: The population's mean total latency [s], or None.
         values: What else is known of this generation or iteration, as in the result's trace.
+        estimate: A fit that could be the answer, (K,) physical values, with ``latency_s``; None within a
+            search or a fit.
     """
 
     stage: str
@@ -46,6 +48,7 @@ class Progress:
     population: FloatArray | None = None
     latency_s: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
+    estimate: FloatArray | None = None
 
 
 ProgressCallback = Callable[[Progress], None]

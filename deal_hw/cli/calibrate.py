@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
-from deal_hw.cli.calibrate_live import CHECKPOINT, check_resume, saying_how_to_resume, watching
+from deal_hw.cli.calibrate_live import CHECKPOINT, SO_FAR, check_resume, saying_how_to_resume, watching
 from deal_hw.cli.calibrate_model import Recordings, prepare_model, write_parameters
 from deal_hw.cli.calibrate_run import (
     HELDOUT_WINDOW_S,
@@ -198,6 +198,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             checkpoint=checkpoint,
             resume=config.resume,
             watch=watch,
+            keep=folder / SO_FAR,
             known_std=known_std,
             heldout_window_s=config.heldout_window,
         )

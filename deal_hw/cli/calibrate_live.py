@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calibration import Budget, CalibrationMethod, ProgressCallback
+from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
@@ -19,10 +21,14 @@ from deal_hw.types import FloatArray, Trajectory
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.search.checkpoint import Checkpoint
+    from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.overlay import Overlay
 
 CHECKPOINT = "checkpoint.npz"
 """Beside the results while the calibration runs; gone when it is over."""
+
+SO_FAR = "so_far"
+"""Folder beside the results that gets the best fit of a calibration that was stopped."""
 
 
 def open_checkpoint(
@@ -59,6 +65,92 @@ def check_resume(path: Path, resume: bool) -> None:
         raise ConfigurationError(
             f"there is nothing to resume: {path} does not exist; leave --resume out to begin a calibration"
         )
+
+
+class BestSoFar:
+    """The best fit of a calibration that is still running: said as it comes, kept where it is stopped.
+
+    Args:
+        space: What is searched.
+        judge: Returns the held-out errors of a fit, (K,) and latency [s], and of the model's own values; None
+            where nothing is held out.
+        quiet: Say nothing.
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        judge: Callable[[FloatArray, float], Mapping[str, float]] | None,
+        quiet: bool = False,
+    ) -> None:
+        self._space, self._judge, self._quiet = space, judge, quiet
+        self._began = time.monotonic()
+        self._error = math.inf
+        self.result: CalibrationResult | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        """Look at a fit that could be the answer; see :attr:`Progress.estimate`."""
+        if progress.estimate is None:
+            return
+        latency_s = progress.latency_s or 0.0
+        errors = self._judge(progress.estimate, latency_s) if self._judge is not None else {}
+        error = errors.get("so far", progress.values.get("chi2", math.inf))
+        if self.result is not None and not error < self._error:
+            return
+        self._error = error
+        low_high = np.stack([self._space.low, self._space.high], axis=1)
+        self.result = CalibrationResult(
+            method=f"interrupted after {progress.stage}",
+            space=self._space,
+            estimate=progress.estimate,
+            interval=low_high,
+            latency_s=latency_s,
+            latency_interval_s=(latency_s, latency_s),
+            chi2=progress.values.get("chi2", math.nan),
+            heldout_nrmse={
+                "nominal": errors["nominal"], "calibrated": errors["so far"], "null": errors["null"]
+            } if errors else {},
+            alarms=("interrupted: no interval was computed; ranges are those that were searched",),
+        )  # fmt: skip
+        if not self._quiet:
+            print(
+                f"{time.monotonic() - self._began:.0f} s, {progress.stage}: {self.sentence}", file=sys.stderr
+            )
+
+    @property
+    def sentence(self) -> str:
+        """How good it is."""
+        if self.result is None:
+            return "no fit yet"
+        errors = self.result.heldout_nrmse
+        if errors:
+            return (
+                f"held-out error {100 * errors['calibrated']:.2g} % of the signal's range "
+                f"(your own model: {100 * errors['nominal']:.2g} %)"
+            )
+        return f"residuals {math.sqrt(max(self.result.chi2, 0.0)):.2g} times the sensor's noise"
+
+
+@contextlib.contextmanager
+def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[None]:
+    """On Ctrl-C write the best fit so far, where there is one, and let the interrupt through.
+
+    Args:
+        best: What has been seen of it.
+        folder: Where to write.
+        robot: The nominal model.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        if best.result is not None:
+            from deal_hw.calib.report.folder import write_result
+            from deal_hw.data.files import interrupts_deferred
+
+            with interrupts_deferred():
+                write_result(folder, robot, best.result)
+            print(f"\nbest so far: {best.sentence}; written to {folder}, without intervals", file=sys.stderr)
+        raise
 
 
 @contextlib.contextmanager

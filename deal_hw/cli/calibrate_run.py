@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
-from deal_hw.cli.calibrate_live import open_checkpoint, saying_how_to_resume
+from deal_hw.cli.calibrate_live import SO_FAR, BestSoFar, keeping_best, open_checkpoint, saying_how_to_resume
 from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -124,6 +125,7 @@ def calibrate_episodes(
     checkpoint: Path | None = None,
     resume: bool = False,
     watch: ProgressCallback | None = None,
+    keep: Path | None = None,
     known_std: FloatArray | None = None,
     heldout_window_s: float = HELDOUT_WINDOW_S,
 ) -> CalibrationResult:
@@ -143,6 +145,7 @@ def calibrate_episodes(
         checkpoint: File that holds the state after each generation; None to keep none.
         resume: Go on with what that file holds.
         watch: Called with the progress, too.
+        keep: Folder that gets the best fit so far on Ctrl-C; None to keep none.
         known_std: What a prediction may be off, positions then velocities, (2 C,); None: the sensor noise, as
             the recordings show it.
         heldout_window_s: Held-out predictions restart this often [s].
@@ -161,16 +164,24 @@ def calibrate_episodes(
     _require_windows(holdout, heldout_window_s)
     problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s, known_std=known_std)
     check_delays(problem)
+
+    def judge(theta: FloatArray, latency: float) -> Mapping[str, float]:
+        fits = {"nominal": (space.nominal, 0.0), "so far": (theta, latency)}
+        return heldout_nrmse(robot, space, holdout, fits, window_s=heldout_window_s, threads=threads)
+
+    best = BestSoFar(space, judge if holdout else None, quiet)
     searcher = make_method(method, polish=budget.polish)
     # The matrices are small: a second BLAS thread only spins, and where processors are shared each
     # decomposition then takes ten times as long.
     with (
         threadpool_limits(1, user_api="blas"),
         show_progress(f"calibrate ({method})", quiet) as report,
+        keeping_best(best, keep, robot) if keep is not None else contextlib.nullcontext(),
     ):
 
         def progress(p: Progress) -> None:
             report(p)
+            best(p)
             if watch is not None:
                 watch(p)
 
@@ -291,6 +302,7 @@ def finish(
         with interrupts_deferred():
             files = write_result(folder, work.robot, result, report)
             checkpoint.unlink(missing_ok=True)
+            shutil.rmtree(folder / SO_FAR, ignore_errors=True)
         if not quiet:
             print_result(result, work.advice, work.name)
             print("written: " + ", ".join(str(f) for f in files.values()))
@@ -336,14 +348,14 @@ def _judged(
     return result, inputs
 
 
-@contextmanager
+@contextlib.contextmanager
 def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
     """Show a progress bar on a terminal; nothing otherwise."""
     if quiet or not sys.stderr.isatty():
         yield lambda progress: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     columns = (
@@ -351,6 +363,8 @@ def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
         BarColumn(),
         TextColumn("{task.fields[note]}"),
         TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=None, note="")

@@ -11,17 +11,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from deal_hw import calibration
 from deal_hw.calib.report import page
-from deal_hw.calibration import Progress, ProgressCallback
+from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli import calibrate as verb
+from deal_hw.cli.calibrate_live import BestSoFar
 from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
 
 
@@ -129,6 +131,52 @@ def test_view_of_the_search_is_written(dataset: Path, tmp_path: Path) -> None:
         for name in ("watched", "plain")
     )
     assert watched == plain
+
+
+def test_the_best_fit_so_far_is_said_and_kept(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C after the local fit: the fit is written, the range its interval; a result replaces it."""
+
+    @contextlib.contextmanager
+    def watching(*_: Any) -> Iterator[ProgressCallback]:
+        def progress(told: Progress) -> None:
+            if told.stage == "latency":
+                raise KeyboardInterrupt
+
+        yield progress
+
+    words = [w for w in command(dataset, tmp_path) if w not in ("--quiet", "--method", "weki")]
+    latency = words.index("--latency")
+    del words[latency : latency + 2]
+    with monkeypatch.context() as patch:
+        patch.setattr(verb, "watching", watching)
+        assert main(words) == EXIT_INTERRUPTED
+    told = capsys.readouterr().err
+    assert "s, local fit: residuals" in told and "best so far" in told
+    kept = tmp_path / "calibration" / "so_far"
+    found = CalibrationResult.from_json(json.loads((kept / "result.json").read_text()))
+    assert found.method == "interrupted after local fit"
+    assert (kept / "calibrated.xml").exists()
+    low_high = [(found.space.low[k], found.space.high[k]) for k in range(2)]
+    assert found.interval == pytest.approx(np.array(low_high))
+    assert main([*words, "--no-report", "--no-advise"]) == EXIT_OK
+    assert not kept.exists()
+
+
+def test_a_worse_fit_does_not_replace_the_best(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of three fits the second predicts held-out motion best; the third is neither said nor kept."""
+    space = k9_space().with_free(("cart.mass", "servo.stiffness"))
+    errors = iter((0.2, 0.1, 0.15))
+    best = BestSoFar(space, lambda *_: {"nominal": 0.5, "so far": next(errors), "null": 1.0})
+    best(Progress("search", 1, 9))
+    assert best.result is None
+    for stage in ("local fit", "search", "refinement"):
+        best(Progress(stage, 1, 1, estimate=space.nominal, latency_s=0.01, values={"chi2": 2.0}))
+    assert best.result is not None and best.result.method == "interrupted after search"
+    assert best.result.heldout_nrmse == {"nominal": 0.5, "calibrated": 0.1, "null": 1.0}
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2 and "held-out error 10 % of the signal's range (your own model: 50 %)" in told[1]
 
 
 FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "report.html"}
