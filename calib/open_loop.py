@@ -16,25 +16,30 @@ Recordings that are held out take no part in any of this.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.baselines.simple import Nominal
-from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
-from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.pipeline import PolishedMethod, conclusive, local_fit, offer, without_search
+from deal_hw.calib.fit.refinement import Polished, at_parameters
+from deal_hw.calib.pipeline import Calibration, Outcome, offer
 from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.uncertainty.correlated import confounded
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, uncertainty
-from deal_hw.calib.validation.checks import with_causes, with_step
-from deal_hw.calib.validation.cross_validation import Choice, fold_masks, motion_numbers, time_masks
+from deal_hw.calib.validation.checks import Validation, with_causes, with_step
+from deal_hw.calib.validation.cross_validation import (
+    Choice,
+    Member,
+    fold_masks,
+    motion_numbers,
+    on_folds,
+    time_masks,
+)
 from deal_hw.calib.validation.split_half import Halves, agreement, heed
 from deal_hw.calibration import (
     Budget,
@@ -42,9 +47,8 @@ from deal_hw.calibration import (
     CalibrationResult,
     Progress,
     ProgressCallback,
-    StateStore,
 )
-from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
@@ -77,10 +81,8 @@ VARIANTS: Mapping[str, Recipe] = {
     "long, no latency": Recipe(seconds=LONG_S, latency=False),
 }
 
-Member = tuple[FloatArray, float]
 
-
-class OpenLoop(CalibrationMethod[Problem]):
+class OpenLoop(Calibration):
     """Searches, fits open-loop predictions, and takes what inner folds say predicts best.
 
     Args:
@@ -90,8 +92,6 @@ class OpenLoop(CalibrationMethod[Problem]):
         name: Name of the whole.
     """
 
-    name = "open-loop"
-
     def __init__(
         self,
         search: CalibrationMethod[Problem] | None = None,
@@ -100,51 +100,32 @@ class OpenLoop(CalibrationMethod[Problem]):
         local_first: bool = True,
         name: str = "open-loop",
     ) -> None:
-        self.search: CalibrationMethod[Problem] = search or Weki()
-        self.folds, self.local_first, self.name = folds, local_first, name
+        super().__init__(search or Weki(), name, Validation(local_first=local_first, folds=folds))
 
-    def run(
+    def fitted(
         self,
         problem: Problem,
         budget: Budget,
         rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-        checkpoint: StateStore | None = None,
-    ) -> CalibrationResult:
-        """Calibrate. See :meth:`CalibrationMethod.run`.
-
-        A resumed run takes the search of all data from the checkpoint; the rest is done again, to the same
-        numbers.
-        """
-        began, before = time.perf_counter(), problem.steps
-        check_excitation(problem)
-        local = local_fit(problem, progress) if self.local_first else None
-        if local is not None:
-            offer("local fit", local.theta, local.latency_s, local.chi2, progress)
-        if local is not None and conclusive(problem, local):
-            explained = PolishedMethod(self.search, self.name).concluded(
-                problem, without_search(problem, budget, local), local, progress=progress
-            )
-            return dataclasses.replace(
-                explained, steps=problem.steps - before, seconds=time.perf_counter() - began
-            )
-        pieces, local_steps = problem, problem.steps - before
-        if self.folds:
+        attempts: Attempts,
+        local: Polished | None,
+        progress: ProgressCallback | None,
+    ) -> Outcome:
+        """Search, fit all candidates, take the one that predicts best. See :meth:`Calibration.fitted`."""
+        pieces, folds = problem, self.settings.folds
+        if folds:
             problem = _whole(problem)
-        work = _Work(problem, self.search, budget, progress, HORIZONS_S if self.folds else (LONG_S,))
+        work = _Work(problem, self.search, budget, progress, HORIZONS_S if folds else (LONG_S,))
         work.say("residual", "fits short windows from the model's own values")
         first = fit_horizon(problem, problem.space.nominal, work.given_latency_s, SHORT)
-        reduced = work.reduced(problem, first)
-        attempts = Attempts(self.search, reduced, rng, checkpoint)
-        searched = attempts.run(0, budget, progress)
+        searched = attempts.run(work.reduced(problem, first), 0, budget, progress)
         offer("search", searched.estimate, searched.latency_s, searched.chi2, progress)
         # Drawn after the search, so that a resumed run draws the same.
         seed = int(rng.integers(2**32))
-        choice = work.choose(seed) if self.folds else Choice("long", {}, LONG_S, note="without folds")
+        choice = work.choose(seed) if folds else Choice("long", {}, LONG_S, note="without folds")
         work.say("fit", f"{choice.chosen} on all recordings")
-        theta, latency_s = work.members(problem, (first.theta, first.latency_s), searched, choice.chosen)[
-            choice.chosen
-        ]
+        members = work.members(problem, (first.theta, first.latency_s), searched, choice.chosen)
+        theta, latency_s = members[choice.chosen]
         recipe = _recipe(choice.chosen)
         told = dataclasses.replace(recipe, latency=True)
         fit = fit_horizon(problem, theta, latency_s, told, iterations=0, central=True)
@@ -160,12 +141,7 @@ class OpenLoop(CalibrationMethod[Problem]):
         left = at_parameters(problem, theta, latency_s, samples_in(problem, MISMATCH_S)).normal
         chi2 = left.cost / max(left.count, 1)
         found = confounded(problem, fit.hessian / known.inflation)
-        words = tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found))))
-        provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
-            "search": searched.method,
-            "search_seconds": searched.seconds,
-            "search_estimate": dict(zip(problem.space.names, map(float, searched.estimate), strict=True)),
-            "search_latency_s": searched.latency_s,
+        facts |= {
             "folds": choice.to_json(),
             "residual_std": dict(zip(problem.channel_names, map(float, first.scale), strict=True)),
             "prediction_rmse": dict(zip(problem.channel_names, map(float, fit.scale), strict=True)),
@@ -175,23 +151,16 @@ class OpenLoop(CalibrationMethod[Problem]):
             "at_bound": [n for n, b in zip(problem.space.names, known.shape.bound, strict=True) if b != 0],
             "halves": halves.to_json(),
             "confounded": [pair.to_json() for pair in found],
-            **facts,
         }
-        return dataclasses.replace(
-            searched,
-            method=self.name,
-            estimate=theta,
-            interval=known.interval,
-            covariance=known.covariance,
-            verdicts=known.verdicts,
-            null_directions=words,
+        return Outcome(
+            searched=searched,
+            theta=theta,
             latency_s=latency_s,
-            latency_interval_s=known.latency_interval_s,
             chi2=chi2,
-            alarms=(*known.alarms, *_unexplained(chi2)),
-            steps=work.steps + (local_steps if pieces is problem else pieces.steps - before),
-            seconds=time.perf_counter() - began + attempts.earlier_seconds,
-            provenance=provenance,
+            known=dataclasses.replace(known, alarms=(*known.alarms, *_unexplained(chi2))),
+            null_directions=tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))),
+            facts=facts,
+            other_steps=work.other_steps + (0 if problem is pieces else problem.steps),
         )
 
 
@@ -244,7 +213,12 @@ class _Work:
     @property
     def steps(self) -> int:
         """Physics steps so far, those of the reduced problems too."""
-        return self._problem.steps - self._before + sum(p.steps for p in self._searched)
+        return self._problem.steps - self._before + self.other_steps
+
+    @property
+    def other_steps(self) -> int:
+        """Physics steps of the reduced problems."""
+        return sum(p.steps for p in self._searched)
 
     def say(self, stage: str, message: str) -> None:
         """Report what is being done."""
@@ -266,28 +240,24 @@ class _Work:
     def choose(self, seed: int) -> Choice:
         """Fit every candidate to the data without each fold and compare what they predict of it."""
         problem, before = self._problem, self.steps
-        errors: dict[str, list[float]] = {}
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = (
             time_masks(problem, MOST_FOLDS) if motions == 1 else fold_masks(problem, min(motions, MOST_FOLDS))
         )
-        for fold, left_out in enumerate(masks):
+
+        def fits(train: Problem, fold: int) -> dict[str, Member]:
             self.say("folds", f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?")
-            train, test = problem.part([~m for m in left_out]), problem.part(left_out)
-            try:
-                first = fit_horizon(train, problem.space.nominal, self.given_latency_s, SHORT)
-                searched = self._search.run(
-                    self.reduced(train, first), self._budget, np.random.default_rng([seed, fold])
-                )
-                members = self.members(train, (first.theta, first.latency_s), searched)
-                rmse = prediction_rmse(test, list(members.values()), LONG_S)
-            except (InsufficientDataError, CalibrationError) as err:
-                return Choice("long", {}, LONG_S, note=f"a fold's data cannot be fitted: {err}")
-            for name, of_channels in zip(members, rmse, strict=True):
-                errors.setdefault(name, []).append(_error(problem, of_channels))
-        means = {name: float(np.mean(np.log(values))) for name, values in errors.items()}
-        chosen = min(means, key=lambda name: means[name])
-        return Choice(chosen, {n: tuple(v) for n, v in errors.items()}, LONG_S, self.steps - before)
+            first = fit_horizon(train, problem.space.nominal, self.given_latency_s, SHORT)
+            rng = np.random.default_rng([seed, fold])
+            searched = self._search.run(self.reduced(train, first), self._budget, rng)
+            return self.members(train, (first.theta, first.latency_s), searched)
+
+        def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
+            rmse = prediction_rmse(test, members, LONG_S)
+            return np.array([_error(problem, of_channels) for of_channels in rmse])
+
+        found = on_folds(problem, masks, fits, errors, "long", LONG_S)
+        return dataclasses.replace(found, steps=self.steps - before)
 
     def members(
         self, problem: Problem, short: Member, searched: CalibrationResult, only: str | None = None

@@ -21,7 +21,6 @@ class Attempts:
 
     Args:
         search: The search.
-        problem: Data and simulator.
         rng: The only source of randomness.
         store: Where the whole run is kept; None to keep nothing.
     """
@@ -29,11 +28,10 @@ class Attempts:
     def __init__(
         self,
         search: CalibrationMethod[Problem],
-        problem: Problem,
         rng: np.random.Generator,
         store: StateStore | None,
     ) -> None:
-        self._search, self._problem, self._rng, self._store = search, problem, rng, store
+        self._search, self._rng, self._store = search, rng, store
         self.finished: list[CalibrationResult] = []
         self.earlier_steps = 0
         """Physics steps that the searches simulated before this process resumed them."""
@@ -44,29 +42,32 @@ class Attempts:
         saved = store.load() if store is not None else None
         if saved is not None:
             self._kept = list(saved["finished"])
-            self.finished = [restored_result(state, problem) for state in self._kept]
+            self.finished = [restored_result(state) for state in self._kept]
             self._running = saved["running"]
             restore_generator(rng, saved["generator"])
             for result in self.finished:
                 self._count(result, 0, 0.0)
         self._generator = generator_state(rng)
 
-    def run(self, number: int, budget: Budget, progress: ProgressCallback | None) -> CalibrationResult:
+    def run(
+        self, problem: Problem, number: int, budget: Budget, progress: ProgressCallback | None
+    ) -> CalibrationResult:
         """Return the result of attempt ``number``, 0 for the first.
 
         Args:
+            problem: Data and simulator.
             number: Which attempt; at most one more than are finished.
             budget: What that search may use.
             progress: Called after each of its generations.
         """
         if number < len(self.finished):
-            return self.finished[number]
-        steps, began = self._problem.steps, time.perf_counter()
+            return dataclasses.replace(self.finished[number], space=problem.space)
+        steps, began = problem.steps, time.perf_counter()
         if self._store is None:
-            result = self._search.run(self._problem, budget, self._rng, progress)
+            result = self._search.run(problem, budget, self._rng, progress)
         else:
-            result = self._search.run(self._problem, budget, self._rng, progress, self)
-        self._count(result, self._problem.steps - steps, time.perf_counter() - began)
+            result = self._search.run(problem, budget, self._rng, progress, self)
+        self._count(result, problem.steps - steps, time.perf_counter() - began)
         self.finished.append(result)
         if self._store is not None:
             self._kept.append(kept_result(result))
@@ -101,11 +102,10 @@ def kept_result(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def restored_result(state: Mapping[str, Any], problem: Problem) -> CalibrationResult:
+def restored_result(state: Mapping[str, Any]) -> CalibrationResult:
     """Undo :func:`kept_result`."""
     return dataclasses.replace(
         CalibrationResult.from_json(state["result"]),
-        space=problem.space,
         population=state["population"],
         trace=tuple(state["trace"]),
     )

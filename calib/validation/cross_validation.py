@@ -8,6 +8,7 @@ better is taken.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,7 +32,10 @@ BLOCKS = 2
 MOST_STEPS = 3e9
 """More physics steps than this are not spent on folds."""
 
-Fit = Callable[[Problem, CalibrationResult], tuple[FloatArray, float]]
+Member = tuple[FloatArray, float]
+"""Physical parameters, (K,), and latency [s]."""
+
+Fit = Callable[[Problem, CalibrationResult], Member]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,21 +97,48 @@ def choose(
     candidates: dict[str, Fit] = {"search": _searched, "polish": _polished}
     if robust:
         candidates["robust polish"] = _robust
-    errors: dict[str, list[float]] = {name: [] for name in candidates}
-    for fold, left_out in enumerate(fold_masks(problem)):
-        train = problem.part([~mask for mask in left_out])
+
+    def fits(train: Problem, fold: int) -> dict[str, Member]:
+        searched = search.run(train, budget, np.random.default_rng([seed, fold]))
+        return {name: fit(train, searched) for name, fit in candidates.items()}
+
+    def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
+        return prediction_error(test, members, length)
+
+    found = on_folds(problem, fold_masks(problem), fits, errors, "polish", window_s)
+    return dataclasses.replace(found, steps=problem.steps - before)
+
+
+def on_folds(
+    problem: Problem,
+    masks: Sequence[Sequence[npt.NDArray[np.bool_]]],
+    fits: Callable[[Problem, int], Mapping[str, Member]],
+    errors: Callable[[Problem, Sequence[Member]], FloatArray],
+    usual: str,
+    window_s: float,
+) -> Choice:
+    """Fit every candidate to the data without each fold and compare what they predict of it.
+
+    Args:
+        problem: All data that are fitted.
+        masks: For each fold which samples of each recording it leaves out, (T,) each.
+        fits: Makes all candidates from a fold's data and its number.
+        errors: Returns what each candidate's prediction of a part is off, (N,).
+        usual: Name of the candidate that is taken where nothing is better or no fold can be fitted.
+        window_s: Predictions restart this often [s].
+    """
+    found: dict[str, list[float]] = {}
+    for fold, left_out in enumerate(masks):
         try:
-            searched = search.run(train, budget, np.random.default_rng([seed, fold]))
-            fits = [fit(train, searched) for fit in candidates.values()]
-            error = prediction_error(problem.part(left_out), fits, length)
+            members = fits(problem.part([~mask for mask in left_out]), fold)
+            each = errors(problem.part(left_out), list(members.values()))
         except (InsufficientDataError, CalibrationError) as err:
-            return Choice("polish", {}, window_s, note=f"a fold's data cannot be fitted: {err}")
-        for name, value in zip(candidates, error, strict=True):
-            errors[name].append(float(value))
-    means = {name: float(np.mean(np.log(values))) for name, values in errors.items()}
-    # The polish stays where nothing is better than it.
-    chosen = min(means, key=lambda name: (means[name], name != "polish"))
-    return Choice(chosen, {n: tuple(v) for n, v in errors.items()}, window_s, problem.steps - before)
+            return Choice(usual, {}, window_s, note=f"a fold's data cannot be fitted: {err}")
+        for name, value in zip(members, each, strict=True):
+            found.setdefault(name, []).append(float(value))
+    means = {name: float(np.mean(np.log(values))) for name, values in found.items()}
+    chosen = min(means, key=lambda name: (means[name], name != usual))
+    return Choice(chosen, {n: tuple(v) for n, v in found.items()}, window_s)
 
 
 def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:

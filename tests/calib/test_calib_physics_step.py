@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.pipeline import local_fit
+from deal_hw.calib.fit.local import local_fit
 from deal_hw.calib.uncertainty.at_fit import statement, with_rows
 from deal_hw.calib.uncertainty.intervals import Uncertainty
 from deal_hw.calib.uncertainty.physics_step import StepCheck, check_step, counted, halved, step_alarm

@@ -10,9 +10,10 @@ from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.pipeline import LatencyScan, PolishedMethod
+from deal_hw.calib.pipeline import PolishedMethod
 from deal_hw.calib.uncertainty.at_fit import NEAR
 from deal_hw.calib.uncertainty.intervals import correlation_time, intervals, uncertainty
+from deal_hw.calib.uncertainty.latency_scan import LatencyScan
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import error_percent, interval_score, log_error_x100
@@ -94,7 +95,7 @@ def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) ->
     inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
     assert inside.sum() >= 7
     assert result.alarms == ()
-    assert set(stages) == {"polish", "latency"}
+    assert set(stages) == {"search", "polish", "refinement", "latency"}
     assert result.provenance["latency_scan"]["ticks"]
 
 

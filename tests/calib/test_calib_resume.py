@@ -98,8 +98,7 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
 
     # Nothing is ever explained and no two searches agree: all three attempts are made.
     monkeypatch.setattr(pipeline, "MISMATCH_CHI2", 0.0)
-    monkeypatch.setattr(pipeline, "SAME_CHI2", 0.0)
-    monkeypatch.setattr(pipeline, "FEWEST_GENERATIONS", 1)
+    monkeypatch.setattr(pipeline, "RESTARTS", pipeline.RestartSettings(same=0.0, fewest_generations=1))
     search = Weki(WekiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
     method = PolishedMethod(search, settings=Validation(local_first=False))
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
@@ -110,8 +109,8 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
 
     whole = method.run(make_problem(), budget, np.random.default_rng(4), note)
     assert whole.provenance["restarts"] == 2
-    # Callbacks up to the first polish's first iteration; and, as the polish is repeated, up to the second
-    # generation of the second search.
+    # Callbacks up to the first polish's first iteration; and, as the first search's result is offered again
+    # and the polish is repeated, up to the second generation of the second search.
     in_polish = stages.index("polish") + 1
     polishes = stages[in_polish:].index("search") + 1
     with pytest.raises(StoppedError):
@@ -119,7 +118,7 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
     saved = Checkpoint(path, "a").load()
     assert saved is not None and len(saved["finished"]) == 1 and saved["running"] is None
     with pytest.raises(StoppedError):
-        run(method, make_problem(), budget, Checkpoint(path, "a"), polishes + 2)
+        run(method, make_problem(), budget, Checkpoint(path, "a"), polishes + 3)
     saved = Checkpoint(path, "a").load()
     assert saved is not None and len(saved["finished"]) == 1 and saved["running"] is not None
     resumed = run(method, make_problem(), budget, Checkpoint(path, "a"), 0)
