@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,33 +53,47 @@ from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
 
-LONG_S = 2.0
-SEARCH_S = 12.0
-"""The search is to find the neighbourhood: so much of the recordings, evenly spread, says where it is [s]."""
 
-STRETCH_S = 2.5
-MOST_FOLDS = 3
-"""Motions are left out in so many turns, a single motion third by third."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenLoopSettings:
+    """Settings of `open-loop`.
 
-SEARCHED_WINDOW_S = 0.4
-"""Starts are compared in windows of this length: even a far one does not diverge in them."""
+    Attributes:
+        horizons_s: Windows of the fits, one from where the one before ended [s]. What the model lacks pulls
+            each horizon's fit elsewhere; their mean may be nearer than any of them.
+        search_s: The search is to find the neighbourhood: so much of the recordings, evenly spread, says
+            where it is [s].
+        stretch_s: Recordings are divided into stretches of this length for it [s].
+        folds: Motions are left out in so many turns, a single motion third by third.
+        compared_s: Starts are compared in windows of this length: even a far one does not diverge [s].
+        half_iterations: Most steps of the fit of each half.
+        mismatch_s: Windows in which the model is held against the sensors' noise: start states are fitted, so
+            even a residual that needs longer to build up shows as far as it matters to a controller [s].
+    """
 
-HALF_ITERATIONS = 5
+    horizons_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
+    search_s: float = 12.0
+    stretch_s: float = 2.5
+    folds: int = 3
+    compared_s: float = 0.4
+    half_iterations: int = 5
+    mismatch_s: float = 0.4
 
-MISMATCH_S = 0.4
-"""Windows in which the model is held against the sensors' noise [s]: start states are fitted, so even a
-residual that needs longer to build up shows as far as it matters to a controller."""
+    @property
+    def long_s(self) -> float:
+        """The longest horizon [s]."""
+        return self.horizons_s[-1]
 
-HORIZONS_S = (0.4, 0.8, 1.2, LONG_S)
-"""What the model lacks pulls each horizon's fit elsewhere; their mean may be nearer than any of them."""
+
+SETTINGS = OpenLoopSettings()
 
 PRIORS: Mapping[str, float] = {"": Recipe().prior_std, ", wide prior": 1.0}
 """How far the model's own values hold, as a share of the range: as far as the range itself, or hardly."""
 
-LONG = Recipe(seconds=LONG_S)
+LONG = Recipe(seconds=SETTINGS.long_s)
 VARIANTS: Mapping[str, Recipe] = {
-    "long, robust": Recipe(seconds=LONG_S, robust=True),
-    "long, no latency": Recipe(seconds=LONG_S, latency=False),
+    "long, robust": Recipe(seconds=SETTINGS.long_s, robust=True),
+    "long, no latency": Recipe(seconds=SETTINGS.long_s, latency=False),
 }
 
 
@@ -115,14 +130,16 @@ class OpenLoop(Calibration):
         pieces, folds = problem, self.settings.folds
         if folds:
             problem = _whole(problem)
-        work = _Work(problem, self.search, budget, progress, HORIZONS_S if folds else (LONG_S,))
+        work = _Work(
+            problem, self.search, budget, progress, SETTINGS.horizons_s if folds else (SETTINGS.long_s,)
+        )
         work.say("residual", "fits short windows from the model's own values")
         first = fit_horizon(problem, problem.space.nominal, work.given_latency_s, SHORT)
         searched = attempts.run(work.reduced(problem, first), 0, budget, progress)
         offer("search", searched.estimate, searched.latency_s, searched.chi2, progress)
         # Drawn after the search, so that a resumed run draws the same.
         seed = int(rng.integers(2**32))
-        choice = work.choose(seed) if folds else Choice("long", {}, LONG_S, note="without folds")
+        choice = work.choose(seed) if folds else Choice("long", {}, SETTINGS.long_s, note="without folds")
         work.say("fit", f"{choice.chosen} on all recordings")
         members = work.members(problem, (first.theta, first.latency_s), searched, choice.chosen)
         theta, latency_s = members[choice.chosen]
@@ -138,7 +155,7 @@ class OpenLoop(Calibration):
             local = with_rows(local)
             known, facts["physics_step"] = with_step(pieces, local, known, theta)
             known, facts["diagnosis"] = with_causes(pieces, local, known)
-        left = at_parameters(problem, theta, latency_s, samples_in(problem, MISMATCH_S)).normal
+        left = at_parameters(problem, theta, latency_s, samples_in(problem, SETTINGS.mismatch_s)).normal
         chi2 = left.cost / max(left.count, 1)
         found = confounded(problem, fit.hessian / known.inflation)
         facts |= {
@@ -227,13 +244,13 @@ class _Work:
 
     def reduced(self, problem: Problem, first: HorizonFit) -> Problem:
         """Return the search's problem: part of the recordings, and residuals as large as a first fit's."""
-        parts = [p for e in problem.episodes for p in stretches(e, STRETCH_S)]
+        parts = [p for e in problem.episodes for p in stretches(e, SETTINGS.stretch_s)]
         usable = [p for p in parts if p.usable.any()]
         std = problem.known_std
         if std is None:
             std = problem.noise_std.copy()
             std[problem.channels] = np.maximum(std[problem.channels], first.scale)
-        found = dataclasses.replace(problem, episodes=spread(usable, SEARCH_S), known_std=std)
+        found = dataclasses.replace(problem, episodes=spread(usable, SETTINGS.search_s), known_std=std)
         self._searched.append(found)
         return found
 
@@ -242,7 +259,9 @@ class _Work:
         problem, before = self._problem, self.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = (
-            time_masks(problem, MOST_FOLDS) if motions == 1 else fold_masks(problem, min(motions, MOST_FOLDS))
+            time_masks(problem, SETTINGS.folds)
+            if motions == 1
+            else fold_masks(problem, min(motions, SETTINGS.folds))
         )
 
         def fits(train: Problem, fold: int) -> dict[str, Member]:
@@ -253,10 +272,10 @@ class _Work:
             return self.members(train, (first.theta, first.latency_s), searched)
 
         def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
-            rmse = prediction_rmse(test, members, LONG_S)
+            rmse = prediction_rmse(test, members, SETTINGS.long_s)
             return np.array([_error(problem, of_channels) for of_channels in rmse])
 
-        found = on_folds(problem, masks, fits, errors, "long", LONG_S)
+        found = on_folds(problem, masks, fits, errors, "long", SETTINGS.long_s)
         return dataclasses.replace(found, steps=self.steps - before)
 
     def members(
@@ -271,7 +290,7 @@ class _Work:
             only: Name of the one candidate that is wanted; None for all.
         """
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
-        rmse = prediction_rmse(problem, [found["search"], short], SEARCHED_WINDOW_S)
+        rmse = prediction_rmse(problem, [found["search"], short], SETTINGS.compared_s)
         start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
         for words, prior_std in PRIORS.items():
             if only is not None and words != _prior_words(only):
@@ -341,8 +360,8 @@ def _unexplained(chi2: float) -> tuple[str, ...]:
     if chi2 <= MISMATCH_CHI2:
         return ()
     return (
-        f"the model does not explain the recordings to their noise: over {MISMATCH_S:g} s, from fitted start "
-        f"states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's noise; the intervals count "
+        f"the model does not explain the recordings to their noise: over {SETTINGS.mismatch_s:g} s, from "
+        f"fitted start states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's noise; the intervals count "
         "all of it as noise",
     )
 
@@ -354,7 +373,12 @@ def _halves(problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertaint
     for mask in fold_masks(problem, 2):
         try:
             half = fit_horizon(
-                problem.part(mask), fit.theta, fit.latency_s, recipe, iterations=HALF_ITERATIONS, central=True
+                problem.part(mask),
+                fit.theta,
+                fit.latency_s,
+                recipe,
+                iterations=SETTINGS.half_iterations,
+                central=True,
             )
         except InsufficientDataError as err:
             return Halves((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")

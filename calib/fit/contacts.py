@@ -11,38 +11,47 @@ takes that way of following which suits it best.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 
-STEP_LIMIT = 0.7
-"""Largest step of a parameter in its own scale (about a factor two)."""
 
-LATENCY_STEP_LIMIT_S = 0.005
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactSettings:
+    """Settings of the steps where feet touch the floor.
 
-START_DAMPINGS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
-"""Levenberg's damping of start states, in units of the smoothed states' standard deviations."""
+    Attributes:
+        step_limit: Largest step of a parameter in its own scale (about a factor two).
+        latency_step_limit_s: Largest step of the latency [s].
+        start_dampings: Levenberg's damping of start states, in units of the smoothed states' standard
+            deviations.
+        step_dampings: Damping of the parameters' steps.
+        follow: How far start states follow a parameter step: kinks make the derivative too long as often as
+            right.
+        stretches: Secants, in turns: forward, backward, far and near ones miss different kinks.
+        gain: A cost that falls by less is noise of the kinks.
+        patience: So many iterations without gain end the solver.
+        worse: A step may cost this share more than the best point: its start states have not followed to the
+            end.
+        start_iterations: Most steps of start states alone.
+    """
 
-STEP_DAMPINGS = (1e-3, 1e-1, 1.0, 10.0)
+    step_limit: float = 0.7
+    latency_step_limit_s: float = 0.005
+    start_dampings: tuple[float, ...] = (1e-2, 1e-1, 1.0, 10.0, 100.0)
+    step_dampings: tuple[float, ...] = (1e-3, 1e-1, 1.0, 10.0)
+    follow: tuple[float, ...] = (0.0, 0.5, 1.0)
+    stretches: tuple[float, ...] = (1.0, -1.0, 2.5, -0.4)
+    gain: float = 1.0
+    patience: int = 3
+    worse: float = 0.01
+    start_iterations: int = 4
 
-FOLLOW = (0.0, 0.5, 1.0)
-"""How far start states follow a parameter step: kinks make the derivative too long as often as right."""
 
-STRETCHES = (1.0, -1.0, 2.5, -0.4)
-"""Secants, in turns: forward, backward, far and near ones miss different kinks."""
-
-GAIN = 1.0
-"""A cost that falls by less is noise of the kinks."""
-
-PATIENCE = 3
-"""So many iterations without gain end the solver."""
-
-WORSE = 0.01
-"""A step may cost this share more than the best point: its start states have not followed to the end."""
-
-START_ITERATIONS = 4
+CONTACTS = ContactSettings()
 
 
 def solve_contacts(
@@ -56,24 +65,26 @@ def solve_contacts(
         iterations: Most steps of the parameters.
         fixed_latency: Keep the latency.
     """
-    best, best_cost = settle(shooting, point, START_ITERATIONS)
+    best, best_cost = settle(shooting, point, CONTACTS.start_iterations)
     here, waited, used = best, 0, 0
     for _ in range(iterations):
         used += 1
-        normal = shooting.normal(here, keep=True, stretch=STRETCHES[waited % len(STRETCHES)])
+        normal = shooting.normal(
+            here, keep=True, stretch=CONTACTS.stretches[waited % len(CONTACTS.stretches)]
+        )
         here, gains, cost = _settled(shooting, here, normal)
         fell = best_cost - cost
         if fell > 0:
             best, best_cost = here, cost
-        waited = 0 if fell > GAIN else waited + 1
-        if waited > PATIENCE:
+        waited = 0 if fell > CONTACTS.gain else waited + 1
+        if waited > CONTACTS.patience:
             break
         here, cost = _stepped(shooting, here, normal, gains, fixed_latency)
         if cost < best_cost:
             best, best_cost = here, cost
-        elif cost > best_cost * (1 + WORSE):
+        elif cost > best_cost * (1 + CONTACTS.worse):
             here = best
-    best, _ = settle(shooting, best, START_ITERATIONS // 2)
+    best, _ = settle(shooting, best, CONTACTS.start_iterations // 2)
     return best, shooting.normal(best), used
 
 
@@ -90,9 +101,9 @@ def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, fl
     """
     cost = float(shooting.costs([point])[0])
     for number in range(iterations):
-        stretch = STRETCHES[number % 2]
+        stretch = CONTACTS.stretches[number % 2]
         point, _, after = _settled(shooting, point, shooting.normal(point, keep=True, stretch=stretch))
-        if cost - after < GAIN:
+        if cost - after < CONTACTS.gain:
             break
         cost = after
     return point, float(shooting.costs([point])[0])
@@ -110,7 +121,7 @@ def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, l
         square = np.einsum("wri,wrj->wij", js, js)
         own = np.einsum("wri,wr->wi", js, rows.residual)[..., None]
         unit = np.eye(len(scale))
-        steps = [np.linalg.solve(square + d * unit, own)[..., 0] * scale for d in START_DAMPINGS]
+        steps = [np.linalg.solve(square + d * unit, own)[..., 0] * scale for d in CONTACTS.start_dampings]
         moves.append(-np.stack([np.zeros_like(steps[0]), *steps]))
         cross = np.einsum("wri,wrj->wij", js, rows.parameter)
         gains.append(np.linalg.solve(square, cross) * scale[:, None])
@@ -131,9 +142,11 @@ def _stepped(
     steps = [
         damped_step(point.value, gradient, normal.hessian, damping, *bounds, fixed_latency)
         for gradient in (normal.gradient, plain)
-        for damping in STEP_DAMPINGS
+        for damping in CONTACTS.step_dampings
     ]
-    moves = [[np.stack([-share * (gain @ step) for share in FOLLOW]) for gain in gains] for step in steps]
+    moves = [
+        [np.stack([-share * (gain @ step) for share in CONTACTS.follow]) for gain in gains] for step in steps
+    ]
     found, costs = _best_windows(shooting, point, steps, moves)
     best = int(np.argmin(costs))
     return found[best], float(costs[best])
@@ -204,7 +217,7 @@ def damped_step(
     if not free.any():
         return step
     scale = np.append(np.ones(len(step) - 1), 100.0)  # 10 ms of latency count like a factor e.
-    limit = np.append(np.full(len(step) - 1, STEP_LIMIT), LATENCY_STEP_LIMIT_S)
+    limit = np.append(np.full(len(step) - 1, CONTACTS.step_limit), CONTACTS.latency_step_limit_s)
     H = hessian[np.ix_(free, free)]
     # Levenberg's damping in units of the parameters' scale beside Marquardt's relative one: a parameter
     # that the data cannot see (a limit never reached) must not run away.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.contacts import START_ITERATIONS, settle, solve_contacts
+from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.robust import cauchy_windows, huber_weights
 from deal_hw.calib.fit.solver import SolverSettings, settled, solve
@@ -230,10 +230,10 @@ def at_parameters(
     shooting = Shooting(problem, length)
     point = shooting.start(theta, latency_s, states)
     if shooting.contacts:
-        point = settle(shooting, point, START_ITERATIONS)[0]
+        point = settle(shooting, point, CONTACTS.start_iterations)[0]
         normal = shooting.normal(point)
     else:
-        point, normal = settled(shooting, point, shooting.normal(point), START_ITERATIONS)
+        point, normal = settled(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
     free = len(problem.space) + (problem.fixed_latency_s is None)
     chi2 = normal.cost / max(normal.count - free, 1)
     return Polished(theta, latency_s, chi2, normal, point, shooting, 0)
