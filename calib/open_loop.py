@@ -361,8 +361,8 @@ def _unexplained(chi2: float) -> tuple[str, ...]:
         return ()
     return (
         f"the model does not explain the recordings to their noise: over {SETTINGS.mismatch_s:g} s, from "
-        f"fitted start states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's noise; the intervals count "
-        "all of it as noise",
+        f"fitted start states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's noise; the "
+        "intervals count all of it as noise",
     )
 
 

@@ -28,6 +28,7 @@ from deal_hw.calib.uncertainty.latency_scan import averaged, scan_latency
 from deal_hw.calib.validation.checks import Validation, judge, unexplained
 from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calibration import (
+    BEFORE_SEARCH,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -125,6 +126,8 @@ class Calibration(CalibrationMethod[Problem]):
                 problem, without_search(problem, budget, local), local, self.settings, progress
             )
         else:
+            if local is not None:
+                foretell(problem, local, progress)
             attempts = Attempts(self.search, rng, checkpoint)
             found = self.fitted(problem, budget, rng, attempts, local, progress)
             earlier_steps, earlier_seconds = attempts.earlier_steps, attempts.earlier_seconds
@@ -295,6 +298,27 @@ def offer(
     """
     if progress is not None:
         progress(Progress(stage, 1, 1, estimate=theta, latency_s=latency_s, values={"chi2": chi2}))
+
+
+def foretell(problem: Problem, local: Polished, progress: ProgressCallback | None) -> None:
+    """Say before the search what the recordings cannot tell, by their Fisher information at the local fit.
+
+    Args:
+        problem: Recordings and simulator.
+        local: The local fit.
+        progress: Who is told.
+    """
+    if progress is None:
+        return
+    # What the model does not explain says nothing of what the motion shows: noise alone counts.
+    noise_only = dataclasses.replace(with_rows(local), chi2=1.0)
+    known = statement(problem, noise_only, fixed_latency=problem.fixed_latency_s is not None)
+    blind = [n for n, v in zip(problem.space.names, known.verdicts, strict=True) if v == "not identifiable"]
+    words = list(known.null_directions)
+    if blind and not words:
+        words = [f"nothing is seen of {', '.join(blind)}"]
+    if words:
+        progress(Progress(BEFORE_SEARCH, 1, 1, "; ".join(words)))
 
 
 def conclusive(problem: Problem, polished: Polished) -> bool:

@@ -25,6 +25,10 @@ Verdict = Literal["identifiable", "weak", "not identifiable"]
 ProblemT = TypeVar("ProblemT", contravariant=True)
 
 
+BEFORE_SEARCH = "before the search"
+"""Stage of a calibration in which is said what no search will find."""
+
+
 @dataclass(frozen=True, slots=True)
 class Progress:
     """Where a long run stands; given to the callback after each generation or iteration.

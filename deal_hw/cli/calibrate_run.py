@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.calibrate_live import SO_FAR, BestSoFar, keeping_best, open_checkpoint, saying_how_to_resume
 from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
@@ -182,6 +182,8 @@ def calibrate_episodes(
         def progress(p: Progress) -> None:
             report(p)
             best(p)
+            if p.stage == BEFORE_SEARCH and not quiet:
+                print(f"{BEFORE_SEARCH}: the data cannot tell: {p.message}", file=sys.stderr)
             if watch is not None:
                 watch(p)
 

@@ -9,9 +9,11 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.pipeline import foretell
 from deal_hw.calib.uncertainty.at_fit import statement, with_rows
 from deal_hw.calib.validation.checks import Validation, judge
 from deal_hw.calib.validation.split_half import Halves, compare_halves, half_of, halves_rows, heed
+from deal_hw.calibration import BEFORE_SEARCH, Progress
 from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.drivers.cartpole.description import parameter_space
 
@@ -100,6 +102,11 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     found = with_rows(polish(problem, theta, case.latency_s, (0.2, 0.4), iterations=4, fixed_latency=True))
     known, _ = judge(problem, found, statement(problem, found, fixed_latency=True), Validation())
     assert len(known.null_directions) == 2
+    # The same is said before a search begins.
+    said: list[Progress] = []
+    foretell(problem, found, said.append)
+    assert [p.stage for p in said] == [BEFORE_SEARCH]
+    assert said[0].message.count("without a trace") == 2
     named = [n for n in space.names if any(n in words for words in known.null_directions)]
     without = [n for n, v in zip(space.names, known.verdicts, strict=True) if v == "not identifiable"]
     assert {"cart.mass", "pole.mass", "pole.length", "servo.stiffness"} <= set(without)
