@@ -25,6 +25,7 @@ from deal_hw.cli.calibrate_run import (
 )
 from deal_hw.cli.excite import balancer
 from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.data.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -99,6 +100,10 @@ class Calibrate(Checked):
 
     latency: Annotated[float | None, Range(*LATENCY_RANGE_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
+
+    spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
+    """Leave out up to three samples in a row that jump away and come back, so many times farther than the
+    joint's fastest motion would take it (docs/calibration.md). A larger number leaves out less."""
 
     residual_std: tuple[str, ...] = ()
     """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE
@@ -270,6 +275,7 @@ def _prepare_model(config: Calibrate) -> Work:
         holdout,
         _narrowing(config, xi),
         std=lambda robot: residual_std(config.residual_std, robot),
+        spikes=SpikeSettings(ratio=config.spike_ratio),
         threads=config.threads,
         quiet=config.quiet,
     )
@@ -283,6 +289,7 @@ def prepare_dataset(config: Calibrate) -> Work:
     """
     from deal_hw.data.checks import Severity, check
     from deal_hw.data.dataset import Dataset
+    from deal_hw.data.spikes import without_spikes
     from deal_hw.errors import InsufficientDataError
 
     if config.dataset is None:
@@ -297,13 +304,19 @@ def prepare_dataset(config: Calibrate) -> Work:
     fit, holdout = choose_episodes(dataset, config.episodes, held)
     space = make_space(dataset.description["name"], config)
     recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
-    for index, trajectory in recordings.items():
-        failed = [v.message for v in check(trajectory) if v.severity is Severity.FAIL]
+    spikes = SpikeSettings(ratio=config.spike_ratio)
+    verdicts = {index: check(trajectory, spikes) for index, trajectory in recordings.items()}
+    for index, found in verdicts.items():
+        failed = [v.message for v in found if v.severity is Severity.FAIL]
         if failed:
             raise InsufficientDataError(
                 f"episode {index} of {config.dataset} cannot be used: {'; '.join(failed)}; "
                 "record again with `deal-hw collect`"
             )
+        jumps = [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN]
+        if jumps and not config.quiet:
+            print(f"episode {index}: {jumps[0]}", file=sys.stderr)
+    recordings = {index: without_spikes(trajectory, spikes) for index, trajectory in recordings.items()}
     robot, episodes = _simulation(dataset, recordings, config.sample_hz)
     return Work(
         robot=robot,
@@ -311,9 +324,7 @@ def prepare_dataset(config: Calibrate) -> Work:
         episodes=[episodes[i] for i in fit],
         holdout=[episodes[i] for i in holdout],
         shown=recordings[fit[0]],
-        telemetry=[
-            f"episode {i}: {v.severity}: {v.message}" for i, t in recordings.items() for v in check(t)
-        ],
+        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
         provenance={
             "dataset": str(config.dataset),
             "description_digest": dataset.digest,

@@ -137,6 +137,33 @@ def test_stretches_are_left_out(folder: Path, tmp_path: Path) -> None:
     assert provenance["left_out"] == [["rec", 2.0, 4.0]]
 
 
+def test_spikes_do_not_move_the_estimate(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Four samples 2 to 4 rad off are named and left out; estimates move by less than their own error."""
+    spiked = record(6.0, 1)
+    spiked["shoulder_pos"][70] += 3.0
+    spiked["shoulder_pos"][[150, 151]] -= 2.5
+    spiked["elbow_pos"][200] += 4.0
+    write(folder / "spiked.csv", spiked)
+    found = {}
+    for name in ("rec", "spiked"):
+        words = command(
+            folder, "--method", "near", "--no-report", "--out", str(tmp_path / name), data=f"{name}.csv"
+        )
+        assert main([*words, "--holdout", str(folder / "other.csv")]) == EXIT_OK
+        found[name] = json.loads((tmp_path / name / "calibration" / "result.json").read_text())
+    told = capsys.readouterr().err
+    assert told.count("spikes") == 1 and "spiked.csv: warn spikes: 4 samples" in told
+    assert (
+        "shoulder +3 rad at 1.400 s, shoulder -2.49 rad at 3.000 s (2 samples), elbow +4 rad at 4.0" in told
+    )
+    for parameter, clean in found["rec"]["parameters"].items():
+        assert found["spiked"]["parameters"][parameter]["estimate"] == pytest.approx(
+            clean["estimate"], abs=0.3 * (clean["high"] - clean["low"])
+        )
+
+
 def test_parameters_are_written_and_read(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

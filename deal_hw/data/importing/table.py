@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
@@ -57,6 +59,15 @@ class Table:
     def name(self) -> str:
         """What messages call it."""
         return f"{self.source['file']} {self.source['part']}".strip()
+
+    def rows(self, kept: npt.NDArray[np.bool_]) -> Table:
+        """Return the recording with these samples only, (T,); commands stay."""
+        optional: dict[str, Any] = {
+            name: values[kept]
+            for name in ("velocity", "effort", "orientation", "gyro")
+            if (values := getattr(self, name)) is not None
+        }
+        return dataclasses.replace(self, time_s=self.time_s[kept], position=self.position[kept], **optional)
 
 
 def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | None = None) -> Table:
