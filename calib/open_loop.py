@@ -236,8 +236,8 @@ class _Work:
 
     @property
     def given_latency_s(self) -> float:
-        """The latency where it is given; otherwise fits begin at none [s]."""
-        return self._problem.fixed_latency_s or 0.0
+        """The latency where it is given; otherwise fits begin at the least that is searched [s]."""
+        return self._problem.first_latency_s
 
     @property
     def steps(self) -> int:

@@ -28,7 +28,7 @@ from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, ref
 from deal_hw.data.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
@@ -98,8 +98,11 @@ class Calibrate(Checked):
     """Search each parameter within a factor XI to either side of its nominal value; 5 by default, with
     --parameters the ranges of that file."""
 
-    latency: Annotated[float | None, Range(*LATENCY_RANGE_S, "s")] = None
+    latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
+
+    latency_range: Annotated[tuple[float, float], Range(0, LONGEST_LATENCY_S, "s")] = LATENCY_RANGE_S
+    """Latencies that are searched, LOW HIGH [s]. An estimate at the end is an alarm: widen the range then."""
 
     spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
     """Leave out up to three samples in a row that jump away and come back, so many times farther than the
@@ -147,6 +150,12 @@ class Calibrate(Checked):
     quiet: bool = False
     """Print nothing but errors."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self.latency_range
+        if not low < high:
+            raise ConfigurationError(f"--latency-range {low:g} {high:g}: give the lower one first")
+
 
 def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:
     """Run the verb: calibrate, or write a file of parameters to edit.
@@ -176,6 +185,8 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             given(source, Recordings()),
             "a dataset says it; that goes with --model and --data",
         )
+    if config.latency is not None:
+        refuse(given(config, Calibrate(), ("latency_range",)), "--latency says the latency")
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
@@ -198,6 +209,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             budget=budget,
             rng=np.random.default_rng(config.seed),
             latency_s=config.latency,
+            latency_range_s=config.latency_range,
             threads=config.threads,
             quiet=config.quiet,
             checkpoint=checkpoint,
@@ -210,6 +222,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         "seed": config.seed,
         "xi": config.xi,
         "heldout_window_s": config.heldout_window,
+        "latency_range_s": None if config.latency is not None else list(config.latency_range),
     }
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)

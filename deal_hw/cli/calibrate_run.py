@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import LATENCY_RANGE_S, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.calibrate_live import open_checkpoint, saying_how_to_resume
 from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
@@ -117,6 +117,7 @@ def calibrate_episodes(
     budget: Budget,
     rng: np.random.Generator,
     latency_s: float | None = None,
+    latency_range_s: tuple[float, float] = LATENCY_RANGE_S,
     threads: int | None = None,
     quiet: bool = True,
     checkpoint: Path | None = None,
@@ -136,6 +137,7 @@ def calibrate_episodes(
         budget: How much it may use.
         rng: The only source of randomness.
         latency_s: Total latency if it is known [s].
+        latency_range_s: Otherwise what is searched [s].
         threads: Simulation threads.
         quiet: Show no progress.
         checkpoint: File that holds the state after each generation; None to keep none.
@@ -151,13 +153,22 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.methods import make_method
+        from deal_hw.calib.validation.checks import latency_alarms
         from deal_hw.calib.validation.heldout import heldout_rmse
         from deal_hw.calib.validation.normalised_error import heldout_nrmse
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
     _require_windows(holdout, heldout_window_s)
-    problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s, known_std=known_std)
+    problem = Problem(
+        robot,
+        space,
+        episodes,
+        threads=threads,
+        latency_range_s=latency_range_s,
+        fixed_latency_s=latency_s,
+        known_std=known_std,
+    )
     check_delays(problem)
     searcher = make_method(method, polish=budget.polish)
     # The matrices are small: a second BLAS thread only spins, and where processors are shared each
@@ -177,6 +188,8 @@ def calibrate_episodes(
         else:
             store = open_checkpoint(checkpoint, resume, problem, searcher, budget, rng)
             result = searcher.run(problem, budget, rng, progress, store)
+    alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
+    result = dataclasses.replace(result, alarms=alarms)
     if not holdout:
         return result
     candidates = {"nominal": (space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}

@@ -164,6 +164,20 @@ def test_spikes_do_not_move_the_estimate(
         )
 
 
+@pytest.mark.parametrize("method", ["near", "weki"])
+def test_latency_at_the_end_of_its_range(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
+) -> None:
+    """Commands act 6 ms late: with 0 to 4 ms both paths end at 4 ms and say so; 0 to 40 ms is the default."""
+    words = command(folder, "--no-report", "--no-advise", "--method", method, "--out", str(tmp_path))
+    assert main([*words, "--latency-range", "0", "0.004"]) == EXIT_OK
+    found = json.loads((tmp_path / "calibration" / "result.json").read_text())
+    assert found["latency_s"] == pytest.approx(0.004)
+    assert found["provenance"]["latency_range_s"] == [0.0, 0.004]
+    assert any("the latency ended at 4 ms" in a and "--latency-range 0 0.008" in a for a in found["alarms"])
+    assert "alarm: the latency ended at 4 ms" in capsys.readouterr().out.replace("\n", " ")
+
+
 def test_parameters_are_written_and_read(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -264,6 +278,10 @@ def test_bad_recordings_are_refused(
         (["--leave-out", "nothing.csv", "0", "1"], "no such recording; they are rec.csv"),
         (["--leave-out", "rec.csv", "0", "99"], "leaves nothing of rec.csv"),
         (["--space", "k9"], "--parameters"),
+        (["--latency", "12"], "--latency 12.0 s: allowed are 0 to 1 s"),
+        (["--latency-range", "0.1", "0.05"], "--latency-range 0.1 0.05: give the lower one first"),
+        (["--latency", "0.02", "--latency-range", "0", "0.1"], "--latency says the latency"),
+        (["--spike-ratio", "0.5"], "allowed are 1 to 1000000"),
     ],
 )
 def test_bad_settings_are_refused(
