@@ -95,8 +95,8 @@ class Calibrate(Checked):
     """Other search ranges, as NAME LOW HIGH (SI)."""
 
     xi: Annotated[float | None, Ratio] = None
-    """Search each parameter within a factor XI to either side of its nominal value; 5 by default, with
-    --parameters the ranges of that file."""
+    """Search each parameter within a factor XI to either side of its nominal value. By default 5; with
+    --model 20 for dry friction (docs/parameters.md), and with --parameters the ranges of that file."""
 
     latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
@@ -282,11 +282,10 @@ def _prepare_model(config: Calibrate) -> Work:
         "only datasets take that; with --model use --data and --parameters",
     )
     holdout = [Path(str(path)) for path in config.holdout]
-    xi = XI if config.xi is None and config.recordings.parameters is None else config.xi
     return prepare_model(
         config.recordings,
         holdout,
-        _narrowing(config, xi),
+        _narrowing(config, config.xi),
         std=lambda robot: residual_std(config.residual_std, robot),
         spikes=SpikeSettings(ratio=config.spike_ratio),
         threads=config.threads,

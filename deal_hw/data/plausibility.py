@@ -421,8 +421,8 @@ def _inside_limits(table: Table, limits: FloatArray | None) -> Verdict:
         return _verdict("limits", Severity.OK, "positions lie inside the model's limits")
     text = (
         f"positions outside the model's limits: {', '.join(found)}; check zero (offset), sign, unit and "
-        "joint order; if these are right the model's range is too narrow: widen it, or its stop pushes in every "
-        "prediction"
+        "joint order; if these are right the model's range is too narrow: widen it, or its stop pushes in "
+        "every prediction"
     )
     return _verdict("limits", Severity.FAIL if severe else Severity.WARN, text)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.sim.fields import Array, Fields, element_id
-from deal_hw.sim.parameters.kind import Kind, one_dof_joint
+from deal_hw.sim.parameters.kind import FRICTION_RATIO, Kind, one_dof_joint
 
 
 def _set(fields: Fields, field: str, index: int, values: Array) -> None:
@@ -89,6 +89,7 @@ JOINT_KINDS = (
         name="dof_frictionloss", element="joint", quantity="frictionloss", unit="N·m", unit_slide="N",
         writes=("dof_frictionloss",), along="nothing", apply=dof_frictionloss,
         baseline=lambda m, i: _dof_value(m, "dof_frictionloss", i), usable=one_dof_joint,
+        ratio=FRICTION_RATIO,
     ),
     Kind(
         name="dof_friction_creep", element="joint", quantity="friction_creep", unit="-",
