@@ -33,7 +33,7 @@ from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.uncertainty.correlated import confounded
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, uncertainty
+from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, ended_at_bound, uncertainty
 from deal_hw.calib.validation.checks import with_causes, with_step
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.split_half import FALSE_ALARMS, Halves, HalvesRow, heed
@@ -170,7 +170,9 @@ class OpenLoop(CalibrationMethod[Problem]):
             "window_s": recipe.seconds,
             "noise_std": problem.noise_std[problem.channels].tolist(),
             "inflation": known.inflation,
-            "at_bound": [n for n, b in zip(problem.space.names, known.shape.bound, strict=True) if b != 0],
+            "at_bound": [
+                problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
+            ],
             "halves": halves.to_json(),
             "confounded": [pair.to_json() for pair in found],
             **facts,

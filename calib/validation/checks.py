@@ -16,6 +16,7 @@ from deal_hw.calib.uncertainty.intervals import (
     NEGLIGIBLE_CHI2,
     Uncertainty,
     correlation_time,
+    ended_at_bound,
 )
 from deal_hw.calib.uncertainty.physics_step import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import Finding, diagnose, motions
@@ -97,9 +98,8 @@ def judge(
         settings: Which checks.
     """
     facts: dict[str, Any] = {"inflation": known.inflation}
-    facts["at_bound"] = [
-        n for n, side in zip(problem.space.names, known.shape.bound, strict=True) if side != 0
-    ]
+    ended = np.flatnonzero(ended_at_bound(problem.space, polished.theta))
+    facts["at_bound"] = [problem.space.names[k] for k in ended]
     if known.clustered is not None:
         cluster = known.clustered
         facts["clustered"] = {
