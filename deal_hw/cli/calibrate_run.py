@@ -342,7 +342,13 @@ def _judged(
     from deal_hw.calib.report.gather import gather
 
     inputs = gather(
-        work.robot, result, work.episodes, work.holdout, telemetry=work.telemetry, threads=threads
+        work.robot,
+        result,
+        work.episodes,
+        work.holdout,
+        telemetry=work.telemetry,
+        window_s=settings.get("heldout_window_s", HELDOUT_WINDOW_S),
+        threads=threads,
     )
     return result, inputs
 
