@@ -134,7 +134,7 @@ def prepare_model(
         from deal_hw.data.importing.columns import read_column_map
         from deal_hw.data.plausibility import despiked
         from deal_hw.sim.compiling import compile_mjcf
-        from deal_hw.sim.describe import describe
+        from deal_hw.sim.describe import describe, with_speed_limits
         from deal_hw.sim.joint_facts import joint_facts
         from deal_hw.sim.model import load_model
     except ModuleNotFoundError as err:
@@ -159,6 +159,7 @@ def prepare_model(
     fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
+    description = with_speed_limits(description, model, space)
     parts = without(
         config.leave_out, *([despiked(table, spikes) for table in tables] for tables in (fitted, held))
     )

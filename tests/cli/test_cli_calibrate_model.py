@@ -46,8 +46,11 @@ Rows = dict[str, FloatArray]
 Change = Callable[[Rows], Rows]
 
 
-def record(seconds: float, seed: int) -> Rows:
-    """Play sums of sines on the hidden arm in plain MuJoCo: 50 Hz, commands act 6 ms late, 0.5 mrad noise."""
+def record(seconds: float, seed: int, shoulder_rad_s: float = np.inf) -> Rows:
+    """Play sums of sines on the hidden arm in plain MuJoCo: 50 Hz, commands act 6 ms late, 0.5 mrad noise.
+
+    The shoulder's servo moves its set-point at the given speed at most.
+    """
     model = mujoco.MjModel.from_xml_string(ARM.format(**HIDDEN))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 0.02)
@@ -56,12 +59,14 @@ def record(seconds: float, seed: int) -> Rows:
     target = 0.25 * np.stack(wave, axis=1)
     seen = np.empty_like(target)
     data.qpos[:] = target[0]
-    sent = target[0]
+    sent = setpoint = target[0]
     for t, wanted in enumerate(target):
         seen[t] = data.qpos
         for step in range(10):
             sent = wanted if step >= 3 else sent
-            data.ctrl[:] = sent[::-1]  # The actuators come in another order than the joints.
+            reach = np.array([shoulder_rad_s, np.inf]) * model.opt.timestep
+            setpoint = setpoint + np.clip(sent - setpoint, -reach, reach)
+            data.ctrl[:] = setpoint[::-1]  # The actuators come in another order than the joints.
             mujoco.mj_step(model, data)
     seen += 5e-4 * rng.standard_normal(seen.shape)
     rows = {"time": time}
@@ -135,6 +140,24 @@ def test_stretches_are_left_out(folder: Path, tmp_path: Path) -> None:
     provenance = json.loads((tmp_path / "calibration" / "result.json").read_text())["provenance"]
     assert provenance["fitted_s"] == pytest.approx(3.96, abs=1e-3)
     assert provenance["left_out"] == [["rec", 2.0, 4.0]]
+
+
+def test_speed_limit_of_a_servo_is_found(folder: Path, tmp_path: Path) -> None:
+    """The shoulder's set-point moves at 1.2 rad/s at most; that is found within 3 % from 3 rad/s.
+
+    The written model has the limit under <custom>.
+    """
+    write(folder / "slewed.csv", record(6.0, 1, 1.2))
+    more = "  - {kind: servo_speed_limit, elements: servo_a, nominal: 3.0, name: shoulder.speed}\n"
+    (folder / "slewed.yaml").write_text(PARAMETERS + more, encoding="utf-8")
+    words = command(folder, "--method", "near", "--no-report", "--no-advise", "--quiet", data="slewed.csv")
+    words[words.index("--parameters") + 1] = str(folder / "slewed.yaml")
+    assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
+    found = json.loads((tmp_path / "calibration" / "result.json").read_text())["parameters"]
+    assert found["shoulder.speed"]["unit"] == "rad/s"
+    assert found["shoulder.speed"]["estimate"] == pytest.approx(1.2, rel=0.03)
+    assert found["shoulder.damping"]["estimate"] == pytest.approx(0.35, rel=0.1)
+    assert "deal_hw.speed_limit" in (tmp_path / "calibration" / "calibrated.xml").read_text()
 
 
 def test_spikes_do_not_move_the_estimate(
