@@ -109,13 +109,13 @@ JOINT_KINDS = (
         name="dof_dampingpoly_square", element="joint", quantity="damping_square", unit="N·m·s²/rad²",
         unit_slide="N·s²/m²", writes=("dof_dampingpoly",), along="nothing; dof_damping stays",
         apply=dof_dampingpoly_square, baseline=lambda m, i: _damping_poly(m, i, 0), usable=one_dof_joint,
-        scale="linear", spread=0.1, least=float("-inf"),
+        scale="linear", spread=0.5, least=float("-inf"),
     ),
     Kind(
         name="dof_dampingpoly_cube", element="joint", quantity="damping_cube", unit="N·m·s³/rad³",
         unit_slide="N·s³/m³", writes=("dof_dampingpoly",), along="nothing; dof_damping stays",
         apply=dof_dampingpoly_cube, baseline=lambda m, i: _damping_poly(m, i, 1), usable=one_dof_joint,
-        scale="linear", spread=0.05, least=float("-inf"),
+        scale="linear", spread=0.2, least=float("-inf"),
     ),
     Kind(
         name="dof_frictionloss", element="joint", quantity="frictionloss", unit="N·m", unit_slide="N",
