@@ -38,8 +38,8 @@ METHODS: dict[str, str] = {
 NULL_METHODS = frozenset({"centre", "nominal", "deal-paper-flat"})
 """Rows that must not read the data, so they are never polished."""
 
-WHOLE_METHODS = frozenset({"open-loop", "near"})
-"""Methods that decide themselves what follows their search; the polish does not."""
+WHOLE_METHODS = frozenset({"open-loop", "near", "mujoco-sysid"})
+"""Methods that decide themselves what follows their search, or stand for somebody else: never polished."""
 
 
 def check_method(name: str) -> None:

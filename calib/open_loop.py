@@ -31,7 +31,7 @@ from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.uncertainty.correlated import confounded
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, uncertainty
+from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, ended_at_bound, uncertainty
 from deal_hw.calib.validation.checks import Validation, with_causes, with_step
 from deal_hw.calib.validation.cross_validation import (
     Choice,
@@ -165,7 +165,9 @@ class OpenLoop(Calibration):
             "window_s": recipe.seconds,
             "noise_std": problem.noise_std[problem.channels].tolist(),
             "inflation": known.inflation,
-            "at_bound": [n for n, b in zip(problem.space.names, known.shape.bound, strict=True) if b != 0],
+            "at_bound": [
+                problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
+            ],
             "halves": halves.to_json(),
             "confounded": [pair.to_json() for pair in found],
         }
@@ -224,8 +226,8 @@ class _Work:
 
     @property
     def given_latency_s(self) -> float:
-        """The latency where it is given; otherwise fits begin at none [s]."""
-        return self._problem.fixed_latency_s or 0.0
+        """The latency where it is given; otherwise fits begin at the least that is searched [s]."""
+        return self._problem.first_latency_s
 
     @property
     def steps(self) -> int:

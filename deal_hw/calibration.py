@@ -16,7 +16,7 @@ from deal_hw.reading import number, numbers, object_of, read_json, reading, text
 from deal_hw.types import FloatArray
 
 LATENCY_RANGE_S = (0.0, 0.04)
-"""Total latencies that are searched, and that the simulator of a calibration can have [s]."""
+"""Total latencies that are searched where nothing else is said [s]."""
 SHORTEST_S = 1.0
 """Shortest recording that is calibrated from [s]."""
 RESULT_FILE = "result.json"

@@ -19,7 +19,7 @@ from deal_hw.calib.data.noise import NoiseModel, noise_model, white_noise_std
 from deal_hw.calib.data.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
 from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
@@ -101,7 +101,8 @@ class Problem:
         episodes: The recordings to fit; short gaps are filled in and not fitted to. All measure the same
             channels.
         threads: Simulation threads; None for all CPUs.
-        latency_range_s: Total latencies that are searched [s].
+        latency_range_s: Total latencies that are searched [s]; widened to hold one that is given, so that no
+            bound moves it.
         fixed_latency_s: A latency that is given; None to search it.
         known_std: Standard deviation of every entry of (position, velocity), (2 C,), where it is known or
             chosen; None to estimate it from the recordings.
@@ -127,11 +128,14 @@ class Problem:
     def __post_init__(self) -> None:
         robot, space, threads = self.robot, self.space, self.threads
         self._batches = BatchPool(lambda count: ServoBatch(robot, space, count, threads))
-        low, high = (1e3 * v for v in self.latency_range_s)
-        if self.fixed_latency_s is not None and not low <= 1e3 * self.fixed_latency_s <= high:
+        given = () if self.fixed_latency_s is None else (self.fixed_latency_s,)
+        (low, high), longest = self.latency_range_s, LONGEST_LATENCY_S
+        if not (0 <= low < high <= longest and all(0 <= latency_s <= longest for latency_s in given)):
             raise ConfigurationError(
-                f"a latency of {1e3 * self.fixed_latency_s:g} ms: the simulator has {low:g} to {high:g} ms"
+                f"latency {' to '.join(f'{1e3 * v:g}' for v in given or (low, high))} ms: a range is two "
+                f"different values, the lower one first; no robot is later than {1e3 * longest:g} ms"
             )
+        self.latency_range_s = (min((low, *given)), max((high, *given)))
         if not self.episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
         self.episodes = [fill_gaps(e) for e in self.episodes]
@@ -215,6 +219,11 @@ class Problem:
         return other
 
     @property
+    def first_latency_s(self) -> float:
+        """The latency that fits begin with: the given one, else the least that is searched [s]."""
+        return self.latency_range_s[0] if self.fixed_latency_s is None else self.fixed_latency_s
+
+    @property
     def exact(self) -> bool:
         """Whether all states are known without error, so that windows need not fit where they start."""
         return all(e.exact for e in self.episodes)
@@ -260,7 +269,7 @@ class Problem:
         problem = ""
         for index, episode in enumerate(self.episodes):
             try:
-                windows = cut_windows(episode, length, hop, offset)
+                windows = cut_windows(episode, length, hop, offset, self.latency_range_s[1])
             except InsufficientDataError as err:
                 problem = str(err)
                 continue

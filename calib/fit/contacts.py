@@ -226,4 +226,7 @@ def damped_step(
     shrink = np.max(np.abs(step) / limit)
     if shrink > 1:
         step = step / shrink
-    return np.asarray(np.clip(value + step, low, high) - value)
+    moved = np.asarray(np.clip(value + step, low, high) - value)
+    if fixed_latency:
+        moved[-1] = 0.0
+    return moved

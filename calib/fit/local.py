@@ -40,7 +40,7 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
     can be explained.
     """
     fixed = problem.fixed_latency_s is not None
-    latency_s = problem.fixed_latency_s or 0.0
+    latency_s = problem.first_latency_s
 
     def notify(done: int, chi2: float) -> None:
         if progress is not None:

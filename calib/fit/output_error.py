@@ -189,7 +189,7 @@ def expected_residual(problem: Problem) -> FloatArray:
     Args:
         problem: Recordings and simulator.
     """
-    fit = fit_horizon(problem, problem.space.nominal, problem.fixed_latency_s or 0.0, SHORT)
+    fit = fit_horizon(problem, problem.space.nominal, problem.first_latency_s, SHORT)
     std = problem.noise_std.copy()
     std[problem.channels] = np.maximum(std[problem.channels], fit.scale)
     return std

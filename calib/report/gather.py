@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData, samples_in
+from deal_hw.calib.fit.output_error import longest_windows
 from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
 from deal_hw.calib.validation.normalised_error import HELDOUT_WINDOW_S
 from deal_hw.calib.validation.split_half import HalvesRow, halves_rows
@@ -33,6 +35,7 @@ def gather(
     *,
     telemetry: Sequence[str] = (),
     halves: Sequence[HalvesRow] = (),
+    window_s: float = HELDOUT_WINDOW_S,
     threads: int | None = None,
 ) -> ReportInputs:
     """Simulate what the report shows.
@@ -44,6 +47,7 @@ def gather(
         holdout: Recordings that the search has not seen.
         telemetry: Verdicts of the telemetry checks, in words.
         halves: Agreement of disjoint halves of the data; by default what the result's provenance says.
+        window_s: Drawn predictions restart this often [s]; where no recording is as long, more often.
         threads: Simulation threads.
     """
     overlays: list[Overlay] = []
@@ -58,7 +62,7 @@ def gather(
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
         problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
         titles = [f"{word} recording {i + 1} of {len(group)}" for i in range(len(shown))]
-        overlays.extend(_overlays(problem, result, titles, heldout))
+        overlays.extend(_overlays(problem, result, titles, heldout, window_s))
         if not heldout:
             residuals.extend(_residuals(problem, result, titles))
     return ReportInputs(
@@ -74,14 +78,13 @@ def gather(
 
 
 def _overlays(
-    problem: Problem, result: CalibrationResult, titles: Sequence[str], heldout: bool
+    problem: Problem, result: CalibrationResult, titles: Sequence[str], heldout: bool, window_s: float
 ) -> list[Overlay]:
     theta = np.stack([result.space.nominal, result.estimate])
     # The user's own model knows no latency: the same candidates as in the held-out error.
     latency = np.array([0.0, result.latency_s])
-    length = samples_in(problem, HELDOUT_WINDOW_S)
     found = []
-    for data in problem.windows(length):
+    for data in _windows(problem, window_s):
         predicted = problem.predict(theta, latency, data).observed
         real = problem.measured(data.episode)
         both = np.full((2, *real.shape), np.nan)
@@ -99,10 +102,18 @@ def _overlays(
                 real=real,
                 nominal=both[0],
                 calibrated=both[1],
-                window_s=length * episode.period_s,
+                window_s=data.windows.length * episode.period_s,
             )
         )
     return found
+
+
+def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
+    """Yield the windows of each recording, as long as wanted or as it holds."""
+    for index in range(len(problem.episodes)):
+        alone = [np.full(len(e.sample), i == index) for i, e in enumerate(problem.episodes)]
+        with contextlib.suppress(InsufficientDataError):
+            yield from longest_windows(problem.part(alone), window_s)
 
 
 def _units(problem: Problem) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -23,7 +24,7 @@ TEMPLATE = "report.html.j2"
 AT_BOUND = 1e-6
 """A parameter so near an end of its range, as a share of the range, ended there."""
 
-_HIDDEN = ("latency_scan", "search_estimate", "versions", "settings", "budget", "halves")
+_HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "halves")
 """Provenance with a place of its own on the page."""
 
 
@@ -91,6 +92,8 @@ def render(inputs: ReportInputs) -> str:
     provenance = dict(result.provenance)
     scan = _mapping(provenance.get("latency_scan"))
     panels = sum(min(len(shown.names), charts.PANELS) for shown in inputs.overlays)
+    heldout = _mapping(provenance.get("heldout_rmse"))
+    names, joints = heldout_rows(heldout)
     drawn = [(shown, *charts.residuals(shown)) for shown in inputs.residuals]
     template = resources.files("deal_hw.calib.report").joinpath(TEMPLATE).read_text(encoding="utf-8")
     return environment.from_string(template).render(
@@ -106,6 +109,9 @@ def render(inputs: ReportInputs) -> str:
         weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
         panels_each=charts.PANELS,
+        heldout_window_s=float(heldout.get("window_s") or 0.0),
+        heldout_names=names,
+        heldout_joints=joints,
         residuals=drawn,
         advice=advice_rows(result),
         scan=charts.latency_scan(scan, inputs.tick_s),
@@ -162,6 +168,21 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             )
         )
     return rows
+
+
+def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, list[float | None]]]]:
+    """Return predictors, and of each joint (and of their mean) the error of each; None where it diverged.
+
+    Args:
+        rmse: ``provenance.heldout_rmse``; empty where nothing was held out.
+    """
+    by_joint = _mapping(rmse.get("by_coordinate"))
+    names = list(by_joint)
+    joints = list(_mapping(by_joint[names[0]])) if names else []
+    rows = [(joint, [by_joint[name][joint] for name in names]) for joint in joints]
+    if len(joints) > 1:
+        rows.append(("mean", [_mapping(rmse.get("mean")).get(name) for name in names]))
+    return names, rows
 
 
 def advice_rows(result: CalibrationResult) -> list[AdviceRow]:

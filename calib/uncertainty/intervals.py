@@ -193,7 +193,7 @@ def uncertainty(
         latency_interval_s=latency,
         verdicts=_verdicts(space, std[:K], blind),
         null_directions=null_directions(space, unseen),
-        alarms=_alarms(space, theta, chi2, tau, timing_std_s),
+        alarms=_alarms(space, theta, chi2, tau, timing_std_s, bound != 0),
         inflation=inflation,
         shape=shape,
         clustered=cluster,
@@ -303,7 +303,12 @@ def _verdicts(space: ParameterSpace, std: FloatArray, blind: npt.NDArray[np.bool
 
 
 def _alarms(
-    space: ParameterSpace, theta: FloatArray, chi2: float, tau: float, timing_std_s: float
+    space: ParameterSpace,
+    theta: FloatArray,
+    chi2: float,
+    tau: float,
+    timing_std_s: float,
+    pressed: npt.NDArray[np.bool_],
 ) -> tuple[str, ...]:
     alarms = []
     if timing_std_s > 0:
@@ -321,10 +326,18 @@ def _alarms(
             f"residuals hang together over {tau:.1f} samples where noise would not: something moves that "
             "the model does not have (friction law, backlash or a varying delay)"
         )
-    unit = space.normalize(theta)
-    for k in np.flatnonzero((unit < AT_BOUND) | (unit > 1 - AT_BOUND)):
+    for k in np.flatnonzero(ended_at_bound(space, theta)):
+        fixed = (
+            "it was fixed there for the others' intervals" if pressed[k] else "the data do not press it there"
+        )
         alarms.append(
             f"{space.names[k]} ended at the bound of its range, {theta[k]:.4g} {space.free[k].unit}: "
-            "it was fixed there for the others' intervals; widen the range, or doubt the model"
+            f"{fixed}; widen the range, or doubt the model"
         )
     return tuple(alarms)
+
+
+def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which parameters lie at an end of their range, pressed against it or not, (K,)."""
+    unit = space.normalize(theta)
+    return np.asarray((unit < AT_BOUND) | (unit > 1 - AT_BOUND))

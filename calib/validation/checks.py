@@ -16,12 +16,16 @@ from deal_hw.calib.uncertainty.intervals import (
     NEGLIGIBLE_CHI2,
     Uncertainty,
     correlation_time,
+    ended_at_bound,
 )
 from deal_hw.calib.uncertainty.physics_step import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import Finding, diagnose, motions
 from deal_hw.calib.validation.split_half import compare_halves, heed
+from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
 
+AT_END = 0.01
+"""A latency ended at the end of its range where it is within this share of it."""
 MOST_CAUSES = 2
 """So many causes are worded in alarms; all are in the provenance."""
 
@@ -49,6 +53,32 @@ class Validation:
     """Say what an unexplained residual looks like."""
 
 
+def latency_alarms(problem: Problem, latency_s: float) -> tuple[str, ...]:
+    """Return an alarm where a latency that was searched ended at the end of its range.
+
+    The lower end counts where it is above zero.
+
+    Args:
+        problem: The problem.
+        latency_s: The estimate [s].
+    """
+    if problem.fixed_latency_s is not None:
+        return ()
+    low, high = problem.latency_range_s
+    near = max(AT_END * (high - low), 0.5 * problem.episodes[0].step_s)
+    if latency_s > high - near:
+        side, wider = "later", (low, min(2 * high, LONGEST_LATENCY_S))
+    elif low > 0 and latency_s < low + near:
+        side, wider = "sooner", (0.0, high)
+    else:
+        return ()
+    return (
+        f"the latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "
+        f"{1e3 * high:g} ms): the robot may act {side} than that, and the other parameters make up for it; "
+        f"calibrate again with --latency-range {wider[0]:g} {wider[1]:g}",
+    )
+
+
 def unexplained(polished: Polished) -> bool:
     """Return whether the residual is larger, or hangs together longer, than noise does."""
     if polished.chi2 <= NEGLIGIBLE_CHI2:
@@ -68,9 +98,8 @@ def judge(
         settings: Which checks.
     """
     facts: dict[str, Any] = {"inflation": known.inflation}
-    facts["at_bound"] = [
-        n for n, side in zip(problem.space.names, known.shape.bound, strict=True) if side != 0
-    ]
+    ended = np.flatnonzero(ended_at_bound(problem.space, polished.theta))
+    facts["at_bound"] = [problem.space.names[k] for k in ended]
     if known.clustered is not None:
         cluster = known.clustered
         facts["clustered"] = {

@@ -25,9 +25,10 @@ from deal_hw.cli.calibrate_run import (
 )
 from deal_hw.cli.excite import balancer
 from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
@@ -94,11 +95,18 @@ class Calibrate(Checked):
     """Other search ranges, as NAME LOW HIGH (SI)."""
 
     xi: Annotated[float | None, Ratio] = None
-    """Search each parameter within a factor XI to either side of its nominal value; 5 by default, with
-    --parameters the ranges of that file."""
+    """Search each parameter within a factor XI to either side of its nominal value. By default 5; with
+    --model 20 for dry friction (docs/parameters.md), and with --parameters the ranges of that file."""
 
-    latency: Annotated[float | None, Range(*LATENCY_RANGE_S, "s")] = None
+    latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
+
+    latency_range: Annotated[tuple[float, float], Range(0, LONGEST_LATENCY_S, "s")] = LATENCY_RANGE_S
+    """Latencies that are searched, LOW HIGH [s]. An estimate at the end is an alarm: widen the range then."""
+
+    spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
+    """Leave out up to three samples in a row that jump away and come back, so many times farther than the
+    joint's fastest motion would take it (docs/calibration.md). A larger number leaves out less."""
 
     residual_std: tuple[str, ...] = ()
     """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE
@@ -142,6 +150,12 @@ class Calibrate(Checked):
     quiet: bool = False
     """Print nothing but errors."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self.latency_range
+        if not low < high:
+            raise ConfigurationError(f"--latency-range {low:g} {high:g}: give the lower one first")
+
 
 def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:
     """Run the verb: calibrate, or write a file of parameters to edit.
@@ -171,6 +185,8 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             given(source, Recordings()),
             "a dataset says it; that goes with --model and --data",
         )
+    if config.latency is not None:
+        refuse(given(config, Calibrate(), ("latency_range",)), "--latency says the latency")
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
@@ -193,6 +209,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             budget=budget,
             rng=np.random.default_rng(config.seed),
             latency_s=config.latency,
+            latency_range_s=config.latency_range,
             threads=config.threads,
             quiet=config.quiet,
             checkpoint=checkpoint,
@@ -206,6 +223,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         "seed": config.seed,
         "xi": config.xi,
         "heldout_window_s": config.heldout_window,
+        "latency_range_s": None if config.latency is not None else list(config.latency_range),
     }
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)
@@ -265,12 +283,12 @@ def _prepare_model(config: Calibrate) -> Work:
         "only datasets take that; with --model use --data and --parameters",
     )
     holdout = [Path(str(path)) for path in config.holdout]
-    xi = XI if config.xi is None and config.recordings.parameters is None else config.xi
     return prepare_model(
         config.recordings,
         holdout,
-        _narrowing(config, xi),
+        _narrowing(config, config.xi),
         std=lambda robot: residual_std(config.residual_std, robot),
+        spikes=SpikeSettings(ratio=config.spike_ratio),
         threads=config.threads,
         quiet=config.quiet,
     )
@@ -283,6 +301,7 @@ def prepare_dataset(config: Calibrate) -> Work:
         DealHwError: A setting or a recording is unusable.
     """
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.spikes import without_spikes
     from deal_hw.data.recording.telemetry_checks import Severity, check
     from deal_hw.errors import InsufficientDataError
 
@@ -298,13 +317,19 @@ def prepare_dataset(config: Calibrate) -> Work:
     fit, holdout = choose_episodes(dataset, config.episodes, held)
     space = make_space(dataset.description["name"], config)
     recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
-    for index, trajectory in recordings.items():
-        failed = [v.message for v in check(trajectory) if v.severity is Severity.FAIL]
+    spikes = SpikeSettings(ratio=config.spike_ratio)
+    verdicts = {index: check(trajectory, spikes) for index, trajectory in recordings.items()}
+    for index, found in verdicts.items():
+        failed = [v.message for v in found if v.severity is Severity.FAIL]
         if failed:
             raise InsufficientDataError(
                 f"episode {index} of {config.dataset} cannot be used: {'; '.join(failed)}; "
                 "record again with `deal-hw collect`"
             )
+        jumps = [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN]
+        if jumps and not config.quiet:
+            print(f"episode {index}: {jumps[0]}", file=sys.stderr)
+    recordings = {index: without_spikes(trajectory, spikes) for index, trajectory in recordings.items()}
     robot, episodes = _simulation(dataset, recordings, config.sample_hz)
     return Work(
         robot=robot,
@@ -312,9 +337,7 @@ def prepare_dataset(config: Calibrate) -> Work:
         episodes=[episodes[i] for i in fit],
         holdout=[episodes[i] for i in holdout],
         shown=recordings[fit[0]],
-        telemetry=[
-            f"episode {i}: {v.severity}: {v.message}" for i, t in recordings.items() for v in check(t)
-        ],
+        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
         provenance={
             "dataset": str(config.dataset),
             "description_digest": dataset.digest,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
@@ -19,7 +20,18 @@ if TYPE_CHECKING:
 
 GRAVITY_EXPLAINED, GRAVITY_LEAST = 0.5, 0.01
 """Gravity must explain this share of a deviation of at least this size, or no gain is told [rad, m]."""
-MOTOR_CHECKS = ("size", "finite", "clock", "rate", "gaps", "frozen", "limits", "orientation", "actuation")
+MOTOR_CHECKS = (
+    "size",
+    "finite",
+    "clock",
+    "rate",
+    "gaps",
+    "spikes",
+    "frozen",
+    "limits",
+    "orientation",
+    "actuation",
+)
 """Checks that mean something where commands are efforts and not positions."""
 
 
@@ -56,6 +68,7 @@ def examine_recording(
     *,
     servo: bool = True,
     kept: Table | None = None,
+    spikes: SpikeSettings = DEFAULT_SPIKES,
     say: Callable[[str], None],
 ) -> list[Verdict]:
     """Check a recording and tell what is wrong; return what is worth keeping.
@@ -66,6 +79,7 @@ def examine_recording(
         force: Go on although a check failed.
         servo: Commands are positions; efforts are not compared with positions.
         kept: The recording without what is left out; None: all of it is used.
+        spikes: What counts as a spike.
         say: Takes each finding in words.
 
     Raises:
@@ -79,7 +93,7 @@ def examine_recording(
     limits = None
     if facts is not None:
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    every = list(examine(table, limits, kept))
+    every = list(examine(table, limits, kept, spikes))
     if facts is not None and {v.name for v in every} >= {"assignment"}:
         # The later checks ran, so clock and values are sound.
         command = facts.command[[facts.names.index(name) for name in table.actuated]]

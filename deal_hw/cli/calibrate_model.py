@@ -27,6 +27,7 @@ from deal_hw.cli.calibrate_recordings import (
 )
 from deal_hw.cli.calibrate_run import Narrowing, Work
 from deal_hw.cli.options import Checked, Range
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
@@ -109,6 +110,7 @@ def prepare_model(
     narrowing: Narrowing,
     *,
     std: Callable[[RobotModel], FloatArray | None],
+    spikes: SpikeSettings = DEFAULT_SPIKES,
     threads: int | None = None,
     quiet: bool = False,
 ) -> Work:
@@ -119,6 +121,7 @@ def prepare_model(
         holdout: Recordings that only judge the result.
         narrowing: What the command line changes about the parameters.
         std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
+        spikes: What counts as a spike.
         threads: Simulation threads.
         quiet: Say nothing of what was guessed and warned of.
 
@@ -128,10 +131,11 @@ def prepare_model(
         InsufficientDataError: The recordings are too short.
     """
     try:
+        from deal_hw.data.checks.plausibility import despiked
         from deal_hw.data.importing.columns import read_column_map
         from deal_hw.sim.engine.compiling import compile_mjcf
         from deal_hw.sim.engine.model import load_model
-        from deal_hw.sim.mjcf.describe import describe
+        from deal_hw.sim.mjcf.describe import describe, with_speed_limits
         from deal_hw.sim.mjcf.joint_facts import joint_facts
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
@@ -155,10 +159,15 @@ def prepare_model(
     fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
-    parts = without(config.leave_out, fitted, held)
+    description = with_speed_limits(description, model, space)
+    parts = without(
+        config.leave_out, *([despiked(table, spikes) for table in tables] for tables in (fitted, held))
+    )
     servo = description.actuation == "position"
     verdicts = {
-        table.name: examine_recording(table, facts, config.force, servo=servo, kept=kept, say=say)
+        table.name: examine_recording(
+            table, facts, config.force, servo=servo, kept=kept, spikes=spikes, say=say
+        )
         for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }
     robot = load_model(description, rates.step_s)

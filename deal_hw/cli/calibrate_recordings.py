@@ -96,19 +96,7 @@ def without(
 def _rows(table: Table, keep: Any) -> Table:
     if not keep.any():
         raise ConfigurationError(f"--leave-out leaves nothing of {table.name}; leave out the file instead")
-    optional = {
-        name: None if values is None else values[keep]
-        for name, values in (
-            ("velocity", table.velocity), ("effort", table.effort),
-            ("orientation", table.orientation), ("gyro", table.gyro),
-        )
-    }  # fmt: skip
-    return dataclasses.replace(
-        table,
-        time_s=table.time_s[keep],
-        position=table.position[keep],
-        **optional,  # type: ignore[arg-type]
-    )
+    return table.rows(keep)
 
 
 def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]:

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import (
+    BEFORE_SEARCH,
+    LATENCY_RANGE_S,
+    Budget,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+)
 from deal_hw.cli.calibrate_live import SO_FAR, BestSoFar, keeping_best, open_checkpoint, saying_how_to_resume
 from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
@@ -120,6 +127,7 @@ def calibrate_episodes(
     budget: Budget,
     rng: np.random.Generator,
     latency_s: float | None = None,
+    latency_range_s: tuple[float, float] = LATENCY_RANGE_S,
     threads: int | None = None,
     quiet: bool = True,
     checkpoint: Path | None = None,
@@ -140,6 +148,7 @@ def calibrate_episodes(
         budget: How much it may use.
         rng: The only source of randomness.
         latency_s: Total latency if it is known [s].
+        latency_range_s: Otherwise what is searched [s].
         threads: Simulation threads.
         quiet: Show no progress.
         checkpoint: File that holds the state after each generation; None to keep none.
@@ -156,13 +165,22 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.methods import make_method
+        from deal_hw.calib.validation.checks import latency_alarms
         from deal_hw.calib.validation.heldout import heldout_rmse
         from deal_hw.calib.validation.normalised_error import heldout_nrmse
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
     _require_windows(holdout, heldout_window_s)
-    problem = Problem(robot, space, episodes, threads=threads, fixed_latency_s=latency_s, known_std=known_std)
+    problem = Problem(
+        robot,
+        space,
+        episodes,
+        threads=threads,
+        latency_range_s=latency_range_s,
+        fixed_latency_s=latency_s,
+        known_std=known_std,
+    )
     check_delays(problem)
 
     def judge(theta: FloatArray, latency: float) -> Mapping[str, float]:
@@ -192,6 +210,8 @@ def calibrate_episodes(
         else:
             store = open_checkpoint(checkpoint, resume, problem, searcher, budget, rng)
             result = searcher.run(problem, budget, rng, progress, store)
+    alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
+    result = dataclasses.replace(result, alarms=alarms)
     if not holdout:
         return result
     candidates = {"nominal": (space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}
@@ -345,7 +365,13 @@ def _judged(
     from deal_hw.calib.report.gather import gather
 
     inputs = gather(
-        work.robot, result, work.episodes, work.holdout, telemetry=work.telemetry, threads=threads
+        work.robot,
+        result,
+        work.episodes,
+        work.holdout,
+        telemetry=work.telemetry,
+        window_s=settings.get("heldout_window_s", HELDOUT_WINDOW_S),
+        threads=threads,
     )
     return result, inputs
 

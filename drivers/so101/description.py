@@ -20,7 +20,7 @@ RANGE_RAD: Final = (
     (-1.69, 1.69),
     (-1.658063, 1.658063),
     (-2.7438473, 2.7438473),
-    (-0.174533, 1.7453292),
+    (-0.174533, 2.1633),
 )
 RECORDED_NAMES: Final = {
     "Rotation": "shoulder_pan",
@@ -80,7 +80,7 @@ DESCRIPTION: Final = RobotDescription(
         "control_rate_hz": "nearest whole rate to the public recordings' 49.8 Hz",
         "device_rate_hz": "assumed; the servo's loop rate is not published",
         "state_rate_hz": "nearest whole rate to the public recordings' 49.8 Hz",
-        "limits": "joint ranges of the same so101.xml",
+        "limits": "joint ranges of the same so101.xml; the gripper's from 1524 recorded ticks",
         "sensor": "12-bit encoder, a tick is 1.5 mrad; speeds are differenced: the servo's own are coarse",
         "mjcf": "own model of lines; kinematics and inertials from the same so101.xml",
     },

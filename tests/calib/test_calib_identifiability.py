@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, uncertainty
+from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, ended_at_bound, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_space, sparse_basis
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
@@ -61,6 +61,19 @@ def test_a_bound_that_the_data_do_not_press_is_none() -> None:
     """At the bound, but the cost falls inwards: the parameter stays free."""
     told = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]), gradient=np.array([0.0, 5.0, 0.0]))
     assert list(told.shape.bound) == [0, 0]
+    (alarm,) = [words for words in told.alarms if "bound" in words]
+    assert alarm.startswith("b ended at the bound of its range, 5 kg: the data do not press it there")
+
+
+def test_what_ended_at_a_bound_is_what_the_alarms_name() -> None:
+    """Pressed, not pressed, and not seen at all: whoever lies at an end is named, nobody else."""
+    space, theta = _space("a", "b", "c", "d"), [5.0, 0.2, 5.0, 4.99]
+    hessian, gradient = np.diag([1e4, 1e4, 1e-9, 1e4]), np.array([-50.0, -50.0, 0.0, -50.0, 0.0])
+    told = _told(space, theta, hessian, gradient=gradient)
+    named = [words.split()[0] for words in told.alarms if "ended at the bound" in words]
+    ended = ended_at_bound(space, np.array(theta))
+    assert named == ["a", "b", "c"] and ended.tolist() == [True, True, True, False]
+    assert list(told.shape.bound) == [1, 0, 0, 0]
 
 
 def test_a_prior_resolves_a_common_factor() -> None:

@@ -18,15 +18,16 @@ from deal_hw.calib.report.figure import envelope
 from deal_hw.calib.report.folder import write_result
 from deal_hw.calib.report.gather import gather
 from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
-from deal_hw.calib.report.page import parameter_rows, render, write_report
+from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report
 from deal_hw.calib.validation.split_half import HalvesRow
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import align
+from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.parts import part
 from deal_hw.testing.simulated_episode import simulated_episode
 
 HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"
@@ -234,9 +235,27 @@ def test_autocorrelation_of_an_alternating_series() -> None:
     assert rho[:4].tolist() == [-1, 1, -1, 1] and band == pytest.approx(0.4472, abs=1e-4)
 
 
+def test_held_out_error_of_each_joint_stands_in_its_unit() -> None:
+    """A row for each joint and their mean, a column for each predictor; what diverged says so."""
+    rmse = {
+        "window_s": 5.0,
+        "mean": {"nominal": None, "calibrated": 0.02},
+        "by_coordinate": {"nominal": {"hip": 0.5, "knee": None}, "calibrated": {"hip": 0.01, "knee": 0.03}},
+    }
+    names, rows = heldout_rows(rmse)
+    assert names == ["nominal", "calibrated"]
+    assert rows == [("hip", [0.5, 0.01]), ("knee", [None, 0.03]), ("mean", [None, 0.02])]
+    text = " ".join(
+        Tags(render(inputs(result(space(), heldout_nrmse=HELD, provenance={"heldout_rmse": rmse})))).words
+    )
+    assert "restart every 5 s, in rad or m" in text and "by_coordinate" not in text
+    assert " ".join(text.partition("knee")[2].split()).startswith("diverged 0.03 mean diverged 0.02")
+    assert heldout_rows({}) == ([], [])
+
+
 @pytest.fixture(scope="module")
-def gathered() -> ReportInputs:
-    """Simulate a cart-pole with 7 ms latency and sensor noise, and gather at the true parameters."""
+def recordings() -> tuple[RobotModel, CalibrationResult, list[Episode]]:
+    """A cart-pole with 7 ms latency and sensor noise, twice 2.5 s, and a result with its true parameters."""
     robot, searched = load_model(DESCRIPTION), k9_space().with_ratio(3.0)
     truth = searched.unnormalize(np.linspace(0.3, 0.7, len(searched)))
     episodes = [
@@ -253,7 +272,25 @@ def gathered() -> ReportInputs:
         method="truth", space=searched, estimate=truth, interval=np.stack([truth, truth], axis=1),
         covariance=np.eye(K) * 1e-4, latency_s=0.007, latency_interval_s=(0.007, 0.007),
     )  # fmt: skip
+    return robot, found, episodes
+
+
+@pytest.fixture(scope="module")
+def gathered(recordings: tuple[RobotModel, CalibrationResult, list[Episode]]) -> ReportInputs:
+    """Gather at the true parameters."""
+    robot, found, episodes = recordings
     return gather(robot, found, episodes[:1], episodes[1:], telemetry=["fine"], threads=1)
+
+
+def test_overlays_restart_as_often_as_held_out_predictions(
+    recordings: tuple[RobotModel, CalibrationResult, list[Episode]],
+) -> None:
+    """1 s is drawn as 1 s; a recording of half a second beside one of 2.5 s gets what it holds."""
+    robot, found, episodes = recordings
+    short = part(episodes[0], 0, round(0.5 / episodes[0].period_s) + 1)
+    drawn = gather(robot, found, [episodes[0], short], episodes[1:], window_s=1.0, threads=1).overlays
+    assert [shown.window_s for shown in drawn] == pytest.approx([1.0, 0.45, 1.0], abs=0.06)
+    assert "restarted every 1 s" in render(ReportInputs(robot="r", result=found, overlays=drawn))
 
 
 def test_gathered_series_show_what_the_models_predict(gathered: ReportInputs) -> None:

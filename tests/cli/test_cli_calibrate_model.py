@@ -46,8 +46,11 @@ Rows = dict[str, FloatArray]
 Change = Callable[[Rows], Rows]
 
 
-def record(seconds: float, seed: int) -> Rows:
-    """Play sums of sines on the hidden arm in plain MuJoCo: 50 Hz, commands act 6 ms late, 0.5 mrad noise."""
+def record(seconds: float, seed: int, shoulder_rad_s: float = np.inf) -> Rows:
+    """Play sums of sines on the hidden arm in plain MuJoCo: 50 Hz, commands act 6 ms late, 0.5 mrad noise.
+
+    The shoulder's servo moves its set-point at the given speed at most.
+    """
     model = mujoco.MjModel.from_xml_string(ARM.format(**HIDDEN))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 0.02)
@@ -56,12 +59,14 @@ def record(seconds: float, seed: int) -> Rows:
     target = 0.25 * np.stack(wave, axis=1)
     seen = np.empty_like(target)
     data.qpos[:] = target[0]
-    sent = target[0]
+    sent = setpoint = target[0]
     for t, wanted in enumerate(target):
         seen[t] = data.qpos
         for step in range(10):
             sent = wanted if step >= 3 else sent
-            data.ctrl[:] = sent[::-1]  # The actuators come in another order than the joints.
+            reach = np.array([shoulder_rad_s, np.inf]) * model.opt.timestep
+            setpoint = setpoint + np.clip(sent - setpoint, -reach, reach)
+            data.ctrl[:] = setpoint[::-1]  # The actuators come in another order than the joints.
             mujoco.mj_step(model, data)
     seen += 5e-4 * rng.standard_normal(seen.shape)
     rows = {"time": time}
@@ -135,6 +140,65 @@ def test_stretches_are_left_out(folder: Path, tmp_path: Path) -> None:
     provenance = json.loads((tmp_path / "calibration" / "result.json").read_text())["provenance"]
     assert provenance["fitted_s"] == pytest.approx(3.96, abs=1e-3)
     assert provenance["left_out"] == [["rec", 2.0, 4.0]]
+
+
+def test_speed_limit_of_a_servo_is_found(folder: Path, tmp_path: Path) -> None:
+    """The shoulder's set-point moves at 1.2 rad/s at most; that is found within 3 % from 3 rad/s.
+
+    The written model has the limit under <custom>.
+    """
+    write(folder / "slewed.csv", record(6.0, 1, 1.2))
+    more = "  - {kind: servo_speed_limit, elements: servo_a, nominal: 3.0, name: shoulder.speed}\n"
+    (folder / "slewed.yaml").write_text(PARAMETERS + more, encoding="utf-8")
+    words = command(folder, "--method", "near", "--no-report", "--no-advise", "--quiet", data="slewed.csv")
+    words[words.index("--parameters") + 1] = str(folder / "slewed.yaml")
+    assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
+    found = json.loads((tmp_path / "calibration" / "result.json").read_text())["parameters"]
+    assert found["shoulder.speed"]["unit"] == "rad/s"
+    assert found["shoulder.speed"]["estimate"] == pytest.approx(1.2, rel=0.03)
+    assert found["shoulder.damping"]["estimate"] == pytest.approx(0.35, rel=0.1)
+    assert "deal_hw.speed_limit" in (tmp_path / "calibration" / "calibrated.xml").read_text()
+
+
+def test_spikes_do_not_move_the_estimate(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Four samples 2 to 4 rad off are named and left out; estimates move by less than their own error."""
+    spiked = record(6.0, 1)
+    spiked["shoulder_pos"][70] += 3.0
+    spiked["shoulder_pos"][[150, 151]] -= 2.5
+    spiked["elbow_pos"][200] += 4.0
+    write(folder / "spiked.csv", spiked)
+    found = {}
+    for name in ("rec", "spiked"):
+        words = command(
+            folder, "--method", "near", "--no-report", "--out", str(tmp_path / name), data=f"{name}.csv"
+        )
+        assert main([*words, "--holdout", str(folder / "other.csv")]) == EXIT_OK
+        found[name] = json.loads((tmp_path / name / "calibration" / "result.json").read_text())
+    told = capsys.readouterr().err
+    assert told.count("spikes") == 1 and "spiked.csv: warn spikes: 4 samples" in told
+    assert (
+        "shoulder +3 rad at 1.400 s, shoulder -2.49 rad at 3.000 s (2 samples), elbow +4 rad at 4.0" in told
+    )
+    for parameter, clean in found["rec"]["parameters"].items():
+        assert found["spiked"]["parameters"][parameter]["estimate"] == pytest.approx(
+            clean["estimate"], abs=0.3 * (clean["high"] - clean["low"])
+        )
+
+
+@pytest.mark.parametrize("method", ["near", "weki"])
+def test_latency_at_the_end_of_its_range(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
+) -> None:
+    """Commands act 6 ms late: with 0 to 4 ms both paths end at 4 ms and say so; 0 to 40 ms is the default."""
+    words = command(folder, "--no-report", "--no-advise", "--method", method, "--out", str(tmp_path))
+    assert main([*words, "--latency-range", "0", "0.004"]) == EXIT_OK
+    found = json.loads((tmp_path / "calibration" / "result.json").read_text())
+    assert found["latency_s"] == pytest.approx(0.004)
+    assert found["provenance"]["latency_range_s"] == [0.0, 0.004]
+    assert any("the latency ended at 4 ms" in a and "--latency-range 0 0.008" in a for a in found["alarms"])
+    assert "alarm: the latency ended at 4 ms" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_parameters_are_written_and_read(
@@ -237,6 +301,10 @@ def test_bad_recordings_are_refused(
         (["--leave-out", "nothing.csv", "0", "1"], "no such recording; they are rec.csv"),
         (["--leave-out", "rec.csv", "0", "99"], "leaves nothing of rec.csv"),
         (["--space", "k9"], "--parameters"),
+        (["--latency", "12"], "--latency 12.0 s: allowed are 0 to 1 s"),
+        (["--latency-range", "0.1", "0.05"], "--latency-range 0.1 0.05: give the lower one first"),
+        (["--latency", "0.02", "--latency-range", "0", "0.1"], "--latency says the latency"),
+        (["--spike-ratio", "0.5"], "allowed are 1 to 1000000"),
     ],
 )
 def test_bad_settings_are_refused(

@@ -119,7 +119,7 @@ def test_a_range_says_milliseconds_where_seconds_are_small() -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("calibrate d --latency 12", "--latency 12.0 s: allowed are 0 to 40 ms"),
+        ("calibrate d --latency 12", "--latency 12.0 s: allowed are 0 to 1 s"),
         ("calibrate d --seed -1", "--seed -1: allowed are 0 to"),
         ("emulate cartpole --drop nan", "--drop nan: allowed are 0 to 1"),
         ("deploy cartpole --port p --domain 233", "DDS domain 233: 0 to 232"),

@@ -322,6 +322,35 @@ def test_column_map_that_does_not_fit_the_file(tmp_path: Path) -> None:
             call()
 
 
+def test_columns_that_do_not_exist_are_never_replaced_by_their_place(tmp_path: Path) -> None:
+    """Each refusal says what was asked for, what there is, and what to write instead."""
+    q = np.arange(8.0).reshape(4, 2)
+    names = np.array(["hip", "knee"])
+    np.savez(tmp_path / "a.npz", time=np.arange(4.0), q=q, u=q[:, :1], joint_names=names)
+    np.savez(tmp_path / "b.npz", time=np.arange(4.0), q=q)
+    np.savez(tmp_path / "c.npz", time=np.arange(4.0), q=q, joint_names=np.array(["hip", "hip"]))
+
+    def position(file: str, joints: list[Any], **entries: Any) -> list[list[float]]:
+        (channels,) = read_channels(tmp_path / file)
+        columns = parse_column_map({"time": "time", "position": "q", "joints": joints, **entries})
+        return build_table(channels, columns).position.tolist()
+
+    swapped = [{"name": "x", "column": "knee"}, {"name": "y", "column": "hip"}]
+    assert position("a.npz", swapped) == q[:, ::-1].tolist()
+    assert position("b.npz", ["x", "y"]) == q.tolist()
+    by_index = [{"name": "x", "column": "typo", "index": 1}, {"name": "y", "index": 0}]
+    assert position("a.npz", by_index) == q[:, ::-1].tolist()
+    for file, joints, entries, words in (
+        ("a.npz", ["x", "y"], {}, "asks for 'x' in 'q', which has none of that name; its columns: hip, knee"),
+        ("a.npz", [{"name": "x", "column": "typo"}, "knee"], {}, "asks for 'typo' in 'q'"),
+        ("a.npz", ["hip", "knee"], {"target": "u"}, "'u' has 1 columns, and the file names 2"),
+        ("b.npz", swapped, {}, "'knee' for joint 'x', but the 2 columns of 'q' have no names; give `index`"),
+        ("c.npz", ["hip", "knee"], {}, "several of that name"),
+    ):
+        with pytest.raises(DatasetError, match=words):
+            position(file, joints, **entries)
+
+
 def test_unknown_files(tmp_path: Path) -> None:
     """A file of no known kind, a missing one, and a folder without a dataset are refused."""
     for path, words in (

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from deal_hw.data.export.lerobot import export_lerobot
 from deal_hw.data.importing import lerobot_source
+from deal_hw.data.importing.columns import parse_column_map
 from deal_hw.data.importing.grid import period_of, to_trajectories
 from deal_hw.data.importing.lerobot_source import read_lerobot
 from deal_hw.data.importing.load import load_tables
@@ -184,6 +185,68 @@ def test_older_layout(tmp_path: Path) -> None:
     assert second.position.tolist() == [[10, 0], [10, 1], [10, 2], [10, 3]]
     assert second.target[:, 1].tolist() == [0.5, 1.5, 2.5, 3.5]
     np.testing.assert_allclose(second.time_s, np.arange(4) / 30, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (None, ()),
+        (["pan", "lift"], ("pan", "lift")),
+        ([["pan", "lift"]], ("pan", "lift")),
+        ({"motors": ["pan", "lift"]}, ("pan", "lift")),
+        ({"motors": [["pan", "lift"]]}, ("pan", "lift")),
+        ({"left": ["pan", "lift"], "right": ["pan"]}, ("left.pan", "left.lift", "right.pan")),
+        ({"lift": 1, "pan": 0}, ("pan", "lift")),
+        (["pan", 7], ("pan", "7")),
+    ],
+)
+def test_names_of_a_feature(names: Any, expected: tuple[str, ...]) -> None:
+    """Every nesting that published datasets have ends as one name a column."""
+    assert lerobot_source._names({"names": names}) == expected
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=9), inner, max_size=4),
+    max_leaves=30,
+)
+
+
+@given(JSON)
+def test_names_of_any_json(names: Any) -> None:
+    """Whatever stands there gives names, or is refused as nested too deep."""
+    try:
+        found = lerobot_source._names({"names": names})
+    except ValueError as err:
+        assert "nested" in str(err)
+    else:
+        assert all(isinstance(name, str) for name in found)
+
+
+def test_arm_that_is_not_in_the_data(tmp_path: Path) -> None:
+    """A map of the right arm on data of the left one is refused, with both lists; it was read by position."""
+    names = [["left_pan.pos", "left_lift.pos"]]
+    features = {
+        name: {"dtype": "float32", "shape": [2], "names": names} for name in ("observation.state", "action")
+    }
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/info.json").write_text(json.dumps({"fps": 30, "features": features}))
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    rows = [[0.1 * i, 1.0] for i in range(4)]
+    columns = {"observation.state": rows, "action": rows, "episode_index": [0] * 4, "frame_index": range(4)}
+    pq.write_table(pa.table(columns), tmp_path / "data/chunk-000/file-000.parquet")
+
+    def table(side: str) -> Table:
+        joints = [{"name": name, "column": f"{side}_{name}"} for name in ("lift", "pan")]
+        entries = {"time": "timestamp", "position": "observation.state", "target": "action"}
+        (found,) = load_tables(tmp_path, parse_column_map({**entries, "joints": joints}))
+        return found
+
+    assert table("left").position[:, 0].tolist() == [1.0] * 4
+    with pytest.raises(
+        DatasetError, match=r"asks for 'right_lift' in 'observation.state'.*left_pan, left_lift"
+    ):
+        table("right")
 
 
 @pytest.mark.parametrize(("limit", "refused"), [(100, True), (300, True), (100_000, False)])

@@ -14,7 +14,7 @@ from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import align
+from deal_hw.sim.recordings.episode import Episode, align, fill_gaps
 from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import Trajectory
 
@@ -98,6 +98,32 @@ def test_episode_shorter_than_one_window_is_refused(recorded: VirtualEpisode) ->
     episode = align(recorded.trajectory, DESCRIPTION)
     with pytest.raises(InsufficientDataError, match=r"no window of 1000 samples \(5\.00 s\)"):
         cut_windows(episode, 1000)
+
+
+def test_short_gaps_are_filled_by_a_spline_and_long_ones_by_lines() -> None:
+    """A sine of 3 Hz at 50 Hz: one lost sample within 3 mrad, where a line is 70 mrad off; 0.2 s by a line.
+
+    A line is off by (omega h)^2 / 2 at a turning point: (18.85 * 0.02)^2 / 2 = 0.07 of the amplitude.
+    """
+    kept = np.delete(np.arange(200), [104, *range(150, 160)])  # 3 Hz * 104 * 0.02 s: a quarter turn past 6.
+    time_s = 0.02 * np.arange(200)
+    motion = np.sin(2 * np.pi * 3.0 * time_s)
+    whole = Episode(
+        step_s=0.02, sample=kept, position=motion[kept, None], velocity=motion[kept, None],
+        target=np.zeros((200, 1)), stiffness=np.ones((200, 1)), damping=np.zeros((200, 1)),
+        effort_limit=np.ones((200, 1)), speed_limit=np.ones((200, 1)), usable=np.ones(len(kept), dtype=bool),
+        start_setpoint=np.zeros(1),
+    )  # fmt: skip
+    filled = fill_gaps(whole)
+    assert filled.reported is not None and np.flatnonzero(~filled.reported).tolist() == [
+        104,
+        *range(150, 160),
+    ]
+    assert abs(filled.position[104, 0] - motion[104]) < 3e-3
+    assert abs((motion[103] + motion[105]) / 2 - motion[104]) > 0.05
+    line = np.linspace(motion[149], motion[160], 12)[1:-1]
+    np.testing.assert_allclose(filled.position[150:160, 0], line, atol=1e-12)
+    assert filled.usable[104] and not filled.usable[150:160].any()
 
 
 def test_command_inside_a_gap_is_placed_by_the_clocks(recorded: VirtualEpisode) -> None:

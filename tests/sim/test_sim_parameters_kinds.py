@@ -233,6 +233,21 @@ def test_a_ball_bounces_higher_with_more_restitution(model: mujoco.MjModel) -> N
     np.testing.assert_allclose(wanted, [0.25, 0.40, 0.63, 0.90], atol=0.006)
 
 
+@pytest.mark.parametrize("speed", [2.0, -3.0])
+def test_damping_grows_with_speed(model: mujoco.MjModel, speed: float) -> None:
+    """Against the motion: 0.2 |v| of the model's own, 0.5 v^2 and 0.1 |v|^3; 3.2 N·m at 2 rad/s."""
+    space = ParameterSpace(
+        [_parameter("dof_dampingpoly_square", "arm", 0.5), _parameter("dof_dampingpoly_cube", "arm", 0.1)]
+    )
+    changed = _single(model, space, space.nominal)
+    data = mujoco.MjData(changed)
+    dof = changed.joint("arm").dofadr[0]
+    data.qvel[dof] = speed
+    mujoco.mj_forward(changed, data)
+    torque = 0.2 * abs(speed) + 0.5 * speed**2 + 0.1 * abs(speed) ** 3
+    assert data.qfrc_damper[dof] == pytest.approx(-np.sign(speed) * torque)
+
+
 def test_creep_falls_in_proportion_to_the_parameter(model: mujoco.MjModel) -> None:
     """The loaded arm that dry friction holds creeps a tenth as fast at a tenth of the value."""
     speeds = []

@@ -31,6 +31,14 @@ def test_pattern_each_gives_one_parameter_an_element_with_the_models_value() -> 
     assert (p.low, p.high) == pytest.approx((0.12, 3.0))
 
 
+def test_dry_friction_is_searched_wider() -> None:
+    """The model's 0.2 within a factor 20, 0.01 to 4; a ratio in the file overrules."""
+    p = _entry("kind: dof_frictionloss, elements: FL_hip_joint")["FL_hip_joint.frictionloss"]
+    assert (p.nominal, p.low, p.high) == pytest.approx((0.2, 0.01, 4.0))
+    p = _entry("kind: dof_frictionloss, elements: FL_hip_joint, ratio: 5")["FL_hip_joint.frictionloss"]
+    assert (p.low, p.high) == pytest.approx((0.04, 1.0))
+
+
 def test_pattern_together_gives_one_parameter_for_all() -> None:
     """Symmetry: one value for the four calves."""
     space = _entry("kind: servo_stiffness, elements: ['F?_calf*', RL_calf_joint, 'R*_calf_joint'], "

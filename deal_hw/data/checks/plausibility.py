@@ -16,7 +16,8 @@ import numpy as np
 from deal_hw.data.checks.joint_match import match
 from deal_hw.data.checks.slip import slip_verdict
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings, find_spikes, sound
+from deal_hw.data.recording.telemetry_checks import Severity, Verdict, spikes_verdict
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
 
@@ -41,25 +42,33 @@ FLAT = 0.1
 """A continuous signal that sits at exactly its extreme for this share of the time is clipped there."""
 
 
-def examine(table: Table, limits: FloatArray | None = None, kept: Table | None = None) -> tuple[Verdict, ...]:
+def examine(
+    table: Table,
+    limits: FloatArray | None = None,
+    kept: Table | None = None,
+    spikes: SpikeSettings = DEFAULT_SPIKES,
+) -> tuple[Verdict, ...]:
     """Run all checks on a recording; the order is fixed.
 
     Where clock or values are unusable the later checks are left out: they would only say the same again.
+    Spikes are told, and the checks after that one look at the recording without them.
 
     Args:
         table: The recording, on its own stamps.
         limits: Lowest and highest position of each joint in the model, (J, 2) [rad or m]; infinite if free.
         kept: The same without what is left out, where slips do no harm.
+        spikes: What counts as a spike.
     """
     first = [_size(table), _finite(table), _clock(table)]
     if any(verdict.severity is Severity.FAIL for verdict in first):
         return tuple(first)
-    sound = np.isfinite(table.position).all(axis=1)
-    clock = table.time_s[sound]
+    clock = table.time_s[np.isfinite(table.position).all(axis=1)]
     rate = _rate(clock)
     if rate.severity is Severity.FAIL:
         return (*first, rate)
-    middle = [rate, _gaps(clock), _frozen(table), _commands(table)]
+    jumps = spikes_verdict(table.time_s, table.position, table.joint_names, table.units, spikes)
+    table = despiked(table, spikes)
+    middle = [rate, _gaps(clock), jumps, _frozen(table), _commands(table)]
     if not table.command_s.size:
         return (*first, *middle)
     return (
@@ -76,6 +85,12 @@ def examine(table: Table, limits: FloatArray | None = None, kept: Table | None =
         _excitation(table),
         *([_quaternion(table)] if table.orientation is not None else []),
     )
+
+
+def despiked(table: Table, settings: SpikeSettings) -> Table:
+    """Return a recording without the samples that jump and come back, see :class:`SpikeSettings`."""
+    found = find_spikes(table.time_s, table.position, table.units, settings)
+    return table.rows(sound(found, table.time_s.size)) if found else table
 
 
 def require(verdicts: Sequence[Verdict], name: str) -> None:
@@ -405,8 +420,9 @@ def _inside_limits(table: Table, limits: FloatArray | None) -> Verdict:
     if not found:
         return _verdict("limits", Severity.OK, "positions lie inside the model's limits")
     text = (
-        f"positions outside the model's limits: {', '.join(found)}; check zero (offset), sign, "
-        "unit and joint order"
+        f"positions outside the model's limits: {', '.join(found)}; check zero (offset), sign, unit and "
+        "joint order; if these are right the model's range is too narrow: widen it, or its stop pushes in "
+        "every prediction"
     )
     return _verdict("limits", Severity.FAIL if severe else Severity.WARN, text)
 

@@ -158,9 +158,9 @@ def _from_arrays(
     width = channels.arrays[array].shape[1]
     own = channels.labels.get(array, ()) or channels.joint_names
     names = [name.removesuffix(".pos") for name in own]
-    by_order = len(names) != width
-    if by_order:
-        if joints is None or len(joints) != width:
+    by_order = not names
+    if len(names) != width:
+        if names or joints is None or len(joints) != width:
             raise _unguessed(channels, f"which joints the {width} columns of {array!r} are")
         names = list(joints)
     found = _rename(channels, names, joints)

@@ -26,6 +26,7 @@ from deal_hw.types import FloatArray
 FLOAT32_STAMP_S = 1e-4
 """Stamps nearer than this to frame_index / fps are the float32 rounding of it."""
 _BATCH_ROWS = 65_536
+_DEEPEST = 8
 _DROPPED = ("index", "task_index", "episode_index", "frame_index")
 
 
@@ -59,7 +60,8 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
     if missing:
         raise DatasetError(f"{path} has no episodes {missing}; it has {len(found)} that were asked for")
     digest = _digest(path, files)
-    labels = {name: _names(feature) for name, feature in info.features.items()}
+    with reading(path / "meta" / "info.json", "the description of a LeRobot dataset"):
+        labels = {name: _names(feature) for name, feature in info.features.items()}
     return [
         Channels(
             path=path,
@@ -174,12 +176,30 @@ def _stamped(arrays: dict[str, FloatArray], fps: float) -> dict[str, FloatArray]
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of a feature's columns; older datasets nest them, as in {motors: [...]}."""
-    names = feature.get("names")
-    if isinstance(names, dict):
-        lists = [value for value in names.values() if isinstance(value, list)]
-        names = lists[0] if len(lists) == 1 else list(names)
-    return tuple(short(str(name)) for name in names) if isinstance(names, list) else ()
+    """Return the names of a feature's columns; () where there are none.
+
+    Published datasets have a list, a list in a list, a mapping of one list ({motors: [...]}) or of several
+    (left and right arm), or of names to indices.
+    """
+    return tuple(short(name) for name in _flat(feature.get("names"), _DEEPEST))
+
+
+def _flat(names: Any, deepest: int) -> list[str]:
+    if deepest == 0:
+        raise ValueError(f"names of a feature are nested {_DEEPEST} deep; they are a list of names")
+    if isinstance(names, list):
+        return [name for part in names for name in _flat(part, deepest - 1)]
+    if not isinstance(names, dict):
+        return [] if names is None else [str(names)]
+    groups = {key: value for key, value in names.items() if isinstance(value, list | dict)}
+    if not groups:
+        whole = all(isinstance(value, int) for value in names.values())
+        return sorted(names, key=lambda key: int(names[key])) if whole else list(names)
+    return [
+        name if len(groups) == 1 else f"{key}.{name}"
+        for key, value in groups.items()
+        for name in _flat(value, deepest - 1)
+    ]
 
 
 def _digest(path: Path, files: list[Path]) -> str:

@@ -21,6 +21,7 @@ from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
 from deal_hw.data.recording.mcap_scan import Found, scan
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder import METADATA_NAME
+from deal_hw.data.recording.spikes import position_units
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
 from deal_hw.types import Trajectory
@@ -153,11 +154,10 @@ def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
     rows = np.array([row for row, _ in known], dtype=np.int64)
     at = np.array([sample for _, sample in known], dtype=np.int64)
     age = np.nan_to_num(trajectory.command_age_s[at]) if at.size else np.empty(0)
-    units = trajectory.metadata.get("description", {}).get("position_units")
     return Table(
         joint_names=trajectory.joint_names,
         actuated=trajectory.actuated,
-        units=tuple(units) if units else ("rad",) * len(trajectory.joint_names),
+        units=position_units(trajectory),
         time_s=trajectory.device_s,
         position=trajectory.position,
         velocity=trajectory.velocity,

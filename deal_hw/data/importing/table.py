@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
-from deal_hw.errors import DatasetError
+from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
 _QUANTITIES = ("pos", "position", "vel", "velocity", "effort", "torque")
@@ -57,6 +59,15 @@ class Table:
     def name(self) -> str:
         """What messages call it."""
         return f"{self.source['file']} {self.source['part']}".strip()
+
+    def rows(self, kept: npt.NDArray[np.bool_]) -> Table:
+        """Return the recording with these samples only, (T,); commands stay."""
+        optional: dict[str, Any] = {
+            name: values[kept]
+            for name in ("velocity", "effort", "orientation", "gyro")
+            if (values := getattr(self, name)) is not None
+        }
+        return dataclasses.replace(self, time_s=self.time_s[kept], position=self.position[kept], **optional)
 
 
 def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | None = None) -> Table:
@@ -173,7 +184,7 @@ def _joint_channel(
     if given is not None or "{joint}" in pattern:
         values = channels.column(pattern.replace("{joint}", joint.column or joint.name))
     else:
-        found = _from_array(channels, pattern, columns, joint, place)
+        found = _from_array(channels, pattern, columns, joint, place, kind)
         if found is None:
             return None
         values = found
@@ -184,9 +195,9 @@ def _joint_channel(
 
 
 def _from_array(
-    channels: Channels, name: str, columns: ColumnMap, joint: JointColumns, place: int
+    channels: Channels, name: str, columns: ColumnMap, joint: JointColumns, place: int, kind: str
 ) -> FloatArray | None:
-    """Return a joint's column: by its index, else by its label, else by its place in the map."""
+    """Return a joint's column: by its index, else by its label, in an array without labels by its place."""
     values = channels.array(name)
     if values.ndim == 1:
         if len(columns.joints) == 1:
@@ -196,12 +207,13 @@ def _from_array(
             "write a pattern with {joint}"
         )
     labels = [_plain(label) for label in channels.labels.get(name, ()) or channels.joint_names]
-    if joint.index is None and len(labels) == values.shape[1]:
-        own = _plain(joint.column or joint.name)
-        if own in labels:
-            return values[:, labels.index(own)]
-        if any(_plain(other.column or other.name) in labels for other in columns.joints):
-            return None  # The labels are those of the map's joints, and this one is not among them.
+    if joint.index is None and labels:
+        return _by_label(channels, name, labels, columns, joint, kind)
+    if joint.index is None and joint.column:
+        raise DatasetError(
+            f"{channels.path}: the column map names {short(joint.column)!r} for joint {joint.name!r}, but "
+            f"the {values.shape[1]} columns of {name!r} have no names; give `index` (from 0) instead"
+        )
     index = place if joint.index is None else joint.index
     if index >= values.shape[1]:
         raise DatasetError(
@@ -209,6 +221,28 @@ def _from_array(
             f"{index}; list the joints in the order of the array, or give each its index"
         )
     return values[:, index]
+
+
+def _by_label(
+    channels: Channels, name: str, labels: Sequence[str], columns: ColumnMap, joint: JointColumns, kind: str
+) -> FloatArray | None:
+    """Return the column of that name; None where only other joints of the map have one, such as a target."""
+    values, own = channels.array(name), _plain(joint.column or joint.name)
+    if len(labels) != values.shape[1]:
+        raise DatasetError(
+            f"{channels.path}: {name!r} has {values.shape[1]} columns, and the file names {len(labels)} "
+            f"({short(', '.join(labels))}); give each joint its `index` (from 0) in the column map"
+        )
+    if labels.count(own) == 1:
+        return values[:, labels.index(own)]
+    asked = [_plain(other.column or other.name) for other in columns.joints if other.index is None]
+    if kind != "position" and own not in labels and any(other in labels for other in asked):
+        return None
+    known = "several" if own in labels else "none"
+    raise DatasetError(
+        f"{channels.path}: the column map asks for {short(own)!r} in {name!r}, which has {known} of that "
+        f"name; its columns: {short(', '.join(labels))}. Name one of them (`column`), or its `index` (from 0)"
+    )
 
 
 def _plain(label: str) -> str:

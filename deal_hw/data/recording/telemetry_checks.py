@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.data.recording.clock_sync import find_jumps
-from deal_hw.types import Status, Trajectory
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings, describe, find_spikes, position_units
+from deal_hw.types import FloatArray, Status, Trajectory
 
 MIN_DURATION_S = 2.0
 MAX_GAP_S = 0.05
@@ -51,8 +52,13 @@ class Verdict:
         return {key: str(value) for key, value in asdict(self).items()}
 
 
-def check(trajectory: Trajectory) -> tuple[Verdict, ...]:
-    """Run all checks on a recording; the order is fixed."""
+def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tuple[Verdict, ...]:
+    """Run all checks on a recording; the order is fixed.
+
+    Args:
+        trajectory: The recording.
+        spikes: What counts as a spike.
+    """
     if trajectory.device_s.size < 2:
         count = trajectory.device_s.size
         return (
@@ -66,11 +72,46 @@ def check(trajectory: Trajectory) -> tuple[Verdict, ...]:
         _lost_frames(trajectory),
         _jitter(trajectory),
         _frozen(trajectory),
+        spikes_verdict(
+            trajectory.device_s,
+            trajectory.position,
+            trajectory.joint_names,
+            position_units(trajectory),
+            spikes,
+        ),
         _commands(trajectory),
         _clamped_by_device(trajectory),
         _clamped_by_us(trajectory),
         _stopped(trajectory),
         _hand_over(trajectory),
+    )
+
+
+def spikes_verdict(
+    time_s: FloatArray,
+    position: FloatArray,
+    joints: Sequence[str],
+    units: Sequence[str],
+    settings: SpikeSettings,
+) -> Verdict:
+    """Say which samples jump away and come back; arguments as of :func:`find_spikes`."""
+    found = find_spikes(time_s, position, units, settings)
+    if not found:
+        return Verdict("spikes", Severity.OK, "no position jumps away and comes back")
+    count = len({row for spike in found for row in spike.rows})
+    text = (
+        f"{count} samples jump and come back, faster than the joint ever moves otherwise: "
+        f"{describe(found, time_s, joints, units)}"
+    )
+    if count > settings.most * time_s.size:
+        return Verdict(
+            "spikes",
+            Severity.FAIL,
+            f"{text}; that is {count / time_s.size:.1%} of all samples: the sensor or its line fails. Mend "
+            "it and record again",
+        )
+    return Verdict(
+        "spikes", Severity.WARN, f"{text}. Calibration leaves them out (--spike-ratio); check sensor and line"
     )
 
 

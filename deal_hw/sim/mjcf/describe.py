@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +14,10 @@ import numpy as np
 
 from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
 from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import actuator_of
-from deal_hw.sim.parameters.fields import element_id
-from deal_hw.sim.parameters.kind import HINGE, SLIDE
+from deal_hw.sim.parameters.fields import element_id, element_names
+from deal_hw.sim.parameters.kind import HINGE, SLIDE, joint_of
 
 WINDOW_TICKS = 20
 """Control periods in the longest window of a search: it is what ``--window`` divides into."""
@@ -125,6 +127,24 @@ def describe(
             "control_rate_hz": "unit of window lengths: the sampling rate over a whole number",
         },
     )
+
+
+def with_speed_limits(description: RobotDescription, model: Any, space: ParameterSpace) -> RobotDescription:
+    """Return the description with a speed limit of the set-point where a parameter says one.
+
+    An MJCF has none, so it is the parameter's nominal value that the servo counts as told; members scale it.
+
+    Args:
+        description: Of a model's robot.
+        model: The MjModel.
+        space: The parameters.
+    """
+    limits = list(description.speed_limit)
+    for p in space.parameters:
+        for name in p.elements if p.kind == "servo_speed_limit" else ():
+            joint = joint_of(model, element_id(model, "actuator", name))
+            limits[description.actuated.index(element_names(model, "joint")[joint])] = p.nominal
+    return dataclasses.replace(description, speed_limit=tuple(limits))
 
 
 def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.sim.parameters.fields import Array, Fields, element_id
-from deal_hw.sim.parameters.kind import Kind, one_dof_joint
+from deal_hw.sim.parameters.kind import FRICTION_RATIO, Kind, one_dof_joint
 
 
 def _set(fields: Fields, field: str, index: int, values: Array) -> None:
@@ -34,6 +34,22 @@ def dof_armature(fields: Fields, elements: Sequence[str], values: Array) -> None
 def dof_damping(fields: Fields, elements: Sequence[str], values: Array) -> None:
     """Set viscous damping [N·m·s/rad or N·s/m]."""
     _set_dof(fields, "dof_damping", elements, values)
+
+
+def dof_dampingpoly_square(fields: Fields, elements: Sequence[str], values: Array) -> None:
+    """Set the damping that grows with speed [N·m·s²/rad² or N·s²/m²]: torque against the motion c v²."""
+    _set_poly(fields, elements, values, 0)
+
+
+def dof_dampingpoly_cube(fields: Fields, elements: Sequence[str], values: Array) -> None:
+    """Set the damping that grows with the square of speed [N·m·s³/rad³ or N·s³/m³]: torque c |v|³."""
+    _set_poly(fields, elements, values, 1)
+
+
+def _set_poly(fields: Fields, elements: Sequence[str], values: Array, power: int) -> None:
+    poly = fields.get("dof_dampingpoly")
+    for name in elements:
+        poly[:, fields.model.jnt_dofadr[element_id(fields.model, "joint", name)], power] = values
 
 
 def dof_frictionloss(fields: Fields, elements: Sequence[str], values: Array) -> None:
@@ -74,6 +90,10 @@ def _dof_value(model: Any, field: str, joint: int) -> float:
     return float(np.ravel(getattr(model, field)[model.jnt_dofadr[joint]])[0])
 
 
+def _damping_poly(model: Any, joint: int, power: int) -> float:
+    return float(model.dof_dampingpoly[model.jnt_dofadr[joint], power])
+
+
 JOINT_KINDS = (
     Kind(
         name="dof_armature", element="joint", quantity="armature", unit="kg·m²", unit_slide="kg",
@@ -86,9 +106,22 @@ JOINT_KINDS = (
         baseline=lambda m, i: _dof_value(m, "dof_damping", i), usable=one_dof_joint,
     ),
     Kind(
+        name="dof_dampingpoly_square", element="joint", quantity="damping_square", unit="N·m·s²/rad²",
+        unit_slide="N·s²/m²", writes=("dof_dampingpoly",), along="nothing; dof_damping stays",
+        apply=dof_dampingpoly_square, baseline=lambda m, i: _damping_poly(m, i, 0), usable=one_dof_joint,
+        scale="linear", spread=0.5, least=float("-inf"),
+    ),
+    Kind(
+        name="dof_dampingpoly_cube", element="joint", quantity="damping_cube", unit="N·m·s³/rad³",
+        unit_slide="N·s³/m³", writes=("dof_dampingpoly",), along="nothing; dof_damping stays",
+        apply=dof_dampingpoly_cube, baseline=lambda m, i: _damping_poly(m, i, 1), usable=one_dof_joint,
+        scale="linear", spread=0.2, least=float("-inf"),
+    ),
+    Kind(
         name="dof_frictionloss", element="joint", quantity="frictionloss", unit="N·m", unit_slide="N",
         writes=("dof_frictionloss",), along="nothing", apply=dof_frictionloss,
         baseline=lambda m, i: _dof_value(m, "dof_frictionloss", i), usable=one_dof_joint,
+        ratio=FRICTION_RATIO,
     ),
     Kind(
         name="dof_friction_creep", element="joint", quantity="friction_creep", unit="-",

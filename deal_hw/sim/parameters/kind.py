@@ -15,6 +15,11 @@ from deal_hw.sim.parameters.fields import Array, Fields
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
+RATIO = 5.0
+"""What a published model is usually right to: a factor to either side."""
+FRICTION_RATIO = 20.0
+"""The same of dry friction, which few models have measured: a real SO-101 has 8 to 9 times the model's."""
+
 Apply = Callable[[Fields, Sequence[str], Array], None]
 Element = Literal["body", "joint", "geom", "actuator", "tendon"]
 
@@ -36,6 +41,7 @@ class Kind:
         baseline: Value that a model has for an element; None: it has none, so params.yaml must say.
         usable: Raises where the element cannot have this parameter.
         scale: Usual scale.
+        ratio: Usual half width of the range on a log scale: a factor to either side.
         spread: Usual half width of the range on a linear scale, in the unit.
         least: No value may lie below.
         most: No value may lie above.
@@ -54,6 +60,7 @@ class Kind:
     unit_slide: str = ""
     usable: Callable[[Any, int, str], None] | None = None
     scale: Scale = "log"
+    ratio: float = RATIO
     spread: float = 0.0
     least: float = 0.0
     most: float = float("inf")

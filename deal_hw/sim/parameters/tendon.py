@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deal_hw.sim.parameters.fields import Array, Fields, element_id
-from deal_hw.sim.parameters.kind import Kind
+from deal_hw.sim.parameters.kind import FRICTION_RATIO, Kind
 
 
 def _set(fields: Fields, field: str, elements: Sequence[str], values: Array) -> None:
@@ -35,7 +35,7 @@ TENDON_KINDS = (
     Kind(
         name="tendon_frictionloss", element="tendon", quantity="frictionloss", unit="N",
         writes=("tendon_frictionloss",), along="nothing", apply=tendon_frictionloss,
-        baseline=lambda m, i: float(m.tendon_frictionloss[i]),
+        baseline=lambda m, i: float(m.tendon_frictionloss[i]), ratio=FRICTION_RATIO,
     ),
     Kind(
         name="tendon_damping", element="tendon", quantity="damping", unit="N·s/m",

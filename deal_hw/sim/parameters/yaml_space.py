@@ -22,9 +22,6 @@ from deal_hw.sim.parameters import check_space, find_kind
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import Kind
 
-RATIO: Final = 5.0
-"""Half width of a log range that the file does not give: a factor to either side of the nominal value."""
-
 _KEYS: Final = (
     "kind", "elements", "group", "name", "nominal", "range", "ratio", "scale", "known", "weighed", "prior",
 )  # fmt: skip
@@ -208,7 +205,7 @@ def _range(
     if "ratio" not in entry and scale == "linear":
         width = kind.spread or abs(nominal) or 1.0
         return max(nominal - width, kind.least), min(nominal + width, kind.most)
-    ratio = _number(entry.get("ratio", RATIO), f"ratio of {name!r}")
+    ratio = _number(entry.get("ratio", kind.ratio), f"ratio of {name!r}")
     if not ratio > 1:
         raise ConfigurationError(f"parameter {name!r}: `ratio` must be above 1, got {ratio:g}")
     if nominal <= 0:

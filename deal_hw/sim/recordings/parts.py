@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.sim.recordings.episode import SENT, Episode
 
-LEAD_S = 0.1
+LEAD_S = LONGEST_LATENCY_S
 """Commands kept before a part's first sample: as long as any latency reaches back [s]."""
 
 

@@ -16,7 +16,8 @@ from deal_hw.sim.engine.servo import delay, slew
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, IntArray
 
-SETPOINT_MARGIN_S = 0.15
+SENT_MARGIN_S = 0.05
+"""Windows keep at least so clear of a change of gains or limits [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,9 @@ class Windows:
         return np.asarray(self.start[:, None] + 1 + np.arange(self.length))
 
 
-def cut_windows(episode: Episode, length: int, hop: int | None = None, first: int = 0) -> Windows:
+def cut_windows(
+    episode: Episode, length: int, hop: int | None = None, first: int = 0, latest_s: float = 0.0
+) -> Windows:
     """Cut an episode into windows in which every sample is usable and what is sent stays the same.
 
     Args:
@@ -49,6 +52,7 @@ def cut_windows(episode: Episode, length: int, hop: int | None = None, first: in
         length: Samples a window predicts, H.
         hop: Samples from one window's start to the next's; H by default, so that no sample is used twice.
         first: First sample that may start a window.
+        latest_s: The longest latency that is simulated [s]: so long a change of what is sent may still act.
 
     Returns:
         The windows; a window never straddles a gap, a lost frame or a change of gains or effort limit.
@@ -66,8 +70,7 @@ def cut_windows(episode: Episode, length: int, hop: int | None = None, first: in
         span = slice(at, at + length + 1)
         step = episode.sample[span]
         whole = bool(episode.usable[span].all()) and bool((np.diff(step) == stride).all())
-        # A change of what is sent acts up to one latency later, so keep clear of it by a margin.
-        late = max(int(step[0]) - round(SETPOINT_MARGIN_S / 3 / episode.step_s), 0)
+        late = max(int(step[0]) - round(max(latest_s, SENT_MARGIN_S) / episode.step_s), 0)
         constant = changed[late] == changed[min(int(step[-1]), last_step)]
         if whole and constant:
             starts.append(at)
