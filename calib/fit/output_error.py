@@ -38,6 +38,7 @@ class Recipe:
         steps: Steps between two measurements of the residual.
         converged: A round of steps that lowers the cost by a smaller share is the last: held-out motion does
             not see it.
+        reach: See :class:`deal_hw.calib.fit.solver.SolverSettings`.
         longest_lag_s: Correlation of residuals is looked for up to here [s].
     """
 
@@ -45,9 +46,10 @@ class Recipe:
     latency: bool = True
     prior_std: float = 0.289
     robust: bool = False
-    iterations: int = 20
-    steps: int = 2
+    iterations: int = 24
+    steps: int = 6
     converged: float = 2e-3
+    reach: float = 30.0
     longest_lag_s: float = 1.0
 
 
@@ -121,7 +123,10 @@ def fit_horizon(
         # Residuals are measured anew every few steps: nobody has said how good the model is.
         weighed, _ = _weighed(plain, point, recipe)
         before = weighed.costs([point])[0]
-        solver = SolverSettings(iterations=min(recipe.steps, left), converged=recipe.converged)
+        # The parameters' prior holds what is not seen; residuals that hang together weigh too little for another.
+        solver = SolverSettings(
+            iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
+        )
         point, normal, more = solve(weighed, point, solver, fixed_latency=fixed)
         left, used = left - max(more, 1), used + more
         if not before - normal.cost > recipe.converged * before:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.contacts import damped_step
+from deal_hw.calib.fit.local import local_fit
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, fit_horizon
-from deal_hw.calib.fit.refinement import Polished, damped_step, polish
-from deal_hw.calib.pipeline import local_fit
+from deal_hw.calib.fit.refinement import Polished, polish
 from deal_hw.calib.validation.checks import latency_alarms
 from deal_hw.errors import ConfigurationError
 
