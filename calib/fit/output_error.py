@@ -123,7 +123,7 @@ def fit_horizon(
         # Residuals are measured anew every few steps: nobody has said how good the model is.
         weighed, _ = _weighed(plain, point, recipe)
         before = weighed.costs([point])[0]
-        # The parameters' prior holds what is not seen; residuals that hang together weigh too little for another.
+        # The prior holds what is not seen; residuals that hang together weigh too little for another hold.
         solver = SolverSettings(
             iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
         )
