@@ -146,13 +146,40 @@ class Armed:
 
 
 def test_a_robot_that_hears_is_passive_at_the_first_attempt() -> None:
-    """One command, at once, and nobody is told of any trouble; a state of 5 ms later confirms it."""
+    """At once, and nobody is told of any trouble; states of every 5 ms confirm three commands in a row."""
     armed = Armed()
     assert armed.make_passive()
     assert armed.motor_off()
-    assert armed.stops() == [0]
+    assert armed.stops() == [0, 5 * MS, 10 * MS]
     assert armed.told == []
     assert armed.passed_s < 0.05
+
+
+@pytest.mark.parametrize("wanted", [1, 3])
+def test_one_state_that_looks_passive_is_no_proof(wanted: int) -> None:
+    """A stiff robot without load looks damped as the link returns, before it heard a command: told again."""
+    armed = Armed()
+    state = armed.robot.read_state(1.0)
+    shown = iter([Status(0), Status(0), Status.ARMED, Status(0), Status(0), Status(0), Status(0)])
+
+    def read_state(timeout_s: float) -> RobotState:
+        if not timeout_s:
+            raise TransportTimeoutError("nothing waits")
+        armed.clock.advance_ns(50 * MS)
+        return dataclasses.replace(state, status=next(shown))
+
+    armed.robot.read_state = read_state  # type: ignore[method-assign]
+    assert armed.make_passive(confirmations=wanted)
+    # Two of the first three commands were shown by chance; three in a row are wanted.
+    assert armed.stops() == [n * 50 * MS for n in range(1 if wanted == 1 else 6)]
+    assert len(armed.told) == (0 if wanted == 1 else 1)
+
+
+@pytest.mark.parametrize("count", [0, -1, 101])
+def test_a_count_of_confirmations_that_cannot_be_is_refused(count: int) -> None:
+    """The message says what is allowed."""
+    with pytest.raises(ConfigurationError, match=f"confirmations is {count}; allowed: 1 to 100"):
+        PassiveConfig(confirmations=count)
 
 
 @pytest.mark.parametrize("down_s", [0.1, 0.5, 1.5, 3.0, 25.0])
@@ -337,7 +364,10 @@ def test_a_driver_that_fails_in_every_way_is_survived() -> None:
 
 def test_the_defaults_are_as_documented() -> None:
     """docs/safety.md names them."""
-    assert PassiveConfig() == PassiveConfig(timeout_s=30.0, confirm_s=0.05, reopen_s=0.5, silent_s=3.0)
+    assert PassiveConfig() == PassiveConfig(
+        timeout_s=30.0, confirm_s=0.05, confirmations=3, reopen_s=0.5, silent_s=3.0
+    )
+    assert PassiveConfig(confirmations=1) and PassiveConfig(confirmations=100)
 
 
 @pytest.mark.parametrize("name", ["timeout_s", "confirm_s", "reopen_s", "silent_s"])

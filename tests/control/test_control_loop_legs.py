@@ -260,8 +260,9 @@ def test_a_trip_damps_at_once_and_repeats_nothing(stood: Stood) -> None:
     assert report.passive_confirmed
     after = [(stamp - rig.tripped_ns, kind) for stamp, kind, _ in rig.commands if stamp >= rig.tripped_ns]
     # The last repeat as the cycle begins; then three copies each of the trip's own damping and of the first
-    # attempt to have it confirmed.
-    assert after == [(0, STIFF), *[(0, DAMPING)] * 6]
+    # attempt to have it confirmed; then the two attempts that show it is no chance.
+    assert after[:7] == [(0, STIFF), *[(0, DAMPING)] * 6]
+    assert [kind for _, kind in after[7:]] == [DAMPING] * 6 and after[-1][0] < 50_000_000
     assert rig.records[-2].sent is None
     # Nobody hands a robot back after a trip: somebody should look at it first.
     assert rig.device.sport_name == ""
