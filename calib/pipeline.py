@@ -126,7 +126,8 @@ class Calibration(CalibrationMethod[Problem]):
                 problem, without_search(problem, budget, local), local, self.settings, progress
             )
         else:
-            if local is not None:
+            if local is not None and progress is not None:
+                local = with_rows(local)
                 foretell(problem, local, progress)
             attempts = Attempts(self.search, rng, checkpoint)
             found = self.fitted(problem, budget, rng, attempts, local, progress)
@@ -300,18 +301,16 @@ def offer(
         progress(Progress(stage, 1, 1, estimate=theta, latency_s=latency_s, values={"chi2": chi2}))
 
 
-def foretell(problem: Problem, local: Polished, progress: ProgressCallback | None) -> None:
+def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> None:
     """Say before the search what the recordings cannot tell, by their Fisher information at the local fit.
 
     Args:
         problem: Recordings and simulator.
-        local: The local fit.
+        local: The local fit, with linearised residuals.
         progress: Who is told.
     """
-    if progress is None:
-        return
     # What the model does not explain says nothing of what the motion shows: noise alone counts.
-    noise_only = dataclasses.replace(with_rows(local), chi2=1.0)
+    noise_only = dataclasses.replace(local, chi2=1.0)
     known = statement(problem, noise_only, fixed_latency=problem.fixed_latency_s is not None)
     blind = [n for n, v in zip(problem.space.names, known.verdicts, strict=True) if v == "not identifiable"]
     words = list(known.null_directions)

@@ -140,11 +140,9 @@ class Shooting:
         """Whether feet that stick and slip kink what start states change."""
         return self.problem.robot.base is not None and not self.given
 
-    def on(self, data: Sequence[WindowData], length: int | None = None) -> Shooting:
+    def on(self, data: Sequence[WindowData]) -> Shooting:
         """Return the same fit of other windows, such as a part of these, or weighed ones."""
-        return Shooting(
-            self.problem, length or self.length, data=data, given=self.given, prior_share=self.prior_share
-        )
+        return Shooting(self.problem, self.length, data=data, given=self.given, prior_share=self.prior_share)
 
     def start(self, theta: FloatArray, latency_s: float, states: States | None = None) -> Point:
         """Return the point at parameters (K,) and latency.

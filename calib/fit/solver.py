@@ -6,6 +6,7 @@ Where windows' start states are unknowns they follow the parameters (variable pr
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -127,17 +128,19 @@ def solve(
         Where it ended, the normal equations there, and the derivatives that were computed.
     """
     bounds, used, before = value_bounds(shooting.problem), 0, np.inf
+    normal: Normal | None = None
     # Next to a kink steps shrink to nothing. A new trust region around start states that have settled since
     # leads on, or shows that this is the end.
-    while used < settings.iterations:
-        fit = _Following(shooting, point)
+    while True:
+        fit = _Following(shooting, point, normal)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
         point, normal = settled(shooting, fit.at(value), fit.normal_at(value), 1)
         used += max(more, 1)
-        if not normal.cost < before * (1 - settings.gain):
+        if used >= settings.iterations or not normal.cost < before * (1 - settings.gain):
             break
         before = normal.cost
-    return point, normal, used
+    # The rows are large and one-sided: who says what is known takes central differences at the end.
+    return point, dataclasses.replace(normal, rows=()), used
 
 
 def settled(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
@@ -153,7 +156,7 @@ def settled(shooting: Shooting, point: Point, normal: Normal, iterations: int) -
         moved = shooting.followed(point, normal, np.zeros_like(point.value))
         if not shooting.costs([moved])[0] < normal.cost * (1 - SETTLED):
             break
-        point, normal = moved, shooting.normal(moved)
+        point, normal = moved, shooting.normal(moved, keep=bool(normal.rows))
     return point, normal
 
 
@@ -163,12 +166,13 @@ class _Following:
     Args:
         shooting: The windows.
         point: Where to start.
+        normal: Normal equations there with their rows, where they are known.
     """
 
-    def __init__(self, shooting: Shooting, point: Point) -> None:
-        self._shooting, self._here = shooting, point
-        self._normal: Normal | None = None
+    def __init__(self, shooting: Shooting, point: Point, normal: Normal | None) -> None:
+        self._shooting, self._here, self._normal = shooting, point, normal
         self._last = point
+        self._vector: tuple[Point, FloatArray] | None = None
 
     def at(self, value: FloatArray) -> Point:
         """Return the point at parameters and latency, (K + 1,)."""
@@ -181,7 +185,11 @@ class _Following:
 
     def residual(self, value: FloatArray) -> FloatArray:
         """See :class:`LeastSquares`."""
-        return self._shooting.vector(self.at(value))
+        point = self.at(value)
+        # The start is asked for twice, here and by the library.
+        if self._vector is None or self._vector[0] is not point:
+            self._vector = point, self._shooting.vector(point)
+        return self._vector[1]
 
     def jacobian(self, value: FloatArray) -> FloatArray:
         """See :class:`LeastSquares`."""

@@ -87,12 +87,11 @@ def test_too_few_windows_are_not_halved(case: Case, problem: Problem, polished: 
     assert halves_rows({"halves": halves.to_json()}) == ()
 
 
-@pytest.mark.parametrize(("profile", "seed"), [("ideal", 0), ("sensor", 1), ("sensor", 2)])
+@pytest.mark.parametrize(("profile", "seed"), [("ideal", 0), ("sensor", 0), ("sensor", 2)])
 def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed: int) -> None:
     """Two exact null directions are named, nearly all parameters have no value, their intervals the range.
 
-    Without noise, too, where the truncation of a one-sided difference would look like information. On sensor
-    seed 0 kinks give the second direction about as much information as the range does (0.6 to 5 times 1.2).
+    Without noise, too, where the truncation of a one-sided difference would look like information.
     """
     case = make_case("cartpole", profile, seed, 5.0)
     space = parameter_space().with_ratio(5.0)
