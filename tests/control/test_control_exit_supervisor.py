@@ -21,6 +21,7 @@ from deal_hw.control.handover import Beat
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
 
+GRACE_S = module._GRACE_S
 CHILD = """
 import json, os, signal, socket, struct, sys, time
 
@@ -86,7 +87,12 @@ class Run:
 
 @pytest.fixture(autouse=True)
 def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The control process's module."""
+    """The control process's module, which has minutes to end after its last word.
+
+    It has an ordinary priority, and closing its channel wakes up a supervisor that has a higher one, in the
+    middle of its end: on a busy machine it may get the processor back after more than the 3 s of a real run.
+    """
+    monkeypatch.setattr(module, "_GRACE_S", 300.0)
     (tmp_path / "deal_hw_obedient_child.py").write_text(CHILD)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
@@ -367,20 +373,23 @@ def test_a_process_that_never_beats_has_thirty_seconds() -> None:
 
 @pytest.fixture
 def limits(monkeypatch: pytest.MonkeyPatch) -> list[float | None]:
-    """For how long the end of a process was waited for [s]; None without a limit."""
+    """For how long the end of a process may be waited for [s]; None without a limit. None strikes."""
     found: list[float | None] = []
     true_wait = subprocess.Popen.wait
 
     def wait(child: subprocess.Popen[bytes], timeout: float | None = None) -> int:
         found.append(timeout)
-        return true_wait(child, timeout)
+        return true_wait(child)
 
     monkeypatch.setattr(subprocess.Popen, "wait", wait)
     return found
 
 
-def test_a_process_has_three_seconds_to_end_after_its_last_word(limits: list[float | None]) -> None:
+def test_a_process_has_three_seconds_to_end_after_its_last_word(
+    limits: list[float | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It still has its files to close."""
+    monkeypatch.setattr(module, "_GRACE_S", GRACE_S)
     assert Run("result(passive_confirmed=True)").end().exit_code == 0
     assert limits == [3.0]
 

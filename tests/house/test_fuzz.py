@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -83,3 +84,33 @@ def test_failures_are_counted(
     found = run(kind, 2, 0, limit_s=0.5, limit_bytes=40 << 20)
     (failure,) = [what for what in found if what.startswith("FAILED")]
     assert words in failure and found[failure] == 2 and found["read"] == found["refused"] == 0
+
+
+class Garbage:
+    """Memory that only the collector frees."""
+
+    def __init__(self) -> None:
+        self.itself = self
+        self.memory = bytearray(b"x" * (120 << 20))
+
+
+def collect_and_grow(data: bytes) -> None:
+    gc.collect()
+    grow(data)
+
+
+def test_garbage_of_the_parent_hides_no_growth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests that ran before left garbage: memory that an input takes counts, whatever is freed meanwhile."""
+    monkeypatch.syspath_prepend(str(TOOL.parent))
+    from fuzz.kind import WireKind
+    from fuzz.mutations import damage_bytes
+    from fuzz.run import run
+
+    kind = WireKind(make=lambda: [b"good"], read=collect_and_grow, mutations=(damage_bytes,))
+    gc.disable()
+    try:
+        Garbage()
+        assert run(kind, 1, 0, limit_s=5.0, limit_bytes=40 << 20)["FAILED: more than 40 MiB of memory"] == 1
+    finally:
+        gc.enable()
+        gc.collect()

@@ -1,0 +1,77 @@
+"""Every refusal has its line in a table, so that none disappears or changes its words unnoticed."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+import refusals
+
+from deal_hw import errors
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = """
+class OwnError(ConfigurationError):
+    pass
+
+def refuse(value):
+    if value:
+        raise OwnError(f"{value} is "
+                       "too large")
+    found = UnknownNameError("verb", value, VERBS)
+    raise found
+
+class Reader:
+    def read(self):
+        raise (ValueError("a\\n  b") if self else self._lost(1, why="x"))
+"""
+
+
+def test_the_table_is_that_of_the_sources() -> None:
+    """A refusal that is new, gone or worded otherwise shows as a line of a diff."""
+    kept = (ROOT / refusals.TABLE).read_text(encoding="utf-8")
+    diff = difflib.unified_diff(
+        kept.splitlines(),
+        refusals.table(refusals.refusals()).splitlines(),
+        "kept",
+        "sources",
+        lineterm="",
+        n=1,
+    )
+    assert not (lines := list(diff)), "\n".join(
+        [*lines, "", "If that is meant: python tools/refusals.py --write"]
+    )
+
+
+def test_all_kinds_of_refusal_are_found(tmp_path: Path) -> None:
+    """Raised, kept in a variable, of a class below ours, chosen by an `if`, made by a helper."""
+    for folder in refusals.FOLDERS:
+        (tmp_path / folder).mkdir()
+    (tmp_path / refusals.ERRORS).write_text((ROOT / refusals.ERRORS).read_text(encoding="utf-8"))
+    (tmp_path / "calib" / "module.py").write_text(SOURCE)
+    (tmp_path / "calib" / "__init__.py").write_text("")
+    found = [one.text().strip() for one in refusals.refusals(tmp_path) if one.path == "calib/module.py"]
+    assert found == [
+        "Reader.read  ValueError -  a b",
+        "Reader.read  _lost 2  {1} | why=x",
+        "refuse  OwnError 2  {value} is too large",
+        "refuse  UnknownNameError 2  verb | {value} | {VERBS}",
+    ]
+
+
+def test_every_class_of_the_error_tree_is_known() -> None:
+    """The tool reads the tree from the sources; it must be the tree that Python has."""
+    defined = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and issubclass(value, errors.DealHwError)
+    }
+    assert defined <= refusals.error_classes()
+
+
+def test_a_line_that_no_test_ran_is_listed(tmp_path: Path) -> None:
+    """The report of coverage says which lines ran; of a call any of its lines counts."""
+    first, second = refusals.refusals()[:2]
+    report = tmp_path / "coverage.json"
+    report.write_text(f'{{"files": {{"{first.path}": {{"executed_lines": [{first.last_line}]}}}}}}')
+    assert refusals.unreached([first, second], report) == [second]

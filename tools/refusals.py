@@ -1,0 +1,214 @@
+"""List every refusal of the product: where an error is made, of which type, with which words.
+
+    python tools/refusals.py                        # print the table
+    python tools/refusals.py --write                # rewrite tests/house/refusals.txt
+    python tools/refusals.py --unreached COV.json   # those that no test ran, by a report of `coverage json`
+
+A refusal is a call that makes an error: of a class of deal_hw/errors.py or of a class below one of these; of
+`deal_hw.schema.refusal`; or any call that stands directly behind `raise`, helpers that make the error among
+them. `raise error` and a bare `raise` hand on what was made elsewhere. The sources are read by their syntax
+tree; nothing of the product is imported.
+
+A line of the table is function, type, exit code of `deal-hw` and the words, with `{...}` where a value comes
+in and ` | ` between several arguments. Exit code "-": no error of deal-hw. A reader puts the words into its
+own message, or a programmer made the mistake and gets a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import builtins
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("deal_hw", "drivers", "policies", "calib")
+TABLE = Path("tests/house/refusals.txt")
+ERRORS = Path("deal_hw/errors.py")
+HEAD = """\
+# Every refusal of the product: function, type, exit code of the command ("-": see tools/refusals.py), words.
+# After a change that is meant: python tools/refusals.py --write
+"""
+EXIT_ERROR = "2"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class Refusal:
+    """A call that makes an error.
+
+    Attributes:
+        path: The source, relative to the checkout.
+        function: Where in it, as ``Class.method``; "" at module level.
+        kind: What is called: an error's class or a helper.
+        words: Its arguments.
+        exit_code: What `deal-hw` ends with where nothing catches the error; "-" for none of its own.
+        line: First line of the call.
+        column: Column of the call.
+        last_line: Its last line.
+    """
+
+    path: str
+    function: str
+    kind: str
+    words: str
+    exit_code: str
+    line: int
+    column: int
+    last_line: int
+
+    def text(self) -> str:
+        """Return the line of the table."""
+        return f"    {self.function or '(module)'}  {self.kind} {self.exit_code}  {self.words}".rstrip()
+
+
+def error_classes(root: Path = ROOT) -> frozenset[str]:
+    """Return the names of the classes of the error tree, those outside of errors.py among them."""
+    bases: dict[str, set[str]] = {}
+    for path in _sources(root):
+        for node in ast.walk(_parsed(path)):
+            if isinstance(node, ast.ClassDef):
+                bases.setdefault(node.name, set()).update(map(_last_name, node.bases))
+    known = {"DealHwError"}
+    while more := {name for name, above in bases.items() if above & known} - known:
+        known |= more
+    return frozenset(known)
+
+
+def refusals(root: Path = ROOT) -> list[Refusal]:
+    """Return all refusals of a checkout, in the table's order."""
+    known = error_classes(root)
+    return sorted(found for path in _sources(root) for found in of_file(path, root, known))
+
+
+def of_file(path: Path, root: Path, known: frozenset[str]) -> Iterator[Refusal]:
+    """Yield the refusals of one source."""
+    relative = path.relative_to(root)
+    tree = _parsed(path)
+    for call, function in calls(tree, known, relative == ERRORS):
+        kind = _last_name(call.func)
+        yield Refusal(
+            path=relative.as_posix(),
+            function=function,
+            kind=function.split(".")[0] if kind == "__init__" else kind,
+            words=" | ".join(_arguments(call)),
+            exit_code=EXIT_ERROR if _ends_the_command(kind, known) else "-",
+            line=call.lineno,
+            column=call.col_offset,
+            last_line=call.end_lineno or call.lineno,
+        )
+
+
+def calls(tree: ast.Module, known: frozenset[str], defines: bool) -> Iterator[tuple[ast.Call, str]]:
+    """Yield each call that makes an error, and the name of the function that it stands in.
+
+    Args:
+        tree: A module.
+        known: Names of error classes.
+        defines: It is errors.py, where a class hands its words to the one above.
+    """
+
+    def walk(node: ast.AST, function: str, raised: bool) -> Iterator[tuple[ast.Call, str]]:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            function = f"{function}.{node.name}".lstrip(".")
+        if isinstance(node, ast.Call):
+            name = _last_name(node.func)
+            if raised or name in known or name == "refusal" or (defines and name == "__init__"):
+                yield node, function
+        chosen: list[ast.AST | None] = []
+        if isinstance(node, ast.Raise):
+            chosen = [node.exc]
+        elif raised and isinstance(node, ast.IfExp):
+            chosen = [node.body, node.orelse]
+        elif raised and isinstance(node, ast.BoolOp):
+            chosen = [*node.values]
+        for child in ast.iter_child_nodes(node):
+            yield from walk(child, function, child in chosen)
+
+    yield from walk(tree, "", False)
+
+
+def table(found: list[Refusal]) -> str:
+    """Return the table as text."""
+    lines, path = [HEAD.rstrip("\n")], ""
+    for refusal in found:
+        if refusal.path != path:
+            path = refusal.path
+            lines.append(path)
+        lines.append(refusal.text())
+    return "\n".join(lines) + "\n"
+
+
+def unreached(found: list[Refusal], coverage: Path) -> list[Refusal]:
+    """Return the refusals of which no line was run, by a report of ``coverage json``."""
+    files = json.loads(coverage.read_text(encoding="utf-8"))["files"]
+    ran = {path: set(file["executed_lines"]) for path, file in files.items()}
+    return [one for one in found if not ran.get(one.path, set()) & set(range(one.line, one.last_line + 1))]
+
+
+def _ends_the_command(kind: str, known: frozenset[str]) -> bool:
+    outside = getattr(builtins, kind, None)
+    if isinstance(outside, type):
+        # What the system refuses is told in one line, too.
+        return issubclass(outside, OSError)
+    # Helpers behind `raise`, and classes in variables, make errors of the tree.
+    return kind in known or not kind[:1].isupper()
+
+
+def _sources(root: Path) -> Iterator[Path]:
+    for folder in FOLDERS:
+        yield from sorted((root / folder).rglob("*.py"))
+
+
+def _parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def _last_name(node: ast.AST) -> str:
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ast.unparse(node)
+
+
+def _arguments(call: ast.Call) -> Iterator[str]:
+    for argument in call.args:
+        yield _words(argument)
+    for keyword in call.keywords:
+        yield f"{keyword.arg}={_words(keyword.value)}"
+
+
+def _words(node: ast.AST) -> str:
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return " ".join(f"x{node.value}x".split())[1:-1]
+    if isinstance(node, ast.JoinedStr):
+        return "".join(_words(part) for part in node.values)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return _words(node.left) + _words(node.right)
+    value = node.value if isinstance(node, ast.FormattedValue) else node
+    return "{" + " ".join(ast.unparse(value).split()) + "}"
+
+
+def main() -> int:
+    """Print or write the table, or the refusals that no test reaches."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--root", type=Path, default=ROOT, help="the checkout")
+    parser.add_argument("--write", action="store_true", help=f"write {TABLE}")
+    parser.add_argument("--unreached", type=Path, metavar="COV.json", help="a report of `coverage json`")
+    given = parser.parse_args()
+    found = refusals(given.root)
+    if given.unreached is not None:
+        left = unreached(found, given.unreached)
+        sys.stdout.write(table(left))
+        print(f"# {len(left)} of {len(found)} refusals: not reached by the tests that were measured")
+    elif given.write:
+        (given.root / TABLE).write_text(table(found), encoding="utf-8")
+    else:
+        sys.stdout.write(table(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
