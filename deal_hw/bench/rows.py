@@ -50,7 +50,7 @@ def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], No
     def key(row: Row) -> tuple[Any, ...]:
         return tuple(row.get(name, "") for name in cells.names)
 
-    done = {key(row) for row in rows if not row["error"]}
+    done = {key(row) for row in rows if not row["error"] and not row.get("skipped")}
     for number, (cell, run) in enumerate(cells.runs, start=1):
         if cell in done:
             continue

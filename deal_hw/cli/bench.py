@@ -26,14 +26,15 @@ class Bench:
     """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
 
     bench: tyro.conf.Positional[
-        Literal["loop", "honest", "mismatch", "paper", "real", "verdict", "go2-codec"]
+        Literal["loop", "honest", "mismatch", "paper", "real", "verdict", "first-answer", "go2-codec"]
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
     simulator here does. paper: DEAL's protocol, whose target is the centre of the range. real: recordings
     of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
-    without deliberate faults: is a right model called right, and a wrong one wrong? go2-codec: what the
-    Go2's messages cost to write and read."""
+    without deliberate faults: is a right model called right, and a wrong one wrong? first-answer:
+    seconds until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. go2-codec: what
+    the Go2's messages cost to write and read."""
 
     recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
 
@@ -46,6 +47,14 @@ class Bench:
     residual_std: tuple[str, ...] = ()
     """real: what a prediction may be off, as for `deal-hw calibrate`; by default the residual of a first
     fit to the recordings that are fitted."""
+
+    real: Path | None = None
+    """first-answer: folder with so101/ and go2_suspended/, the recordings and columns.yaml of each as
+    docs/example-so101.md and docs/example-go2-suspended.md make them; without it these two are skipped."""
+
+    problems: str = ""
+    """first-answer: robots, comma separated; by default all: double-pendulum, cart-pole, torque-arm, so101,
+    go2-suspended."""
 
     task: str = "cartpole"
     """Tasks, comma separated: cartpole, ant, go2 (loop: the cart-pole only)."""
@@ -95,8 +104,11 @@ class Bench:
         parse_ratios(self.xi)
         if self.bench != "real":
             options = given(self.recordings, Recordings())
-            options += given(self, Bench(bench="real"), ("holdout", "heldout_window", "residual_std"))
+            options += given(self, Bench, ("holdout", "heldout_window", "residual_std"))
             refuse(options, "only `bench real` takes that")
+        if self.bench != "first-answer":
+            # The class holds the defaults of these.
+            refuse(given(self, Bench, ("real", "problems")), "only `bench first-answer` takes that")
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -186,6 +198,19 @@ def _methods(config: Bench, default: Sequence[str]) -> tuple[str, ...]:
     return tuple(m.strip() for m in config.methods.split(",") if m.strip()) or tuple(default)
 
 
+def _first_answer(config: Bench, out: Path) -> _Table:
+    from deal_hw.bench import first_answer
+
+    problems = [name.strip() for name in config.problems.split(",") if name.strip()]
+    cells = first_answer.cells(
+        problems or tuple(first_answer.PROBLEMS), parse_seeds(config.seeds), real=config.real,
+        budget=_budget(config), threads=config.threads,
+    )  # fmt: skip
+    return _Table(
+        cells=cells, line=first_answer.line, summary=lambda rows: print("\n".join(first_answer.summary(rows)))
+    )
+
+
 def _budget(config: Bench) -> Budget:
     return Budget(population=config.population, generations=config.generations)
 
@@ -250,5 +275,10 @@ def _verdict(config: Bench, out: Path) -> _Table:
     )
 
 
-_TABLES: dict[str, Callable[[Bench, Path], _Table]] = {"loop": _loop, "real": _real, "verdict": _verdict}
+_TABLES: dict[str, Callable[[Bench, Path], _Table]] = {
+    "loop": _loop,
+    "real": _real,
+    "verdict": _verdict,
+    "first-answer": _first_answer,
+}
 """Benches by name; the others calibrate robots whose truth is known."""
