@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case, Rig, SpoiledError, headline
+from stall_monitor import watch_stalls
 
-from deal_hw.cli.bench import describe_machine
-from deal_hw.cli.witness import witnesses
+from deal_hw.bench.rows import describe_machine
 from deal_hw.control.realtime import priority
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.errors import DealHwError
@@ -224,7 +224,7 @@ def run_cases(
             if not numbers:
                 continue
             load = [round(os.getloadavg()[0], 1)]
-            with witnesses(PAUSE_NS) as account:
+            with watch_stalls(PAUSE_NS) as account:
                 try:
                     done = list(pool.map(lambda number, case=case: one(case, number), numbers))
                 except SpoiledError as error:

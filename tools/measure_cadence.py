@@ -5,10 +5,8 @@
 The whole path is measured: supervisor, control process, recorder, serial line (a pty). With --port the robot
 or emulator on that port is used instead of one of our own.
 
-Beside it runs a witness on each processor: a thread of the highest real-time priority that does nothing but
-sleep for a millisecond and look at the clock. Where it wakes late, too, no program could have been on time:
-the machine itself stood still (a virtual machine that the host took off its processor). Each overrun beyond a
-period is listed with the witness's account.
+Beside it runs the stall monitor (stall_monitor.py): each overrun beyond a period is listed with the
+longest pause of the machine at that time.
 """
 
 from __future__ import annotations
@@ -27,9 +25,9 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
+from stall_monitor import Account, watch_stalls
 
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.witness import Account, witnesses
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import Episode
 
@@ -70,7 +68,7 @@ def _judge(overruns: list[tuple[int, int]], seen: Account) -> list[dict[str, Any
     return [
         {
             "late_ms": (started - due) * 1e-6,
-            "witness_paused_ms": seen.longest_between_ns(due, started) * 1e-6,
+            "machine_paused_ms": seen.longest_between_ns(due, started) * 1e-6,
         }
         for due, started in overruns
     ]
@@ -79,7 +77,7 @@ def _judge(overruns: list[tuple[int, int]], seen: Account) -> list[dict[str, Any
 def measure(config: MeasureCadence) -> dict[str, Any]:
     """Run and return the report with the machine it was measured on."""
     load_before = os.getloadavg()
-    with tempfile.TemporaryDirectory() as folder, witnesses(_PAUSE_NS) as seen, _port(config.port) as port:
+    with tempfile.TemporaryDirectory() as folder, watch_stalls(_PAUSE_NS) as seen, _port(config.port) as port:
         report = collect(
             Collect(
                 robot="cartpole", port=port, dataset=Path(folder), profile=config.profile,
@@ -95,8 +93,8 @@ def measure(config: MeasureCadence) -> dict[str, Any]:
         "reason": episode.reason,
         "cadence": episode.cadence.to_json() if episode.cadence is not None else None,
         "beyond_period": _judge(_late_cycles(recording), seen),
-        "witness_pauses": len(seen.pauses),
-        "witness_longest_ms": seen.longest_ns * 1e-6,
+        "machine_pauses": len(seen.pauses),
+        "machine_longest_pause_ms": seen.longest_ns * 1e-6,
         "states_recorded": info.states,
         "cycles_recorded": info.cycles,
         "warnings": list(episode.warnings),

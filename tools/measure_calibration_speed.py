@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.loop import demonstrate
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
 from deal_hw.calibration import Budget
-from deal_hw.cli.bench_loop import demonstrate
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.sim.engine.batch import bare_steps_per_second
 from deal_hw.sim.engine.model import load_model

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.cli.bench import describe_machine
+from deal_hw.bench.rows import describe_machine
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
 from deal_hw.drivers.go2.emulator.truth import Truth

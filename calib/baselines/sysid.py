@@ -1,12 +1,13 @@
 """`mujoco-sysid`: DeepMind's ``mujoco.sysid`` as an outside reference, on the same windows as every method.
 
-Its user knows windows, smoothed start states and ranges, and nothing of a latency: the controls are late by
-the latency that the problem or the settings give, by nothing otherwise. The start is the nominal model, the
-intervals are its own.
+Its user knows windows, smoothed start states and ranges. The controls are late by the latency that the
+problem or the settings give, by nothing otherwise; or the latency is one more parameter of its least squares
+(:func:`with_delay`). The start is the nominal model, the intervals are its own.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +28,16 @@ class SysidSettings:
 
     Attributes:
         ticks: Window length in control periods.
+        window_s: Window length in seconds instead [s].
         latency_s: A latency that was found by other means, such as our scan [s]; None for the problem's where
             one is given, and otherwise zero.
+        delay: Where no latency is given, search it within the problem's range as one more parameter.
     """
 
     ticks: int = 10
+    window_s: float | None = None
     latency_s: float | None = None
+    delay: bool = False
 
 
 class MujocoSysid(Search):
@@ -62,10 +67,22 @@ class MujocoSysid(Search):
         check_space(problem.space)
         _check_channels(problem)
         given = settings.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
+        if settings.delay and given is None:
+            return OneShot(run, settings, lambda: _solve(run, settings, problem.first_latency_s), "its own")
         source = "given" if given is not None else "none, as its user would have it"
         latency_s = Coordinates(problem).clip_latency(given or 0.0)
         words = f"its own, {1e3 * latency_s:g} ms of latency ({source})"
-        return OneShot(run, settings, lambda: _solve(run, settings.ticks, latency_s), words)
+        settings = dataclasses.replace(settings, delay=False)
+        return OneShot(run, settings, lambda: _solve(run, settings, latency_s), words)
+
+
+def with_delay(window_s: float) -> MujocoSysid:
+    """Return it as a user tunes it for recordings of late commands: longer windows, and a delay to be found.
+
+    Args:
+        window_s: Window length [s].
+    """
+    return MujocoSysid(SysidSettings(window_s=window_s, delay=True))
 
 
 def _check_channels(problem: Problem) -> None:
@@ -78,8 +95,10 @@ def _check_channels(problem: Problem) -> None:
         )
 
 
-def _solve(run: Run, ticks: int, latency_s: float) -> Found:
-    problem = run.problem
+def _solve(run: Run, settings: SysidSettings, latency_s: float) -> Found:
+    problem, ticks = run.problem, settings.ticks
+    if settings.window_s is not None:
+        ticks = max(round(settings.window_s * problem.robot.description.control_rate_hz), 1)
     recordings = [
         Recording(problem.episodes[d.episode], d.windows, d.start_position, d.start_velocity)
         for d in cut(problem, ticks)
@@ -90,6 +109,7 @@ def _solve(run: Run, ticks: int, latency_s: float) -> Found:
         space,
         recordings,
         latency_s=latency_s,
+        latency_range_s=problem.latency_range_s if settings.delay else None,
         iterations=run.budget.generations,
         threads=problem.threads,
     )
@@ -99,7 +119,7 @@ def _solve(run: Run, ticks: int, latency_s: float) -> Found:
     return Found(
         theta=found.theta,
         covariance=textbook_covariance(space, found.jacobian * chain, found.residual),
-        latency_s=latency_s,
+        latency_s=found.latency_s,
         iterations=found.iterations,
         message=found.message,
         steps=found.steps,

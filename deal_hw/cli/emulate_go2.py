@@ -1,4 +1,4 @@
-"""``deal-hw emulate go2``: its options beside the common ones, and how it runs."""
+"""``deal-hw emulate go2``: how it runs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import gc
 import re
 import socket
 import sys
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from deal_hw.cli.emulate_common import (
     cut_on_signal,
@@ -21,86 +18,16 @@ from deal_hw.cli.emulate_common import (
     run_until,
     stop_on_signals,
 )
-from deal_hw.cli.options import Range, check_ranges
-from deal_hw.drivers.go2.emulator.faults import FaultPlan, Go2Faults
+from deal_hw.cli.emulate_settings import DEFAULT_PORTS, Emulate
+from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.transport import TopicTransport, WireOptions
 
 if TYPE_CHECKING:
-    from deal_hw.cli.emulate import Emulate
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.truth import Truth
 
-DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
-"""Transports of the Go2, and where its emulator is by default: on this machine alone."""
 _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Go2Options:
-    """Options of ``emulate go2`` alone."""
-
-    suspended: bool = False
-    """The base is held in the air: no floor, no contact."""
-
-    start: Literal["lying", "standing"] = "lying"
-    """Limp on the floor, or standing with sport mode in control."""
-
-    sport: Literal["normal", "ai", "advanced", "mcf", "off"] = "normal"
-    """The sport mode that is active at power-up; it fights every other command until it is released."""
-
-    sport_silent: bool = False
-    """Sport mode's own commands are not seen on rt/lowcmd."""
-
-    remote_script: Path | None = None
-    """JSON file with what the remote says from when on: [{"at_s": 2.0, "buttons": "L2+B", "left_y": 0.5}]"""
-
-    no_remote: bool = False
-    """No remote is heard: its 40 bytes are zeros."""
-
-    tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
-    """The robot's clock at the start [ms]; it wraps at 2**32."""
-
-    domain: Annotated[int, Range(0, 232)] = 0
-    """DDS domain."""
-
-    mode: Literal["peer", "client"] = "peer"
-    """Zenoh: wait for peers at the port, or be a client of the router there."""
-
-    insecure: bool = False
-    """Zenoh: allow plain TCP beyond this machine."""
-
-    ca: Path | None = None
-    """Zenoh over TLS: the authority that peers are checked against (PEM)."""
-
-    certificate: Path | None = None
-    """Zenoh over TLS: our certificate (PEM)."""
-
-    key: Path | None = None
-    """Zenoh over TLS: its private key (PEM)."""
-
-    faults: tyro.conf.OmitArgPrefixes[Go2Faults] = field(default_factory=Go2Faults)
-    """Faults of the Go2, which begin so long after the first stiff command."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-    def wire(self, transport: str) -> WireOptions:
-        """Return how the emulator joins the wire."""
-        return WireOptions(
-            domain=self.domain, listen=transport == "zenoh" and self.mode == "peer", mode=self.mode,
-            insecure=self.insecure, ca=self.ca, certificate=self.certificate, key=self.key,
-        )  # fmt: skip
-
-    def given(self) -> list[str]:
-        """Return the flags of options that differ from their defaults."""
-        given = vars(self) | asdict(self.faults)
-        default = vars(Go2Options()) | asdict(Go2Faults())
-        return [
-            "--" + name.replace("_", "-")
-            for name, value in given.items()
-            if name != "faults" and value != default[name]
-        ]
 
 
 def make_transport(name: str, port: str, options: WireOptions) -> TopicTransport:

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import settle
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, MISMATCH_TIME, correlation_time
 from deal_hw.calib.validation.checks import unexplained
-from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, parameter_space
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import ParameterSpace

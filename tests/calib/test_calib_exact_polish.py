@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2
 from deal_hw.calib.uncertainty.latency_scan import scan_latency
-from deal_hw.cli.bench_tasks import make_case
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel

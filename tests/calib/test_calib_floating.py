@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.validation.normalised_error import heldout_nrmse, signal_range
-from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.episode import Episode

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust, polish_windows
 from deal_hw.calib.fit.residual import Shooting
@@ -22,7 +23,6 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
-from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.types import FloatArray
 
 

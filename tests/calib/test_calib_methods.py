@@ -8,6 +8,8 @@ import functools
 import numpy as np
 import pytest
 
+from deal_hw.bench.loop import demonstrate
+from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import METHODS, NULL_METHODS, WHOLE_METHODS, check_method, make_method
 from deal_hw.calib.pipeline import PolishedMethod
@@ -15,8 +17,6 @@ from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Weki
 from deal_hw.calibration import Budget
-from deal_hw.cli.bench_loop import demonstrate
-from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.errors import UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite

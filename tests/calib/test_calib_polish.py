@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deal_hw.bench.loop import demonstrate
+from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
@@ -19,8 +21,6 @@ from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.metrics import error_percent, interval_score, log_error_x100
 from deal_hw.calib.validation.normalised_error import heldout_nrmse
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
-from deal_hw.cli.bench_loop import demonstrate
-from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace

@@ -7,6 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from deal_hw.bench.loop import demonstrate
+from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.coordinates import Coordinates, Members, logistic, logit
 from deal_hw.calib.data.innovations import explained, linearise, predict
 from deal_hw.calib.data.problem import Problem
@@ -17,8 +19,6 @@ from deal_hw.calib.deal_paper.rollouts import (
     rollout_population,
     transitions,
 )
-from deal_hw.cli.bench_loop import demonstrate
-from deal_hw.cli.bench_tasks import Case as Demonstration
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 

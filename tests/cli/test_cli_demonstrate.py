@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deal_hw.bench import loop as bench_loop
+from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Verdict
-from deal_hw.cli import bench_loop
-from deal_hw.cli.bench_tasks import make_case
 from deal_hw.cli.calibrate import choose_episodes
 from deal_hw.cli.calibrate_run import calibrate_episodes
 from deal_hw.cli.collect import Collect, collect

@@ -161,7 +161,6 @@ def test_words_that_do_not_parse_still_get_the_box(capsys: pytest.CaptureFixture
         ("excite cartpole --out o --family steps --draws 3", "--draws"),
         ("inspect e --web-port 1234", "--web-port"),
         ("bench loop --model m.xml", "--model"),
-        ("bench loop --rate 100", "--rate"),
     ],
 )
 def test_an_option_without_effect_is_refused(line: str, option: str) -> None:

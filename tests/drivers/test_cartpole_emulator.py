@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.emulate import Emulate, emulate
+from deal_hw.cli.emulate import emulate
+from deal_hw.cli.emulate_settings import Emulate
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import adopt_robot, make_robot

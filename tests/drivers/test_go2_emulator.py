@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.cli.emulate import Emulate, emulate
-from deal_hw.cli.emulate_go2 import Go2Options, free_port, make_transport, summary
+from deal_hw.cli.emulate import emulate
+from deal_hw.cli.emulate_go2 import free_port, make_transport, summary
+from deal_hw.cli.emulate_settings import Emulate, Go2Options
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.go2.emulator.device import Go2Device

@@ -4,11 +4,13 @@ What it gets: parameters in physical units with their ranges as bounds, joint po
 set-points as controls, and each window of a recording as one of its sequences, which starts at a given state.
 What it does is its own: finite differences, optimiser, confidence intervals.
 
-It has no command latency and no limit on a set-point's speed. A latency is given by controls that are late
-already; the speed limit goes through its hook for rollouts. Its hook for residuals is used for two facts of
-MuJoCo 3.17: sensors that a rollout returns are those before the step whose time they carry, so positions are
-taken from the state; and the residual is normalised window by window, which divides by zero where a joint
-rests at zero, so it is normalised over the whole recording.
+It has no limit on a set-point's speed, and its delays are those of sensors, which windows that start at
+measured states cannot use: a late sensor would show what was before the start. A latency is given by controls
+that are late already, or is one more parameter of its least squares; then, and with speed limits, its hook
+for rollouts gives each candidate its own controls, linear between commands. Its hook for residuals is used
+for two facts of MuJoCo 3.17: sensors that a rollout returns are those before the step whose time they carry,
+so positions are taken from the state; and the residual is normalised window by window, which divides by zero
+where a joint rests at zero, so it is normalised over the whole recording.
 """
 
 from __future__ import annotations
@@ -60,8 +62,9 @@ class Identified:
 
     Attributes:
         theta: Physical values, (K,).
+        latency_s: The latency that was given or found [s].
         half_width: Of its confidence intervals, (K,); infinite where its Jacobian is blind.
-        jacobian: Of its residual by the physical values, (R, K).
+        jacobian: Of its residual by the physical values, (R, K), less what a found latency explains.
         residual: Its normalised residual, (R,).
         iterations: Iterations of its optimiser.
         message: Why that stopped, in its own words.
@@ -69,6 +72,7 @@ class Identified:
     """
 
     theta: FloatArray
+    latency_s: float
     half_width: FloatArray
     jacobian: FloatArray
     residual: FloatArray
@@ -115,6 +119,7 @@ def identify(
     recordings: Sequence[Recording],
     *,
     latency_s: float = 0.0,
+    latency_range_s: tuple[float, float] | None = None,
     iterations: int = 50,
     alpha: float = 0.1,
     threads: int | None = None,
@@ -125,7 +130,8 @@ def identify(
         robot: The nominal model.
         space: The parameters.
         recordings: What to fit.
-        latency_s: Latency by which the set-points are late [s].
+        latency_s: Latency by which the set-points are late, or at which the search for it starts [s].
+        latency_range_s: Latencies that are searched [s]; None: it is as given.
         iterations: Most iterations of its optimiser.
         alpha: Its intervals hold 1 - alpha.
         threads: Threads of its rollouts; None for all CPUs.
@@ -136,8 +142,9 @@ def identify(
     """
     sysid = require_sysid()
     check_space(space)
-    bridge = _Bridge(sysid, robot, space, recordings, latency_s)
-    hooks: dict[str, Any] = {"custom_rollout": bridge.rollout} if bridge.slewed else {}
+    bridge = _Bridge(sysid, robot, space, recordings, latency_s, latency_range_s)
+    own_controls = bridge.slewed or latency_range_s is not None
+    hooks: dict[str, Any] = {"custom_rollout": bridge.rollout} if own_controls else {}
     residual = sysid.build_residual_fn(
         models_sequences=bridge.sequences(),
         build_model=bridge.build_model,
@@ -157,21 +164,31 @@ def identify(
         x_scale="jac",
         output=output,
     )
-    theta = np.clip(found.as_vector(), space.low, space.high)
-    left = residual(theta, found)[0]
+    vector = np.asarray(found.as_vector(), dtype=float)
+    left = residual(vector, found)[0]
     jacobian = np.asarray(result.jac, dtype=float)
     with np.errstate(all="ignore"):
         half_width = sysid.calculate_intervals(left, jacobian, alpha=alpha)[1]
     said = [line for line in output.getvalue().splitlines() if line.startswith("Terminated")]
     return Identified(
-        theta=theta,
-        half_width=np.nan_to_num(np.asarray(half_width, dtype=float), nan=np.inf, posinf=np.inf),
-        jacobian=jacobian,
+        theta=np.clip(vector[: len(space)], space.low, space.high),
+        latency_s=bridge.latency(vector),
+        half_width=np.nan_to_num(
+            np.asarray(half_width, dtype=float)[: len(space)], nan=np.inf, posinf=np.inf
+        ),
+        jacobian=_without(jacobian[:, : len(space)], jacobian[:, len(space) :]),
         residual=np.concatenate(left),
         iterations=len(result.extras["objective"]) - 1,
         message=said[-1] if said else "no message",
         steps=bridge.steps,
     )
+
+
+def _without(jacobian: FloatArray, nuisance: FloatArray) -> FloatArray:
+    """Return derivatives, (R, K), less what those by other parameters, (R, n), explain of them."""
+    if not np.any(nuisance):
+        return jacobian
+    return np.asarray(jacobian - nuisance @ np.linalg.lstsq(nuisance, jacobian, rcond=None)[0])
 
 
 @dataclass(slots=True)
@@ -183,7 +200,8 @@ class _Bridge:
         robot: The nominal model.
         space: The parameters.
         recordings: What to fit.
-        latency_s: Latency by which the set-points are late [s].
+        latency_s: Latency by which the set-points are late, or at which the search for it starts [s].
+        latency_range_s: Latencies that are searched [s]; None: it is as given.
     """
 
     sysid: Any
@@ -191,6 +209,7 @@ class _Bridge:
     space: ParameterSpace
     recordings: Sequence[Recording]
     latency_s: float
+    latency_range_s: tuple[float, float] | None
     steps: int = field(init=False, default=0)
     slewed: bool = field(init=False)
     _spec: mujoco.MjSpec = field(init=False)
@@ -201,7 +220,7 @@ class _Bridge:
     _origin: dict[int, tuple[int, int]] = field(init=False, default_factory=dict)
     _sent: dict[int, tuple[FloatArray, FloatArray, FloatArray]] = field(init=False, default_factory=dict)
     _models: dict[tuple[bytes, int], mujoco.MjModel] = field(init=False, default_factory=dict)
-    _paths: dict[tuple[int, bytes], FloatArray] = field(init=False, default_factory=dict)
+    _paths: dict[tuple[int, bytes, float], FloatArray] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.slewed = any(p.kind == SPEED_LIMIT for p in self.space.free)
@@ -244,10 +263,16 @@ class _Bridge:
         made = self.sysid.ParameterDict()
         for p in self.space.free:
             made.add(self.sysid.Parameter(p.name, p.nominal, p.low, p.high))
+        if self.latency_range_s is not None:
+            made.add(self.sysid.Parameter("latency", self.latency_s, *self.latency_range_s))
         return made
 
     def _values(self, parameters: Any) -> FloatArray:
-        return np.asarray(parameters.as_vector(), dtype=float)
+        return np.asarray(parameters.as_vector(), dtype=float)[: len(self.space)]
+
+    def latency(self, vector: FloatArray) -> float:
+        """Return the latency among what is searched, (K,) or (K + 1,), or the given one [s]."""
+        return float(vector[-1]) if self.latency_range_s is not None else self.latency_s
 
     def sequences(self) -> list[Any]:
         """Return the windows as sequences, those sent the same gains and limits in one group."""
@@ -294,7 +319,7 @@ class _Bridge:
         _, steps = self._times(r)
         times = np.arange(steps + 1) * self.robot.step_s
         made = self.sysid.TimeSeries.from_control_names(
-            times, self._cut(self._path(r, self.space.nominal), r, w), self._nominal
+            times, self._cut(self._path(r, self.space.nominal, self.latency_s), r, w), self._nominal
         )
         self._origin[id(made)] = r, w
         return made
@@ -304,17 +329,15 @@ class _Bridge:
         times = np.arange(0, steps + 1, every) * self.robot.step_s
         return self.sysid.TimeSeries.from_names(times, self._measured(self.recordings[r])[w], self._nominal)
 
-    def _path(self, r: int, theta: FloatArray) -> FloatArray:
-        """Return the set-points of a whole episode, (S, A); made once for each set of speed limits."""
+    def _path(self, r: int, theta: FloatArray, latency_s: float) -> FloatArray:
+        """Return the set-points of an episode, (S, A); made once for each latency and set of speed limits."""
         limits = np.array([theta[k] for k, p in enumerate(self.space.free) if p.kind == SPEED_LIMIT])
-        key = r, limits.tobytes()
+        key = r, limits.tobytes(), latency_s
         if key not in self._paths:
             if len(self._paths) > 4 * (len(self.space) + 1) * len(self.recordings):
                 self._paths.clear()
             self._batch.set_parameters(theta[None])
-            self._paths[key] = setpoints(self._batch, self.recordings[r].episode, np.array([self.latency_s]))[
-                0
-            ]
+            self._paths[key] = setpoints(self._batch, self.recordings[r].episode, np.array([latency_s]))[0]
         return self._paths[key]
 
     def _cut(self, path: FloatArray, r: int, w: int) -> FloatArray:
@@ -349,11 +372,12 @@ class _Bridge:
         return self._models[key]
 
     def rollout(self, *, control_signal: Sequence[Any], param_dicts: Sequence[Any], **given: Any) -> Any:
-        """Roll out with set-points slewed at each candidate's own speed limit: their hook."""
+        """Roll out with set-points at each candidate's own latency and speed limit: their hook."""
         slewed = []
         for signal, parameters in zip(control_signal, param_dicts, strict=True):
             r, w = self._origin[id(signal)]
-            data = self._cut(self._path(r, self._values(parameters)), r, w)
+            vector = np.asarray(parameters.as_vector(), dtype=float)
+            data = self._cut(self._path(r, vector[: len(self.space)], self.latency(vector)), r, w)
             slewed.append(self.sysid.TimeSeries(signal.times, data, signal.signal_mapping))
         return self.sysid.sysid_rollout(control_signal=slewed, **given)
 

@@ -1,4 +1,4 @@
-"""Witnesses: what they say of an interval, and that they watch."""
+"""The stall monitor: what it says of an interval, and that it watches."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import os
 import time
 
 import pytest
+from measure_go2_transport import TransportBench, lines, summary
+from stall_monitor import Account, Pause, watch_stalls
 
-from deal_hw.cli.bench_go2_transport import TransportBench, lines, summary
-from deal_hw.cli.witness import Account, Pause, witnesses
 from deal_hw.errors import ConfigurationError
 
 MS = 1_000_000
@@ -55,10 +55,10 @@ def test_a_late_cycle_that_the_machine_slept_through_is_not_held_against_the_wir
     assert "10.00 ms: NOT kept" in "\n".join(lines(row))
 
 
-def test_witnesses_watch_each_processor_and_end() -> None:
+def test_each_processor_is_watched_until_the_block_ends() -> None:
     """With no least length every wake-up is a pause: all processors are heard, in order."""
     try:
-        with witnesses(-1) as seen:
+        with watch_stalls(-1) as seen:
             time.sleep(0.05)
     except ConfigurationError:
         pytest.skip("SCHED_FIFO is refused here")

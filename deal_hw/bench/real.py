@@ -7,13 +7,17 @@ recordings that are fitted, unless it is given.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import Cells, Row
+from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget
 from deal_hw.cli.calibrate_model import HELDOUT_PART, Recordings, prepare_model
 from deal_hw.cli.calibrate_run import Narrowing, Work, calibrate_episodes, residual_std
@@ -84,6 +88,48 @@ def expected_std(work: Work, words: Sequence[str], threads: int | None) -> Calla
     return std
 
 
+def cells(
+    recordings: Recordings,
+    holdout: Sequence[Path],
+    *,
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    xi: float,
+    std: Sequence[str],
+    polish_all: bool,
+    budget: Budget,
+    window_s: float,
+    threads: int | None,
+    quiet: bool,
+) -> Cells:
+    """Read and check the recordings and return the cells; see :func:`run_cell`.
+
+    Raises:
+        UnknownNameError: There is no such method.
+        ConfigurationError: No model was named, or a setting cannot be used.
+        DatasetError: A recording cannot be used.
+    """
+    for method in methods:
+        check_method(method)
+    task = Path(recordings.model or "").stem
+    # A file of parameters has ranges of its own.
+    ratio = xi if recordings.parameters is None else None
+    work = prepare(recordings, holdout, ratio, std, threads=threads, quiet=quiet)
+    split, expected = split_name(recordings, holdout), expected_std(work, std, threads)
+
+    def make(method: str, seed: int, polish: bool) -> Callable[[], Row]:
+        return lambda: run_cell(
+            work, task, split, method, seed, xi, polish=polish, std=expected(method), threads=threads,
+            budget=budget, window_s=window_s,
+        )  # fmt: skip
+
+    runs = []
+    for seed, method in itertools.product(seeds, methods):
+        polish = method == "default" or polish_all
+        runs.append(((task, split, method, polish, xi, seed), make(method, seed, polish)))
+    return Cells(names=KEY, runs=runs)
+
+
 def run_cell(
     work: Work,
     task: str,
@@ -93,7 +139,7 @@ def run_cell(
     xi: float,
     *,
     polish: bool,
-    budget: Callable[[bool], Budget],
+    budget: Budget,
     std: FloatArray | None,
     window_s: float,
     threads: int | None,
@@ -108,7 +154,7 @@ def run_cell(
         seed: Of everything random.
         xi: Ratio of the search range, for the row.
         polish: Whether the polish follows.
-        budget: Makes the budget.
+        budget: What the search may use.
         std: What a prediction may be off, (2 C,); None: the sensor noise, or what the method finds itself.
         window_s: Held-out predictions restart this often [s].
         threads: Simulation threads.
@@ -119,7 +165,8 @@ def run_cell(
     }  # fmt: skip
     try:
         result = calibrate_episodes(
-            work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget(polish),
+            work.robot, work.space, work.episodes, work.holdout, method=method,
+            budget=dataclasses.replace(budget, polish=polish),
             rng=np.random.default_rng(seed), threads=threads, heldout_window_s=window_s,
             known_std=std,
             # A model that nobody calibrated has no latency.

@@ -9,13 +9,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from deal_hw.bench.loop import calibration_row
+from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.tasks import TASKS, make_case
 from deal_hw.calibration import Budget
-from deal_hw.cli.bench_loop import calibration_row
-from deal_hw.cli.bench_tasks import TASKS, make_case
 from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["honest", "mismatch", "paper"]
@@ -87,6 +88,15 @@ def make_cells(
         )
         for task, xi, seed, method in itertools.product(tasks, xis, seeds, methods)
     ]  # fmt: skip
+
+
+def cells(chosen: Sequence[Cell], *, population: int, generations: int, threads: int | None) -> Cells:
+    """Return what runs cells; see :func:`run_cell`."""
+
+    def make(cell: Cell) -> Callable[[], Row]:
+        return lambda: run_cell(cell, population=population, generations=generations, threads=threads)
+
+    return Cells(names=KEY, runs=[(cell.key, make(cell)) for cell in chosen])
 
 
 def run_cell(cell: Cell, *, population: int, generations: int, threads: int | None) -> dict[str, Any]:

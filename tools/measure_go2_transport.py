@@ -1,23 +1,32 @@
-"""``deal-hw bench go2-transport``: a controller and a robot on the Go2's topics, 500 times a second."""
+"""How regular 500 commands and states a second are over the Go2's wire: a controller, a robot, nothing else.
+
+    python tools/measure_go2_transport.py --transport zenoh --seconds 600 --freeze-at 300 --freeze-s 5
+
+Two processes of this machine send messages of the robot's size on its topics. With --freeze-at the robot's
+process is stopped for a while: no control cycle may wait for it. Exit code 1: one was late by more than 2 ms
+while the machine ran.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import tyro
+from go2_transport_sides import LATE_NS
+from side_process import SideProcess
+from stall_monitor import Account, watch_stalls
 
-from deal_hw.cli.bench_go2_process import SideProcess
-from deal_hw.cli.bench_go2_sides import LATE_NS
+from deal_hw.bench.rows import describe_machine, write_rows
 from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.cli.options import Range, check_ranges
 from deal_hw.cli.seconds_bar import seconds_bar
-from deal_hw.cli.witness import Account, witnesses
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.transport import WireOptions
 
 _START_S: Final = 30.0
@@ -31,28 +40,34 @@ FREEZE_LIMIT_S: Final = 2e-3
 
 @dataclass(frozen=True, kw_only=True)
 class TransportBench:
-    """The bench go2-transport: two processes, one wire."""
+    """Measure how regular 500 commands and states a second are over the Go2's wire."""
 
     transport: Literal["dds", "zenoh"] = "dds"
-    """go2-transport: the wire."""
+    """The wire."""
 
     port: str = ""
-    """go2-transport: network interface (dds) or end point (zenoh); by default on this machine's loopback."""
+    """Network interface (dds) or end point (zenoh); by default on this machine's loopback."""
 
     seconds: Annotated[float, Range(0.1, 86_400, "s")] = 20.0
-    """go2-transport: how long to measure [s]."""
+    """How long to measure [s]."""
 
     rate: Annotated[float, Range(1, 10_000, "Hz")] = 500.0
-    """go2-transport: commands and states a second [1/s]."""
+    """Commands and states a second [1/s]."""
 
     freeze_at: Annotated[float | None, Range(1e-3, 86_400, "s")] = None
-    """go2-transport: stop the robot's process (SIGSTOP) this long after the start [s]."""
+    """Stop the robot's process (SIGSTOP) this long after the start [s]."""
 
     freeze_s: Annotated[float, Range(1e-3, 3600, "s")] = 1.0
-    """go2-transport: for how long [s]."""
+    """For how long [s]."""
 
     wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
-    """go2-transport: more about the network."""
+    """More about the network."""
+
+    out: Path | None = None
+    """File of the row (JSON)."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -63,7 +78,7 @@ class TransportBench:
             )
 
 
-def bench_transport(settings: TransportBench, out: Path | None = None, *, quiet: bool = False) -> int:
+def bench_transport(settings: TransportBench) -> int:
     """Measure, print and, where a file is named, write.
 
     Returns:
@@ -72,28 +87,25 @@ def bench_transport(settings: TransportBench, out: Path | None = None, *, quiet:
     Raises:
         TransportError: A process failed; the message holds what it said.
     """
-    # Imported here: the verb's module holds our settings.
-    from deal_hw.cli.bench import describe_machine, write_rows
-
     machine = describe_machine()
-    row = summary(settings, *measure(settings, quiet=quiet))
+    row = summary(settings, *measure(settings))
     row["load_before"] = machine["load"]
-    if not quiet:
+    if not settings.quiet:
         print("\n".join(lines(row)))
-    if out is not None:
-        write_rows(out, [row])
-        if not quiet:
-            print(f"written: {out}")
+    if settings.out is not None:
+        write_rows(settings.out, [row], program="tools/measure_go2_transport.py")
+        if not settings.quiet:
+            print(f"written: {settings.out}")
     return int(row["frozen"] is not None and _longest_s(row["frozen"]) > FREEZE_LIMIT_S)
 
 
 def _longest_s(frozen: Mapping[str, Any]) -> float:
-    """Return the delay that counts: that of the machine's waking hours, where a witness knows them [s]."""
+    """Return the delay that counts: without the machine's pauses, where the stall monitor ran [s]."""
     awake_s = frozen.get("awake_delay_s")
     return float(frozen["cycle_delay"]["max_s"] if awake_s is None else awake_s)
 
 
-def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+def measure(settings: TransportBench) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run both processes and return what the controller and the robot measured."""
     orders = {
         "parent_pid": os.getpid(),
@@ -106,7 +118,7 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
     # Zenoh needs one side that waits, and a client cannot; DDS does not care.
     robot_wire, wire = {**wire, "listen": True, "mode": "peer"}, {**wire, "listen": False}
     with (
-        _witnessed() as seen,
+        _monitored() as seen,
         SideProcess("robot", {**orders, "wire": robot_wire}) as robot,
     ):
         robot.expect("ready", _START_S)
@@ -114,7 +126,7 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
         with SideProcess("controller", {**orders, "wire": wire, "freeze": freeze}) as controller:
             controller.expect("ready", _START_S)
             controller.expect("running", _START_S)
-            with seconds_bar(f"go2-transport {settings.transport}", settings.seconds, quiet) as bar:
+            with seconds_bar(f"go2-transport {settings.transport}", settings.seconds, settings.quiet) as bar:
                 measured = controller.result(settings.seconds + _END_S, bar.passed)
         robot.stop()
         other = robot.result(_END_S)
@@ -122,11 +134,11 @@ def measure(settings: TransportBench, *, quiet: bool) -> tuple[dict[str, Any], d
 
 
 @contextlib.contextmanager
-def _witnessed() -> Iterator[Account | None]:
+def _monitored() -> Iterator[Account | None]:
     """Watch the machine itself, where that is permitted."""
     with contextlib.ExitStack() as stack:
         try:
-            seen: Account | None = stack.enter_context(witnesses(_PAUSE_NS))
+            seen: Account | None = stack.enter_context(watch_stalls(_PAUSE_NS))
         except ConfigurationError:
             seen = None
         yield seen
@@ -177,12 +189,12 @@ def summary(
         "warnings": [*controller["warnings"], *robot["warnings"]],
         "freeze_at_s": settings.freeze_at,
         "freeze_s": settings.freeze_s if settings.freeze_at is not None else None,
-        "frozen": _witnessed_delay(controller["frozen"], controller.get("account")),
+        "frozen": _awake_delay(controller["frozen"], controller.get("account")),
         "quiet_awake_delay_s": _awake_s(controller["quiet"], controller.get("account")),
     }
 
 
-def _witnessed_delay(frozen: Mapping[str, Any] | None, seen: Account | None) -> dict[str, Any] | None:
+def _awake_delay(frozen: Mapping[str, Any] | None, seen: Account | None) -> dict[str, Any] | None:
     if frozen is None:
         return None
     kept = {name: value for name, value in frozen.items() if name != "late"}
@@ -251,13 +263,13 @@ def lines(row: Mapping[str, Any]) -> list[str]:
         )
     if frozen := row["frozen"]:
         longest_s = _longest_s(frozen)
-        witnessed = "" if frozen.get("awake_delay_s") is None else " while the machine ran"
+        monitored = "" if frozen.get("awake_delay_s") is None else " while the machine ran"
         text += [
             f"frozen {row['freeze_s']:g} s, then {_SETTLE_S:g} s: cycle delay {_ms(frozen['cycle_delay'])}",
             f"  of it work     {_ms(frozen['work'])}, {frozen['cycles_without_link']} cycles without a link",
             f"                 {row['commands']['lost_around_freeze']} commands dropped, "
             f"{row['commands']['older_than_100_ms']} delivered late",
-            f"                 longest delay{witnessed} {longest_s * 1e3:.2f} ms: "
+            f"                 longest delay{monitored} {longest_s * 1e3:.2f} ms: "
             + ("kept" if longest_s <= FREEZE_LIMIT_S else "NOT kept")
             + f" the limit of {FREEZE_LIMIT_S * 1e3:g} ms",
         ]
@@ -267,3 +279,17 @@ def lines(row: Mapping[str, Any]) -> list[str]:
 def _ms(spread: Mapping[str, float | None]) -> str:
     values = (spread[name] for name in ("p50_s", "p99_s", "max_s"))
     return " / ".join("-" if v is None else f"{v * 1e3:.3f}" for v in values) + " ms"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    try:
+        return bench_transport(tyro.cli(TransportBench, description=__doc__, args=arguments))
+    except DealHwError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Benches of the Go2's wire: what its messages cost to write and read."""
+"""The bench of the Go2's messages: what they cost to write and read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.cli.bench import describe_machine, write_rows
+from deal_hw.bench.rows import describe_machine, write_rows
 from deal_hw.drivers.go2.fake import FakeGo2
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,

@@ -1,12 +1,15 @@
-"""Witnesses beside a measurement: was a program late, or did the machine stand still?
+"""Stall monitor beside a measurement: was a program late, or did the machine stand still?
 
-A witness is a process of the highest real-time priority, pinned to one processor, that does nothing but sleep
-for a millisecond and look at the clock. Where it wakes late, too, no program there could have been on time: a
-virtual machine was taken off its processor, or the kernel was busy with itself.
+    python tools/stall_monitor.py --seconds 60 --least-ms 1
+
+The monitor is a process of the highest real-time priority on each processor, which sleeps for a millisecond
+and looks at the clock. Where it wakes late, too, no program there could have been on time: a virtual machine
+was taken off its processor, or the kernel was busy with itself. Other tools use :func:`watch_stalls`.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import subprocess
@@ -28,7 +31,7 @@ class Pause:
 
     Attributes:
         processor: Its number.
-        from_ns: When the witness was due, on the machine's monotonic clock [ns].
+        from_ns: When the monitor was due, on the machine's monotonic clock [ns].
         until_ns: When it woke [ns].
     """
 
@@ -39,7 +42,7 @@ class Pause:
 
 @dataclass(slots=True)
 class Account:
-    """What the witnesses saw; filled when the block that they watch ends.
+    """What the monitor saw; filled when the block that it watches ends.
 
     Attributes:
         pauses: All pauses, by processor and time.
@@ -69,7 +72,7 @@ class Account:
 
 
 @contextlib.contextmanager
-def witnesses(least_ns: int, processors: Sequence[int] | None = None) -> Iterator[Account]:
+def watch_stalls(least_ns: int, processors: Sequence[int] | None = None) -> Iterator[Account]:
     """Watch processors while the block runs.
 
     Args:
@@ -84,11 +87,13 @@ def witnesses(least_ns: int, processors: Sequence[int] | None = None) -> Iterato
     with contextlib.ExitStack() as stack:
         running = []
         for number in numbers:
-            command = [sys.executable, "-m", __name__, str(number), str(least_ns)]
+            command = [sys.executable, __file__, f"--watch={number}", f"--least-ms={least_ns * 1e-6}"]
             process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             stack.callback(process.kill)
             if process.stdout is None or process.stdout.readline() != "ready\n":
-                raise ConfigurationError("the witness was refused SCHED_FIFO: measure where it is granted")
+                raise ConfigurationError(
+                    "SCHED_FIFO was refused to the stall monitor: measure where it is granted"
+                )
             running.append(process)
         yield found
         for process in running:
@@ -99,9 +104,8 @@ def witnesses(least_ns: int, processors: Sequence[int] | None = None) -> Iterato
             ]
 
 
-def main() -> None:
-    """Print each pause of a processor: number, when the witness was due and when it woke [ns]."""
-    number, least_ns = int(sys.argv[1]), int(sys.argv[2])
+def watch(number: int, least_ns: int) -> None:
+    """Print each pause of a processor, for ever: number, when the monitor was due and when it woke [ns]."""
     os.sched_setaffinity(0, {number})
     become_realtime()
     try:
@@ -119,5 +123,28 @@ def main() -> None:
             due_ns = now_ns
 
 
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=60.0, help="how long to watch [s]")
+    parser.add_argument("--least-ms", type=float, default=1.0, help="shorter pauses are not noted [ms]")
+    parser.add_argument("--watch", type=int, help="be the monitor of this processor, until killed")
+    given = parser.parse_args()
+    if given.watch is not None:
+        watch(given.watch, round(given.least_ms * 1e6))
+    try:
+        with watch_stalls(round(given.least_ms * 1e6)) as seen:
+            time.sleep(given.seconds)
+    except ConfigurationError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(
+        f"{len(seen.pauses)} pauses longer than {given.least_ms:g} ms in {given.seconds:g} s, the longest "
+        f"{seen.longest_ns * 1e-6:.1f} ms"
+    )
+    return 0
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""The two processes of ``deal-hw bench go2-transport``: a controller and a robot that only measure.
+"""The two processes of ``tools/measure_go2_transport.py``: a controller and a robot that only measure.
 
 Each message carries its number and the time of its sending in bytes that the receiver leaves alone. Both
 processes run on one machine, so their clocks are the same and ages are exact.
@@ -31,7 +31,7 @@ _HEADER: Final = bytes.fromhex("00010000")
 _LAYOUT: Final[Mapping[str, tuple[int, int]]] = {LOW_COMMAND: (812, 748), LOW_STATE: (1180, 1104)}
 """Topic -> bytes of its message, and where in them the field wireless_remote stands."""
 LATE_NS: Final = 1_000_000
-"""Cycles that are delayed by more are listed one by one, for the witness to judge [ns]."""
+"""Cycles that are delayed by more are listed one by one, for the stall monitor to judge [ns]."""
 _MEETING_S: Final = 10.0
 _STALE_NS: Final = 100_000_000
 

@@ -1,4 +1,4 @@
-"""Runs the two processes of ``deal-hw bench go2-transport``: orders in, one line after the other out."""
+"""Runs the two processes of ``tools/measure_go2_transport.py``: orders in, one line after the other out."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import IO, Any
 
 from deal_hw.errors import TransportError
+
+_SIDES = Path(__file__).with_name("go2_transport_sides.py")
 
 
 class SideProcess:
@@ -26,7 +29,7 @@ class SideProcess:
         self._name = name
         # A session of its own: Ctrl-C in the terminal is this process's to handle.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "deal_hw.cli.bench_go2_sides", name],
+            [sys.executable, str(_SIDES), name],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             start_new_session=True, bufsize=0,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.bench_go2 import TARGETS_US, bench_codec
+from deal_hw.bench.go2_codec import TARGETS_US, bench_codec
 
 
 def test_the_codec_bench_writes_medians_and_the_machine(

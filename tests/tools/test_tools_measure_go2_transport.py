@@ -11,12 +11,11 @@ from pathlib import Path
 
 import psutil
 import pytest
+from go2_transport_sides import Arrivals, mark, read_mark
 from hypothesis import given
 from hypothesis import strategies as st
+from measure_go2_transport import TransportBench, bench_transport, lines, main, summary
 
-from deal_hw.cli import main as cli
-from deal_hw.cli.bench_go2_sides import Arrivals, mark, read_mark
-from deal_hw.cli.bench_go2_transport import TransportBench, bench_transport, lines, summary
 from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
 from deal_hw.errors import ConfigurationError, TransportError
 from deal_hw.transport import WireOptions
@@ -110,7 +109,7 @@ def test_a_run_over_zenoh_counts_every_message(tmp_path: Path) -> None:
     out = tmp_path / "zenoh.json"
     arguments = "--transport zenoh --seconds 0.8 --rate 200 --freeze-at 0.3 --freeze-s 0.1 --quiet".split()
     # Exit code 1: a busy machine wakes up later than the limit allows.
-    assert cli.main(["bench", "go2-transport", *arguments, "--out", str(out)]) in {0, 1}
+    assert main([*arguments, "--out", str(out)]) in {0, 1}
     values = json.loads(out.read_text())
     assert values["machine"]["processors"] > 0
     (row,) = values["rows"]
@@ -126,21 +125,23 @@ def test_a_run_over_zenoh_counts_every_message(tmp_path: Path) -> None:
 def test_a_run_over_dds_counts_every_message() -> None:
     """The same two processes on the other wire, in a domain of their own."""
     pytest.importorskip("cyclonedds")
-    settings = TransportBench(transport="dds", seconds=0.5, rate=200.0, wire=WireOptions(domain=77))
-    assert bench_transport(settings, quiet=True) == 0
+    settings = TransportBench(
+        transport="dds", seconds=0.5, rate=200.0, wire=WireOptions(domain=77), quiet=True
+    )
+    assert bench_transport(settings) == 0
 
 
 def test_a_side_that_fails_is_quoted() -> None:
     """An end point beyond this machine is refused by the process that would listen there."""
-    settings = TransportBench(transport="zenoh", port="tcp/192.0.2.1:7447", seconds=1.0)
+    settings = TransportBench(transport="zenoh", port="tcp/192.0.2.1:7447", seconds=1.0, quiet=True)
     with pytest.raises(TransportError, match=r"the robot's process failed: .*--insecure"):
-        bench_transport(settings, quiet=True)
+        bench_transport(settings)
 
 
 def test_ctrl_c_leaves_no_process_behind() -> None:
-    """The verb ends with the code of an interrupt, and so do both sides."""
-    arguments = "bench go2-transport --transport zenoh --seconds 60".split()
-    command = [sys.executable, "-m", "deal_hw", *arguments]
+    """The tool ends with the code of an interrupt, and so do both sides."""
+    tool = Path(__file__).resolve().parents[2] / "tools/measure_go2_transport.py"
+    command = [sys.executable, str(tool), *"--transport zenoh --seconds 60".split()]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as bench:
         try:
             children: list[psutil.Process] = []

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from deal_hw.bench import verdict as bench_verdict
+from deal_hw.bench.verdict import cells, line, names, run_cell, summary
 from deal_hw.calibration import Budget
-from deal_hw.cli import bench_verdict
-from deal_hw.cli.bench_verdict import cells, line, names, run_cell, summary
 from deal_hw.errors import UnknownNameError
 from deal_hw.testing import plain_robots
 from deal_hw.testing.plain_robots import FAULTS, KINDS, NOISE, PlainRobot, make_robot, record, write

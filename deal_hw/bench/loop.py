@@ -6,15 +6,18 @@ through the same driver, bytes, loop and recorder as on the wire.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.tasks import Case, make_case
+from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.cli.calibrate_run import calibrate_episodes
 from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole
@@ -161,9 +164,32 @@ def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[st
     return row
 
 
-def loop_cells(methods: Sequence[str], seeds: Sequence[int]) -> list[tuple[int, str]]:
-    """Return the cells of the bench, seed by seed."""
-    return [(seed, method) for seed in seeds for method in methods]
+def cells(
+    profile: str,
+    methods: Sequence[str],
+    xi: float,
+    seeds: Sequence[int],
+    *,
+    train: bool,
+    folder: Path,
+    threads: int | None,
+) -> Cells:
+    """Return the cells of the bench, seed by seed; see :func:`loop_row`.
+
+    Raises:
+        UnknownNameError: There is no such method.
+    """
+    for method in methods:
+        check_method(method)
+
+    def make(seed: int, method: str) -> Callable[[], Row]:
+        return lambda: loop_row(profile, seed, method, xi, train=train, folder=folder, threads=threads)
+
+    runs = [
+        ((profile, seed, method, xi), make(seed, method))
+        for seed, method in itertools.product(seeds, methods)
+    ]
+    return Cells(names=("profile", "seed", "method", "xi"), runs=runs)
 
 
 def loop_row(
@@ -180,6 +206,7 @@ def loop_row(
         folder: Where policies go.
         threads: Simulation threads.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     polish = method == "default"
     row: dict[str, Any] = {
         "bench": "loop", "task": "cartpole", "profile": profile, "method": method, "polish": polish, "xi": xi,

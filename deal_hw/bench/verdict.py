@@ -7,12 +7,13 @@ MJCF, with default settings. Without a fault the model can explain all; each fau
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import Cells, Row
 from deal_hw.calib.validation.checks import MOST_CAUSES
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import Budget, CalibrationResult
@@ -38,6 +39,15 @@ RIGHT = ""
 def cells(seeds: Sequence[int]) -> list[tuple[str, str, int]]:
     """Return the robots by (kind, fault, seed): without a fault first."""
     return [(kind, fault, seed) for fault in (RIGHT, *FAULTS) for seed in seeds for kind in KINDS]
+
+
+def table(seeds: Sequence[int], *, budget: Budget, threads: int | None) -> Cells:
+    """Return what runs the robots; see :func:`run_cell`."""
+
+    def make(kind: str, fault: str, seed: int) -> Callable[[], Row]:
+        return lambda: run_cell(kind, fault, seed, budget=budget, threads=threads)
+
+    return Cells(names=KEY, runs=[(cell, make(*cell)) for cell in cells(seeds)])
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:

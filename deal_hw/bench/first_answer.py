@@ -1,0 +1,381 @@
+"""``deal-hw bench first-answer``: how long until a calibration is nearly as good as it gets?
+
+Five robots are calibrated as a user would, from an MJCF and recordings with default settings. Each fit that
+is shown on the way counts from the moment when it is there, with its error on held-out motion. Beside it, in
+the same run and on the same recordings, parameters and ranges, runs mujoco.sysid with the latency as one more
+parameter. Reading files and importing packages is not counted, on either side.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.bench.rows import Cells, Row
+from deal_hw.calibration import Budget, Progress
+from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
+from deal_hw.cli.calibrate_model import Recordings
+from deal_hw.cli.calibrate_run import Work
+from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
+from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
+from deal_hw.types import FloatArray
+
+KEY = ("task", "seed")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstAnswerSettings:
+    """Settings of the bench.
+
+    Attributes:
+        near: A fit whose held-out error is within this factor of the final one is a first answer.
+        window_s: Held-out predictions restart from the measured state this often [s].
+        sysid_window_s: Windows of mujoco.sysid [s]: on the public SO-101 recordings 2 s did best.
+        sysid_iterations: Most iterations of its optimiser: its own default.
+        seconds: Length of each simulated recording; two are fitted, one judges [s].
+    """
+
+    near: float = 1.1
+    window_s: float = 2.0
+    sysid_window_s: float = 2.0
+    sysid_iterations: int = 200
+    seconds: float = 12.0
+
+
+SETTINGS = FirstAnswerSettings()
+
+SO101_PARAMETERS = """\
+parameters:
+  - {kind: servo_stiffness, elements: "*"}
+  - {kind: dof_damping, elements: "*"}
+  - {kind: dof_frictionloss, elements: "*", range: [0.01, 1.0]}
+  - {kind: dof_armature, elements: "*"}
+  - {kind: servo_effort_limit, elements: gripper}
+"""
+"""As in docs/example-so101.md."""
+
+GO2_PARAMETERS = """\
+parameters:
+  - {kind: servo_stiffness, elements: "*"}
+  - {kind: servo_damping, elements: "*"}
+  - {kind: dof_frictionloss, elements: "*_hip_joint"}
+  - {kind: dof_frictionloss, elements: "*_thigh_joint"}
+  - {kind: dof_frictionloss, elements: "*_calf_joint", range: [0.02, 4]}
+  - {kind: tendon_frictionloss, elements: ["*_rod", "*_strap"], nominal: 5, ratio: 10}
+  - {kind: dof_armature, elements: "*_joint"}
+"""
+"""As in docs/example-go2-suspended.md."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Ask:
+    """What a problem is made of.
+
+    Attributes:
+        folder: For files.
+        seed: Decides the truth of a simulated robot.
+        real: Folder of real recordings, or None.
+        seconds: Length of each simulated recording [s].
+    """
+
+    folder: Path
+    seed: int
+    real: Path | None
+    seconds: float
+
+    def recorded(self, name: str, motions: Sequence[str], example: str) -> list[Path]:
+        """Return files of a real robot.
+
+        Raises:
+            ConfigurationError: There are none; the message says where they come from.
+        """
+        if self.real is None:
+            raise ConfigurationError(f"no real recordings: --real DIR with DIR/{name} as {example} makes it")
+        files = [self.real / name / f"{motion}.npz" for motion in motions]
+        if missing := [str(f) for f in (*files, self.real / name / "columns.yaml") if not f.exists()]:
+            raise ConfigurationError(f"{', '.join(missing)} missing: {example} says how to make them")
+        return files
+
+
+def _written(robot: PlainRobot, ask: _Ask) -> Calibrate:
+    model, fit, held_out = write(robot, ask.folder, seconds=ask.seconds)
+    return Calibrate(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,), quiet=True)
+
+
+def _double_pendulum(ask: _Ask) -> Calibrate:
+    return _written(make_robot("double-pendulum", ask.seed), ask)
+
+
+def _cart_pole(ask: _Ask) -> Calibrate:
+    return _written(make_robot("cart-pole", ask.seed), ask)
+
+
+def _torque_arm(ask: _Ask) -> Calibrate:
+    """Return an arm of two links that is driven by torques, not by servos."""
+    robot = make_robot("double-pendulum", ask.seed)
+    gains = {name.partition(".")[0]: value for name, value in _stiffness(robot.model).items()}
+
+    def driven(mjcf: str) -> str:
+        """Return a model whose motors are as much stronger as its servos are stiffer."""
+        for joint, stiffness in _stiffness(mjcf).items():
+            gain = stiffness / gains[joint]
+            mjcf = re.sub(
+                f'<position name="{joint}" joint="{joint}" kp="[^"]*"/>',
+                f'<general name="{joint}" joint="{joint}" gainprm="{gain:.9g}"/>',
+                mjcf,
+            )
+        return mjcf
+
+    return _written(
+        replace(robot, kind="torque-arm", model=driven(robot.model), robot=driven(robot.robot)), ask
+    )
+
+
+def _stiffness(mjcf: str) -> dict[str, float]:
+    return {name: float(kp) for name, kp in re.findall(r'joint="(\w+)" kp="([^"]*)"', mjcf)}
+
+
+def _so101(ask: _Ask) -> Calibrate:
+    from deal_hw.drivers.so101.description import DESCRIPTION
+
+    fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
+    held_out = ("step_response", "slow_precision")
+    files = ask.recorded("so101", (*fitted, *held_out), "docs/example-so101.md")
+    parameters = ask.folder / "so101.yaml"
+    parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
+    recordings = Recordings(
+        model=DESCRIPTION.mjcf, data=tuple(files[: len(fitted)]), parameters=parameters,
+        columns=files[0].with_name("columns.yaml"), leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
+        fit_seconds=30.0, physics_step=0.004,
+    )  # fmt: skip
+    return Calibrate(recordings=recordings, holdout=tuple(files[len(fitted) :]), quiet=True)
+
+
+def _go2(ask: _Ask) -> Calibrate:
+    from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
+
+    name = "go2_suspended"
+    files = ask.recorded(name, ("train",), "docs/example-go2-suspended.md")
+    parameters = ask.folder / "go2.yaml"
+    parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
+    recordings = Recordings(
+        model=DESCRIPTION.mjcf, data=tuple(files), parameters=parameters,
+        columns=files[0].with_name("columns.yaml"), window=0.2,
+    )  # fmt: skip
+    return Calibrate(recordings=recordings, quiet=True)
+
+
+PROBLEMS: Mapping[str, Callable[[_Ask], Calibrate]] = {
+    "double-pendulum": _double_pendulum,
+    "cart-pole": _cart_pole,
+    "torque-arm": _torque_arm,
+    "so101": _so101,
+    "go2-suspended": _go2,
+}
+"""The robots by name: three in plain MuJoCo with hidden truths, two real ones."""
+
+
+def check_problems(names: Sequence[str]) -> None:
+    """Raise where there is no such problem.
+
+    Raises:
+        UnknownNameError: A name is not in `PROBLEMS`.
+    """
+    for name in names:
+        if name not in PROBLEMS:
+            raise UnknownNameError("problem of first-answer", name, PROBLEMS)
+
+
+def cells(
+    problems: Sequence[str], seeds: Sequence[int], *, real: Path | None, budget: Budget, threads: int | None
+) -> Cells:
+    """Return what runs the problems; a real robot has one truth, so it is run for the first seed alone.
+
+    Raises:
+        UnknownNameError: There is no such problem.
+    """
+    check_problems(problems)
+
+    def make(name: str, seed: int) -> Callable[[], Row]:
+        return lambda: run_cell(name, seed, real=real, budget=budget, threads=threads)
+
+    drawn = {"double-pendulum", "cart-pole", "torque-arm"}
+    chosen = [(name, seed) for seed in seeds for name in problems if name in drawn or seed == seeds[0]]
+    return Cells(names=KEY, runs=[(cell, make(*cell)) for cell in chosen])
+
+
+def run_cell(
+    name: str,
+    seed: int,
+    *,
+    real: Path | None,
+    budget: Budget,
+    threads: int | None,
+    settings: FirstAnswerSettings = SETTINGS,
+) -> Row:
+    """Calibrate one robot both ways; an error is kept in the row.
+
+    Args:
+        name: A name in `PROBLEMS`.
+        seed: Of the truth, and of everything random in our calibration.
+        real: Folder of real recordings.
+        budget: What a search may use.
+        threads: Simulation threads.
+        settings: How to judge.
+    """
+    row: Row = {"bench": "first-answer", "task": name, "seed": seed, "error": "", "skipped": ""}
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            config = PROBLEMS[name](_Ask(Path(folder), seed, real, settings.seconds))
+        except ConfigurationError as err:
+            return row | {"skipped": str(err)}
+        try:
+            work = prepare(config)
+            return row | _compared(work, config, seed, budget, threads, settings)
+        except DealHwError as err:
+            return row | {"error": f"{type(err).__name__}: {err}"}
+
+
+@dataclass(slots=True)
+class _Stopwatch:
+    """Wall clock and processor time since a moment."""
+
+    wall_s: float
+    cpu_s: float
+
+    @classmethod
+    def start(cls) -> _Stopwatch:
+        return cls(time.perf_counter(), time.process_time())
+
+    def passed(self) -> tuple[float, float]:
+        """Return wall clock and processor time so far [s]."""
+        return time.perf_counter() - self.wall_s, time.process_time() - self.cpu_s
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """A fit and when it was there: its stage, wall clock and processor time [s], (K,) values, latency [s]."""
+
+    stage: str
+    wall_s: float
+    cpu_s: float
+    theta: FloatArray
+    latency_s: float
+
+
+def _compared(
+    work: Work,
+    config: Calibrate,
+    seed: int,
+    budget: Budget,
+    threads: int | None,
+    settings: FirstAnswerSettings,
+) -> Row:
+    from deal_hw.calib.baselines.sysid import with_delay
+    from deal_hw.calib.data.problem import Problem
+    from deal_hw.calib.methods import make_method
+    from deal_hw.calib.validation.heldout import heldout_rmse
+    from deal_hw.calib.validation.verdict import trust
+    from deal_hw.sim.recordings.sysid_adapter import require_sysid
+
+    # Imports are not counted.
+    method = usual_method(config, work.robot)
+    make_method(method, polish=True)
+    require_sysid()
+    load, shown, since = os.getloadavg()[0], list[_Shown](), _Stopwatch.start()
+
+    def watch(progress: Progress) -> None:
+        if progress.estimate is not None:
+            latency_s = progress.latency_s or 0.0
+            shown.append(_Shown(progress.stage, *since.passed(), progress.estimate.copy(), latency_s))
+
+    result = calibrate_episodes(
+        work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget,
+        rng=np.random.default_rng(seed), threads=threads, watch=watch,
+    )  # fmt: skip
+    shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s))
+
+    since = _Stopwatch.start()
+    sysid = with_delay(settings.sysid_window_s).run(
+        Problem(work.robot, work.space, work.episodes, threads=threads),
+        Budget(generations=settings.sysid_iterations),
+        np.random.default_rng(seed),
+    )
+    sysid_s, sysid_cpu_s = since.passed()
+
+    fits = {str(i): (fit.theta, fit.latency_s) for i, fit in enumerate(shown)}
+    fits |= {"sysid": (sysid.estimate, sysid.latency_s), "nominal": (work.space.nominal, 0.0)}
+    judged = heldout_rmse(work.robot, work.space, work.holdout, fits, settings.window_s, threads)
+    errors = judged.mean()
+    ours = [errors[str(i)] for i in range(len(shown))]
+    first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= settings.near * ours[-1])
+    return {
+        "method": method,
+        "parameters": len(work.space),
+        "fitted_s": float(sum(len(e.sample) * e.period_s for e in work.episodes)),
+        "load": load,
+        "first_stage": first.stage,
+        "first_s": first.wall_s,
+        "first_cpu_s": first.cpu_s,
+        "seconds": shown[-1].wall_s,
+        "cpu_s": shown[-1].cpu_s,
+        "sysid_s": sysid_s,
+        "sysid_cpu_s": sysid_cpu_s,
+        "seconds_ratio": first.wall_s / sysid_s,
+        "cpu_ratio": first.cpu_s / sysid_cpu_s,
+        "heldout_window_s": settings.window_s,
+        "heldout_rmse": ours[-1],
+        "heldout_rmse_sysid": errors["sysid"],
+        "heldout_rmse_nominal": errors["nominal"],
+        "heldout_rmse_null": errors["null"],
+        "heldout_ratio": ours[-1] / errors["sysid"],
+        "latency_found": result.latency_s,
+        "latency_sysid": sysid.latency_s,
+        "colour": trust(result).colour,
+        "search": result.provenance.get("search", ""),
+        "sysid_iterations": sysid.provenance.get("iterations"),
+        "sysid_stopped": sysid.provenance.get("stopped"),
+        "shown": [
+            {"stage": fit.stage, "seconds": fit.wall_s, "cpu_s": fit.cpu_s, "heldout_rmse": error}
+            for fit, error in zip(shown, ours, strict=True)
+        ],
+    }
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """Return one row in words."""
+    head = f"{row['task']} seed {row['seed']}"
+    if row["error"] or row["skipped"]:
+        return f"{head}: {row['error'] or 'skipped: ' + row['skipped']}"
+    return (
+        f"{head}, {row['parameters']} parameters: first answer after {row['first_s']:.1f} s "
+        f"({row['first_stage']}), end after {row['seconds']:.1f} s, mujoco.sysid {row['sysid_s']:.1f} s, "
+        f"ratio {row['seconds_ratio']:.2f} (processor time {row['cpu_ratio']:.2f}); held-out error "
+        f"{1e3 * row['heldout_rmse']:.3f}e-3, mujoco.sysid {1e3 * row['heldout_rmse_sysid']:.3f}e-3, "
+        f"ratio {row['heldout_ratio']:.3f}"
+    )
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for each problem: medians over seeds of both ratios."""
+    found = []
+    for task in dict.fromkeys(row["task"] for row in rows):
+        mine = [row for row in rows if row["task"] == task and not row["error"] and not row["skipped"]]
+        if not mine:
+            found.append(f"{task}: not run")
+            continue
+        names = ("seconds_ratio", "cpu_ratio", "heldout_ratio")
+        seconds, cpu, error = (float(np.median([row[name] for row in mine])) for name in names)
+        found.append(
+            f"{task}: {len(mine)} seeds; first answer / mujoco.sysid: {seconds:.2f} in seconds, {cpu:.2f} in "
+            f"processor time, {error:.3f} in held-out error"
+        )
+    return found

@@ -1,0 +1,111 @@
+"""Rows of a bench: cells that are not done yet are run, and each row is kept at once, with the machine."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deal_hw.data.files import write_json
+from deal_hw.data.run_folder import git_commit, versions
+from deal_hw.errors import DatasetError, shown
+from deal_hw.reading import read_json
+
+FORMAT = "deal_hw.bench/1"
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cells:
+    """What a bench runs.
+
+    Attributes:
+        names: Fields of a row that tell it apart from all others.
+        runs: For each cell the values of these fields, and what runs it.
+    """
+
+    names: Sequence[str]
+    runs: Sequence[tuple[tuple[Any, ...], Callable[[], Row]]]
+
+
+def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], None]) -> list[Row]:
+    """Run the cells that a file has no sound row of, writing the file after each; return all rows.
+
+    Args:
+        cells: What to run.
+        out: File of the rows; the CSV lies beside it.
+        after: Called after each cell with its place, such as "2/10", its row and all rows.
+
+    Raises:
+        DatasetError: The file holds something else.
+    """
+    rows = load_rows(out)
+
+    def key(row: Row) -> tuple[Any, ...]:
+        return tuple(row.get(name, "") for name in cells.names)
+
+    done = {key(row) for row in rows if not row["error"] and not row.get("skipped")}
+    for number, (cell, run) in enumerate(cells.runs, start=1):
+        if cell in done:
+            continue
+        row = run()
+        rows = [r for r in rows if key(r) != cell] + [row]
+        save_rows(out, rows)
+        after(f"{number}/{len(cells.runs)}", row, rows)
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """What the file of a bench holds."""
+
+    format: str
+    rows: tuple[dict[str, Any], ...]
+
+
+def load_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a file; none where there is no file.
+
+    Raises:
+        DatasetError: It holds something else.
+    """
+    if not path.exists():
+        return []
+    found = read_json(path, _Rows, "rows of a bench", "name another file")
+    if found.format != FORMAT:
+        raise DatasetError(f"{path} has format {shown(found.format)}, not {FORMAT!r}; name another file")
+    return list(found.rows)
+
+
+def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the machine they came from, as JSON and as CSV."""
+    write_rows(path, rows)
+    names = sorted({k for row in rows for k, v in row.items() if not isinstance(v, dict | list)})
+    with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], program: str = "deal-hw") -> None:
+    """Write rows with the machine and the command they came from, as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = {"format": FORMAT, "machine": describe_machine(), "argv": [program, *sys.argv[1:]]}
+    write_json(path, {**values, "rows": list(rows)})
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return what a reader of measurements must know of the machine."""
+    return {
+        "platform": platform.platform(),
+        "processors": len(os.sched_getaffinity(0)),
+        "load": list(os.getloadavg()),
+        "versions": versions(),
+        "git_commit": git_commit(),
+    }

@@ -1,0 +1,133 @@
+"""Tables, lines and figures of benches whose truth is known, and of the bench on real recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from deal_hw.errors import MissingExtraError
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """Return one row in words."""
+    head = f"{' '.join(_group(row))} seed {row['seed']}"
+    if row["error"]:
+        return f"{head}: {row['error']}"
+    if row["bench"] == "real":
+        errors = (f"{name} {row[f'heldout_rmse_{name}']:.4g}" for name in ("nominal", "calibrated"))
+        return f"{head}: held-out RMSE {', '.join(errors)}, {row['seconds']:.0f} s"
+    text = f"{head}: error {row['error_percent']:.2f} %, log error x100 {row['log_error_x100']:.2f}"
+    text += f", {row['seconds']:.0f} s"
+    if "angle_error_retrained" in row:
+        text += (
+            f", angle error UDR {row['angle_error_udr']:.4f} retrained {row['angle_error_retrained']:.4f} "
+            f"oracle {row['angle_error_oracle']:.4f} rad"
+        )
+    return text
+
+
+def figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Draw parameter errors and, where policies were trained, their pole angles.
+
+    Args:
+        path: Of the PNG.
+        rows: Rows without errors, at least one.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as err:
+        raise MissingExtraError("matplotlib", "bench") from err
+    trained = [row for row in rows if "angle_error_retrained" in row]
+    figure = Figure(figsize=(7.5, 3.6), layout="constrained")
+    panels = figure.subplots(1, 1 + bool(trained), width_ratios=(3, 2)[: 1 + bool(trained)], squeeze=False)[0]
+    left = panels[0]
+    groups = list(dict.fromkeys(_group(row) for row in rows))
+    # Only what tells the groups apart is worth a label's room.
+    told = [i for i, column in enumerate(zip(*groups, strict=True)) if len(set(column)) > 1] or [-1]
+    for i, group in enumerate(groups):
+        # An exact result has no place on a log scale.
+        values = [max(row["log_error_x100"], 1e-3) for row in rows if _group(row) == group]
+        left.plot([i] * len(values), values, "o", alpha=0.6, color=f"C{i}")
+    labels = [" ".join(group[i] for i in told) for group in groups]
+    left.set_xticks(range(len(groups)), labels, rotation=30, ha="right")
+    left.set_yscale("log")
+    left.set_ylabel("100 mean |ln(p / p*)|")
+    left.set_title("parameter error, one point a seed (below 1e-3: drawn at 1e-3)", fontsize=10)
+    for row in trained:
+        right = panels[1]
+        values = [row[f"angle_error_{name}"] for name in ("udr", "retrained", "oracle")]
+        right.plot(range(3), values, "o-", alpha=0.5, color="C0", linewidth=0.8)
+        right.set_xticks(range(3), ["UDR", "retrained", "oracle"])
+        right.set_yscale("log")
+        right.set_title("pole-angle error [rad]", fontsize=10)
+    figure.savefig(path, dpi=130)
+
+
+def print_real(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print held-out errors, a line a row."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="held-out RMSE in rad or m: mean over joints, all samples pooled")
+    words = ("robot", "held out", "method")
+    for name in (*words, "seed", "mean", "pooled", "nominal", "at a bound", "flagged", "seconds"):
+        table.add_column(name, justify="left" if name in words else "right")
+    for row in rows:
+        numbers = (
+            row.get(f"heldout_{key}") for key in ("rmse_calibrated", "pooled_calibrated", "rmse_nominal")
+        )
+        table.add_row(
+            row["task"],
+            row.get("split", ""),
+            _group(row)[-1],
+            str(row["seed"]),
+            *("diverged" if value is None else f"{value:.4f}" for value in numbers),
+            str(len(row["at_bound"])),
+            str(int(row["flagged"])),
+            f"{row['seconds']:.0f}",
+        )
+    Console(width=120).print(table)
+
+
+def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print median and worst by profile and method."""
+    import numpy as np
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="median over seeds (worst)")
+    for name in (
+        "task", "profile", "xi", "method", "seeds", "error %", "log error x100", "coverage90", "width90",
+        "held-out / nominal", "latency error ms", "flagged", "seconds",
+    ):  # fmt: skip
+        table.add_column(name, justify="left" if name in ("task", "profile", "method") else "right")
+    for group in dict.fromkeys(_group(row) for row in rows):
+        part = [row for row in rows if _group(row) == group]
+
+        def values(name: str, rows: Sequence[Mapping[str, Any]] = part) -> Any:
+            return np.array([row[name] for row in rows], dtype=float)
+
+        ratio = values("heldout_nrmse_calibrated") / values("heldout_nrmse_nominal")
+        late = 1e3 * np.abs(values("latency_found") - values("latency_true"))
+        table.add_row(
+            *group,
+            str(len(part)),
+            *(
+                f"{np.median(values(n)):.2f} ({values(n).max():.2f})"
+                for n in ("error_percent", "log_error_x100")
+            ),
+            f"{values('coverage90').mean():.2f}",
+            f"{np.median(values('width90')):.2f}",
+            f"{np.median(ratio):.3f} ({ratio.max():.3f})",
+            f"{np.median(late):.2f} ({late.max():.2f})",
+            f"{int(values('flagged').sum())}",
+            f"{np.median(values('seconds')):.0f} ({values('seconds').max():.0f})",
+        )
+    Console(width=150).print(table)
+
+
+def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a line of the summary stands for."""
+    method = row["method"] + (" + polish" if row.get("polish") and row["method"] != "default" else "")
+    return row.get("task", "cartpole"), row["profile"], f"{row['xi']:g}", method

@@ -1,0 +1,193 @@
+"""Settings of ``deal-hw emulate``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from deal_hw.cli.options import Range, Ratio, Seed, Share, check_ranges
+from deal_hw.drivers.go2.emulator.faults import Go2Faults
+from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.transport import WireOptions
+
+DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
+"""Transports of the Go2, and where its emulator is by default: on this machine alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Go2Options:
+    """Options of ``emulate go2`` alone."""
+
+    suspended: bool = False
+    """The base is held in the air: no floor, no contact."""
+
+    start: Literal["lying", "standing"] = "lying"
+    """Limp on the floor, or standing with sport mode in control."""
+
+    sport: Literal["normal", "ai", "advanced", "mcf", "off"] = "normal"
+    """The sport mode that is active at power-up; it fights every other command until it is released."""
+
+    sport_silent: bool = False
+    """Sport mode's own commands are not seen on rt/lowcmd."""
+
+    remote_script: Path | None = None
+    """JSON file with what the remote says from when on: [{"at_s": 2.0, "buttons": "L2+B", "left_y": 0.5}]"""
+
+    no_remote: bool = False
+    """No remote is heard: its 40 bytes are zeros."""
+
+    tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
+    """The robot's clock at the start [ms]; it wraps at 2**32."""
+
+    domain: Annotated[int, Range(0, 232)] = 0
+    """DDS domain."""
+
+    mode: Literal["peer", "client"] = "peer"
+    """Zenoh: wait for peers at the port, or be a client of the router there."""
+
+    insecure: bool = False
+    """Zenoh: allow plain TCP beyond this machine."""
+
+    ca: Path | None = None
+    """Zenoh over TLS: the authority that peers are checked against (PEM)."""
+
+    certificate: Path | None = None
+    """Zenoh over TLS: our certificate (PEM)."""
+
+    key: Path | None = None
+    """Zenoh over TLS: its private key (PEM)."""
+
+    faults: tyro.conf.OmitArgPrefixes[Go2Faults] = field(default_factory=Go2Faults)
+    """Faults of the Go2, which begin so long after the first stiff command."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+    def wire(self, transport: str) -> WireOptions:
+        """Return how the emulator joins the wire."""
+        return WireOptions(
+            domain=self.domain, listen=transport == "zenoh" and self.mode == "peer", mode=self.mode,
+            insecure=self.insecure, ca=self.ca, certificate=self.certificate, key=self.key,
+        )  # fmt: skip
+
+    def given(self) -> list[str]:
+        """Return the flags of options that differ from their defaults."""
+        given = vars(self) | asdict(self.faults)
+        default = vars(Go2Options()) | asdict(Go2Faults())
+        return [
+            "--" + name.replace("_", "-")
+            for name, value in given.items()
+            if name != "faults" and value != default[name]
+        ]
+
+
+TRANSPORTS = {"cartpole": ("serial",), "go2": tuple(DEFAULT_PORTS)}
+"""Robots to emulate and the wires that each speaks on; the first is the default."""
+CARTPOLE_XI = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Emulate:
+    """Emulate a robot in real time on a port of its own, with physics that nobody can look inside."""
+
+    robot: tyro.conf.Positional[str] = "cartpole"
+    """The robot to emulate."""
+
+    transport: str | None = None
+    """The wire to speak on. Cart-pole: "serial", a pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
+
+    port: str | None = None
+    """Go2: network interface or its address (dds), or end point to listen at (zenoh; number 0: a free
+    one). By default on this machine alone."""
+
+    profile: Literal["ideal", "sensor", "realistic"] = "realistic"
+    """ideal: equations only; sensor: noise, quantisation and a hidden latency; realistic: also jitter,
+    Stribeck friction and dropped frames, backlash (cart-pole), encoder bias and torque-speed limit (Go2)."""
+
+    seed: Seed = 0
+    """Decides the hidden parameters, the noise and the start angles."""
+
+    xi: Annotated[float | None, Ratio] = None
+    """Hidden parameters lie within this ratio of the nominal ones; 5 for the cart-pole, 2 for the Go2."""
+
+    nominal: bool = False
+    """Use the nominal parameters and no latency instead of hidden ones."""
+
+    truth_from: Path | None = None
+    """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
+
+    link: Path | None = None
+    """Make a symbolic link to the port here."""
+
+    reveal: bool = False
+    """Print the truth and what happened as one line of JSON at the end."""
+
+    reveal_to: Path | None = None
+    """Write the same to this JSON file at the end."""
+
+    duration_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Stop after this time [s]; without it, at Ctrl-C."""
+
+    corrupt: Share = 0.0
+    """Share of frames from the device in which a byte is changed."""
+
+    drop: Share = 0.0
+    """Share of frames from the device that are lost."""
+
+    duplicate: Share = 0.0
+    """Share of frames from the device that come twice."""
+
+    freeze_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The firmware hangs this long after the motor was first armed, or commanded [s]."""
+
+    cut_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The wire is cut this long after the motor was first armed, or commanded [s]: nothing goes out and
+    nothing is heard. The signal SIGUSR1 cuts it at any moment."""
+
+    cut_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
+    """How long the wire is cut [s]."""
+
+    vanish_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The port vanishes this long after the motor was first armed, like a cable that is pulled [s]."""
+
+    return_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The port comes back under --link so long after it vanished [s]; without it the emulator ends there."""
+
+    events_to: Path | None = None
+    """Append to this file what the robot is told, while it happens: lines of JSON with device time [ms], host
+    time [ns] and what it was."""
+
+    parent: Annotated[int | None, Range(1, 2**22)] = None
+    """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
+
+    go2: tyro.conf.OmitArgPrefixes[Go2Options] = field(default_factory=Go2Options)
+    """Options of the Go2 alone."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if self.robot not in TRANSPORTS:
+            raise UnknownNameError("robot to emulate", self.robot, TRANSPORTS)
+        if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:
+            raise UnknownNameError("transport to emulate on", self.transport, TRANSPORTS[self.robot])
+        if foreign := self._foreign():
+            raise ConfigurationError(f"emulate {self.robot} has no {', '.join(foreign)}")
+        if self.nominal and self.truth_from is not None:
+            raise ConfigurationError("--nominal and --truth-from exclude each other")
+        if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
+            raise ConfigurationError(
+                "--return-after-s needs --vanish-after-s and --link: the new port has another name"
+            )
+
+    def _foreign(self) -> list[str]:
+        """Return the flags given that belong to another robot."""
+        if self.robot == "cartpole":
+            return self.go2.given() + (["--port"] if self.port is not None else [])
+        own = {
+            "--link": self.link,
+            "--vanish-after-s": self.vanish_after_s,
+            "--return-after-s": self.return_after_s,
+        }
+        return [flag for flag, value in own.items() if value is not None]
