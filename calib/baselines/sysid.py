@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.baselines.least_squares import Found, OneShot, textbook_covariance
-from deal_hw.calib.data.coordinates import Coordinates
 from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.recordings.sysid_adapter import Recording, check_space, identify, require_sysid
 
@@ -50,22 +49,22 @@ class MujocoSysid(Search):
     def __init__(self, settings: SysidSettings | None = None) -> None:
         self.settings = settings or SysidSettings()
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run before its only generation; nothing is drawn.
 
         Raises:
             ConfigurationError: A parameter has no counterpart, or joint positions were not measured.
             MissingExtraError: ``mujoco.sysid`` is not installed.
         """
-        problem, settings = run.problem, self.settings
+        problem, settings = log.problem, self.settings
         require_sysid()
         check_space(problem.space)
         _check_channels(problem)
         given = settings.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
         source = "given" if given is not None else "none, as its user would have it"
-        latency_s = Coordinates(problem).clip_latency(given or 0.0)
+        latency_s = log.coordinates.clip_latency(given or 0.0)
         words = f"its own, {1e3 * latency_s:g} ms of latency ({source})"
-        return OneShot(run, settings, lambda: _solve(run, settings.ticks, latency_s), words)
+        return OneShot(log, lambda: _solve(log, settings.ticks, latency_s), words)
 
 
 def _check_channels(problem: Problem) -> None:
@@ -78,8 +77,8 @@ def _check_channels(problem: Problem) -> None:
         )
 
 
-def _solve(run: Run, ticks: int, latency_s: float) -> Found:
-    problem = run.problem
+def _solve(log: SearchLog, ticks: int, latency_s: float) -> Found:
+    problem = log.problem
     recordings = [
         Recording(problem.episodes[d.episode], d.windows, d.start_position, d.start_velocity)
         for d in cut(problem, ticks)
@@ -90,7 +89,7 @@ def _solve(run: Run, ticks: int, latency_s: float) -> Found:
         space,
         recordings,
         latency_s=latency_s,
-        iterations=run.budget.generations,
+        iterations=log.budget.generations,
         threads=problem.threads,
     )
     # From derivatives by the value to those by its logarithm, where that is the scale.
