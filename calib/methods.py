@@ -11,8 +11,8 @@ from deal_hw.calibration import CalibrationMethod
 from deal_hw.errors import UnknownNameError
 
 METHODS: dict[str, str] = {
-    "default": "deal_hw.calib.search.eki:Weki",
-    "weki": "deal_hw.calib.search.eki:Weki",
+    "default": "deal_hw.calib.search.eki:Eki",
+    "eki": "deal_hw.calib.search.eki:Eki",
     "deal": "deal_hw.calib.search.deal:Deal",
     "deal-paper": "deal_hw.calib.deal_paper.algorithm1:paper",
     "deal-paper-literal": "deal_hw.calib.deal_paper.algorithm1:literal",
@@ -68,10 +68,10 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
     if not polish or name in NULL_METHODS | WHOLE_METHODS:
         return search
     from deal_hw.calib.pipeline import PolishedMethod
-    from deal_hw.calib.search.eki import Weki
+    from deal_hw.calib.search.eki import Eki
     from deal_hw.calib.validation.checks import Validation
 
-    if isinstance(search, Weki):
+    if isinstance(search, Eki):
         search = dataclasses.replace(
             search, settings=dataclasses.replace(search.settings, before_polish=True)
         )

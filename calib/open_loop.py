@@ -27,8 +27,8 @@ from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
 from deal_hw.calib.fit.refinement import Polished, at_parameters
 from deal_hw.calib.pipeline import Calibration, Outcome, offer
-from deal_hw.calib.search.eki import Weki
-from deal_hw.calib.search.restarts import Attempts
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.uncertainty.correlated import confounded
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, ended_at_bound, uncertainty
@@ -101,7 +101,7 @@ class OpenLoop(Calibration):
     """Searches, fits open-loop predictions, and takes what inner folds say predicts best.
 
     Args:
-        search: The search; `weki` by default.
+        search: The search; `eki` by default.
         folds: Let inner folds choose; otherwise the fit over long horizons is taken.
         local_first: Refine the model's own values first; where that explains the recordings it is the answer.
         name: Name of the whole.
@@ -115,14 +115,14 @@ class OpenLoop(Calibration):
         local_first: bool = True,
         name: str = "open-loop",
     ) -> None:
-        super().__init__(search or Weki(), name, Validation(local_first=local_first, folds=folds))
+        super().__init__(search or Eki(), name, Validation(local_first=local_first, folds=folds))
 
     def fitted(
         self,
         problem: Problem,
         budget: Budget,
         rng: np.random.Generator,
-        attempts: Attempts,
+        attempts: Restarts,
         local: Polished | None,
         progress: ProgressCallback | None,
     ) -> Outcome:

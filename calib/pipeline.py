@@ -21,7 +21,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.local import local_fit
 from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust
 from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis
-from deal_hw.calib.search.restarts import Attempts
+from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.at_fit import statement, with_rows
 from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty
 from deal_hw.calib.uncertainty.latency_scan import averaged, scan_latency
@@ -129,7 +129,7 @@ class Calibration(CalibrationMethod[Problem]):
             if local is not None and progress is not None:
                 local = with_rows(local)
                 foretell(problem, local, progress)
-            attempts = Attempts(self.search, rng, checkpoint)
+            attempts = Restarts(self.search, rng, checkpoint)
             found = self.fitted(problem, budget, rng, attempts, local, progress)
             earlier_steps, earlier_seconds = attempts.earlier_steps, attempts.earlier_seconds
         searched, known = found.searched, found.known
@@ -164,7 +164,7 @@ class Calibration(CalibrationMethod[Problem]):
         problem: Problem,
         budget: Budget,
         rng: np.random.Generator,
-        attempts: Attempts,
+        attempts: Restarts,
         local: Polished | None,
         progress: ProgressCallback | None,
     ) -> Outcome:
@@ -188,7 +188,7 @@ class PolishedMethod(Calibration):
         problem: Problem,
         budget: Budget,
         rng: np.random.Generator,
-        attempts: Attempts,
+        attempts: Restarts,
         local: Polished | None,
         progress: ProgressCallback | None,
     ) -> Outcome:
@@ -344,7 +344,7 @@ def without_search(problem: Problem, budget: Budget, local: Polished) -> Calibra
 
 
 def _until_explained(
-    attempts: Attempts, problem: Problem, budget: Budget, progress: ProgressCallback | None
+    attempts: Restarts, problem: Problem, budget: Budget, progress: ProgressCallback | None
 ) -> tuple[CalibrationResult, Polished, int]:
     best: tuple[CalibrationResult, Polished] | None = None
     attempt, left = 0, budget.generations

@@ -90,7 +90,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, help="JSON file to write")
-    parser.add_argument("--methods", default="deal-paper,deal,weki")
+    parser.add_argument("--methods", default="deal-paper,deal,eki")
     parser.add_argument("--threads", type=int, default=1, help="of simulation, engine and critic alike")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--generations", type=int, default=50)

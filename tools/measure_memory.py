@@ -42,7 +42,7 @@ POLISHED = "default, polished"
 """What `deal-hw calibrate` does without options."""
 
 SEARCHES = (
-    "weki", "deal", "deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "deal-paper-flat",
+    "eki", "deal", "deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "deal-paper-flat",
     "easi", "bo", "cma", "gauss-newton", "ekf", "random",
 )  # fmt: skip
 """Methods with generations; a generation of `ekf` is a pass along the recording."""

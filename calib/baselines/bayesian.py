@@ -38,16 +38,10 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.checkpoint import State
-from deal_hw.calib.search.log import Run
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
-
-_FIT_ITERATIONS = 60
-_ACQUISITION_ITERATIONS = 30
-_STARTS, _RAW_STARTS, _SAMPLES = 2, 64, 64
-"""Starts of the acquisition's optimiser, draws they are chosen from, and draws of the process."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +58,11 @@ class BoSettings:
             range.
         most_points: Most points of the Gaussian process.
         elite: Members that make the population of the result, best first.
+        fit_iterations: Most iterations of the process's fit.
+        acquisition_iterations: Most iterations of the acquisition's optimiser.
+        acquisition_starts: From how many starts it is optimised.
+        acquisition_draws: Draws that these starts are chosen from.
+        process_draws: Draws of the process of which the improvement is the mean.
         scoring: How the fitness scores.
     """
 
@@ -72,6 +71,11 @@ class BoSettings:
     trust_region: bool = True
     most_points: int = 300
     elite: int = 10
+    fit_iterations: int = 60
+    acquisition_iterations: int = 30
+    acquisition_starts: int = 2
+    acquisition_draws: int = 64
+    process_draws: int = 64
     scoring: FitnessSettings = field(default_factory=FitnessSettings)
 
     def __post_init__(self) -> None:
@@ -83,13 +87,14 @@ class BoSettings:
             raise ConfigurationError(f"most_points must be at least 4, got {self.most_points}")
 
 
-class TrustRegion:
+class TrustRegion(Kept):
     """The side of the box in which the next batch is taken, in widths of the range (TuRBO, algorithm 1).
 
     Args:
         failures: Generations without a better point after which the box is halved.
     """
 
+    KEPT = ("length", "_good", "_bad")
     LONGEST, FIRST, SHORTEST = 1.6, 0.8, 0.5**7
     SUCCESSES = 3
     """Better points in a row after which the box is doubled."""
@@ -109,16 +114,8 @@ class TrustRegion:
             # TuRBO forgets all points here; the process is global, so that only the box starts again.
             self.length = self.FIRST
 
-    def save(self) -> State:
-        """Return length and counters."""
-        return {"length": self.length, "good": self._good, "bad": self._bad}
 
-    def load(self, state: State) -> None:
-        """Continue from a saved state."""
-        self.length, self._good, self._bad = float(state["length"]), int(state["good"]), int(state["bad"])
-
-
-class GaussianProcessSearch:
+class GaussianProcessSearch(Kept):
     """Points in the unit cube, proposed from a Gaussian process of the scores of earlier ones.
 
     Knows no simulator: it is asked for points and told their fitness. All draws are those of one seed and the
@@ -131,6 +128,8 @@ class GaussianProcessSearch:
         seed: Decides all draws.
         stationary: Whether a point's fitness stays what it was; if not, earlier points are scored again.
     """
+
+    KEPT = ("_points", "_fitness", "_generation", "_seed", "scored", "fallbacks", "region")
 
     def __init__(
         self, count: int, population: int, settings: BoSettings, seed: int, *, stationary: bool
@@ -204,26 +203,6 @@ class GaussianProcessSearch:
         kept = self._kept(max(self._settings.most_points, 2 * self._settings.elite))
         self._points, self._fitness = self._points[kept], self._fitness[kept]
 
-    def save(self) -> State:
-        """Return points, scores and counters."""
-        return {
-            "points": self._points,
-            "fitness": self._fitness,
-            "generation": self._generation,
-            "seed": self._seed,
-            "scored": self.scored,
-            "fallbacks": self.fallbacks,
-            "region": self.region.save(),
-        }
-
-    def load(self, state: State) -> None:
-        """Continue from a saved state."""
-        self._points, self._fitness = np.array(state["points"]), np.array(state["fitness"])
-        self._generation, self._seed = int(state["generation"]), int(state["seed"])
-        self.fallbacks, self._asked = int(state["fallbacks"]), None
-        self.scored = int(state["scored"])
-        self.region.load(state["region"])
-
     def _sobol(self, count: int) -> FloatArray:
         seed = np.random.default_rng([self._seed, self._generation])
         # A power of two of points is balanced; a part of it is the next best thing, not an error.
@@ -243,7 +222,7 @@ class GaussianProcessSearch:
         if len(np.unique(fitness[np.isfinite(fitness)])) > 1:
             side = self.region.length if self._settings.trust_region else None
             seed = self._seed + self._generation
-            found = _largest_improvement(points, _quantiles(fitness), batch, side, seed)
+            found = _largest_improvement(points, _quantiles(fitness), batch, side, seed, self._settings)
         if found is None:
             self.fallbacks += 1
             return self._sobol(batch)
@@ -260,7 +239,7 @@ def _quantiles(fitness: FloatArray) -> FloatArray:
 
 
 def _largest_improvement(
-    points: FloatArray, value: FloatArray, batch: int, side: float | None, seed: int
+    points: FloatArray, value: FloatArray, batch: int, side: float | None, seed: int, settings: BoSettings
 ) -> FloatArray | None:
     """Return the batch of the largest qLogEI, (batch, C), or None where the process could not be fitted.
 
@@ -270,9 +249,19 @@ def _largest_improvement(
         batch: Points to return.
         side: Mean side of the box around the best point in which to look; None for the unit cube.
         seed: Decides all draws.
+        settings: Iterations and draws.
     """
-    bo = _botorch()
-    torch = bo.torch
+    _require_botorch()
+    import torch
+    from botorch.acquisition.logei import qLogExpectedImprovement
+    from botorch.exceptions.errors import ModelFittingError
+    from botorch.fit import fit_gpytorch_mll
+    from botorch.models import SingleTaskGP
+    from botorch.optim.optimize import optimize_acqf
+    from botorch.sampling.normal import SobolQMCNormalSampler
+    from gpytorch.mlls import ExactMarginalLogLikelihood
+    from linear_operator.utils.errors import NanError, NotPSDError
+
     from deal_hw.calib.search.critic import torch_threads
 
     x, y = torch.from_numpy(points), torch.from_numpy(value)[:, None]
@@ -281,21 +270,25 @@ def _largest_improvement(
         warnings.simplefilter("ignore")
         torch.manual_seed(seed)
         try:
-            model = bo.process(x, y, outcome_transform=None)
-            likelihood = bo.likelihood(model.likelihood, model)
-            options = {"maxiter": _FIT_ITERATIONS}
-            bo.fit(likelihood, optimizer_kwargs={"options": options})
-            sampler = bo.sampler(torch.Size([_SAMPLES]), seed=seed)
-            acquisition = bo.improvement(model, best_f=y.max(), sampler=sampler)
-            found, _ = bo.optimise(
+            model = SingleTaskGP(x, y, outcome_transform=None)
+            likelihood = ExactMarginalLogLikelihood(model.likelihood, model)
+            options = {"maxiter": settings.fit_iterations}
+            fit_gpytorch_mll(likelihood, optimizer_kwargs={"options": options})
+            sampler = SobolQMCNormalSampler(torch.Size([settings.process_draws]), seed=seed)
+            acquisition = qLogExpectedImprovement(model, best_f=y.max(), sampler=sampler)
+            found, _ = optimize_acqf(
                 acquisition,
                 bounds=torch.from_numpy(_box(points, value, model, side)),
                 q=batch,
-                num_restarts=_STARTS,
-                raw_samples=_RAW_STARTS,
-                options={"maxiter": _ACQUISITION_ITERATIONS, "seed": seed, "sample_around_best": True},
+                num_restarts=settings.acquisition_starts,
+                raw_samples=settings.acquisition_draws,
+                options={
+                    "maxiter": settings.acquisition_iterations,
+                    "seed": seed,
+                    "sample_around_best": True,
+                },
             )
-        except bo.failures:
+        except (ModelFittingError, NanError, NotPSDError):
             return None
     return np.asarray(found.detach().numpy(), dtype=float)
 
@@ -324,9 +317,9 @@ class BayesianOptimisation(Search):
     settings: BoSettings = field(default_factory=BoSettings)
     policy: PopulationPolicy | None = None
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """See :meth:`Search.begin`."""
-        return _Bo(run, rng, self.settings, self.policy)
+        return _Bo(log, rng, self.settings, self.policy)
 
 
 def critic_return() -> BayesianOptimisation:
@@ -335,16 +328,18 @@ def critic_return() -> BayesianOptimisation:
 
 
 class _Bo(ScoredStepper):
+    INTERVAL = "spread of the best points, uncalibrated"
+
     def __init__(
-        self, run: Run, rng: np.random.Generator, settings: BoSettings, policy: PopulationPolicy | None
+        self, log: SearchLog, rng: np.random.Generator, settings: BoSettings, policy: PopulationPolicy | None
     ) -> None:
-        super().__init__(run, rng, settings.fitness, settings.scoring, policy)
+        super().__init__(log, rng, settings.fitness, settings.scoring, policy)
         self._settings = settings
         # Now rather than after the first generation has been simulated.
-        _botorch()
+        _require_botorch()
         self._search = GaussianProcessSearch(
             self.coordinates.count,
-            run.budget.population,
+            log.budget.population,
             settings,
             int(rng.integers(2**31)),
             stationary=self.stationary,
@@ -369,29 +364,11 @@ class _Bo(ScoredStepper):
             },
         )
 
-    def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`; the estimate is the best point, the population the best few."""
-        found = self._search.points[self._search.order] if self.run.trace else self._search.ask()
+    def found(self) -> tuple[Members, Members]:
+        """Return the best point and the best few."""
+        found = self._search.points[self._search.order] if self.log.trace else self._search.ask()
         elite = self.coordinates.members(found[: self._settings.elite])
-        centre = Members(elite.theta[:1], elite.latency_s[:1])
-        return self.run.result(
-            self.coordinates,
-            centre,
-            elite,
-            settings=self._settings,
-            chi2=self.residual(centre),
-            alarms=self.alarms(),
-            extra={"interval": "spread of the best points, uncalibrated"},
-        )
-
-    def save(self) -> State:
-        """See :meth:`Stepper.save`."""
-        return {"search": self._search.save(), "fitness": self.fitness.save()}
-
-    def load(self, state: State) -> None:
-        """See :meth:`Stepper.load`."""
-        self._search.load(state["search"])
-        self.fitness.load(state["fitness"])
+        return Members(elite.theta[:1], elite.latency_s[:1]), elite
 
 
 @functools.cache
@@ -407,43 +384,11 @@ def _give_back() -> None:
     _trimmer()(0)
 
 
-@dataclass(frozen=True, slots=True)
-class _Botorch:
-    """What is used of BoTorch and GPyTorch, loaded on use."""
-
-    torch: Any
-    process: Any
-    likelihood: Any
-    fit: Any
-    improvement: Any
-    sampler: Any
-    optimise: Any
-    failures: tuple[type[Exception], ...]
-
-
-def _botorch() -> _Botorch:
+def _require_botorch() -> None:
     try:
         with warnings.catch_warnings():
-            # Its parts use parts of torch that are on their way out.
+            # It uses parts of torch that are on their way out.
             warnings.simplefilter("ignore")
-            import torch
-            from botorch.acquisition.logei import qLogExpectedImprovement
-            from botorch.exceptions.errors import ModelFittingError
-            from botorch.fit import fit_gpytorch_mll
-            from botorch.models import SingleTaskGP
-            from botorch.optim.optimize import optimize_acqf
-            from botorch.sampling.normal import SobolQMCNormalSampler
-            from gpytorch.mlls import ExactMarginalLogLikelihood
-            from linear_operator.utils.errors import NanError, NotPSDError
+            import botorch  # noqa: F401
     except ImportError as err:  # pragma: no cover - the extra is installed where the tests run
         raise MissingExtraError("botorch", "bench") from err
-    return _Botorch(
-        torch,
-        SingleTaskGP,
-        ExactMarginalLogLikelihood,
-        fit_gpytorch_mll,
-        qLogExpectedImprovement,
-        SobolQMCNormalSampler,
-        optimize_acqf,
-        (ModelFittingError, NanError, NotPSDError),
-    )

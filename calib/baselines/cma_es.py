@@ -7,23 +7,20 @@ The baseline of robot calibration in practice (PACE, NVIDIA's extension). Restar
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.checkpoint import State
-from deal_hw.calib.search.log import Run
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import Kept, State
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
-
-_SAME = 1e-9
-"""A replayed mean may be off by this, or the numerical libraries differ from those of the saved run."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +56,7 @@ class CmaSettings:
             )
 
 
-class RestartedCma:
+class RestartedCma(Kept):
     """CMA-ES in the unit cube, restarted when a run is over; all randomness comes from one seed.
 
     Knows no simulator: it is asked for a population and told its cost. pycma's state cannot be stored but by
@@ -156,7 +153,8 @@ class RestartedCma:
             size = self.population
             self.tell(costs[at : at + size])
             at += size
-        if not np.allclose(self.mean, state["mean"], rtol=0.0, atol=_SAME):
+        # Off by more than rounding, the libraries are not those of the saved run.
+        if not np.allclose(self.mean, state["mean"], rtol=0.0, atol=1e-9):
             raise DatasetError(
                 "the saved run of `cma` cannot be repeated here: its costs lead to another mean; resume it "
                 "with the versions of cma and numpy that began it, or start again"
@@ -176,32 +174,33 @@ class Cma(Search):
     settings: CmaSettings = field(default_factory=CmaSettings)
     policy: PopulationPolicy | None = None
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """See :meth:`Search.begin`."""
-        return _Cma(run, rng, self.settings, self.policy)
+        return _Cma(log, rng, self.settings, self.policy)
 
 
 class _Cma(ScoredStepper):
+    KEPT = ("_search", "_fitness", "_scored", "_best")
+
     def __init__(
-        self, run: Run, rng: np.random.Generator, settings: CmaSettings, policy: PopulationPolicy | None
+        self, log: SearchLog, rng: np.random.Generator, settings: CmaSettings, policy: PopulationPolicy | None
     ) -> None:
-        super().__init__(run, rng, settings.fitness, settings.scoring, policy)
-        self._settings = settings
-        usual = min(4 + int(3 * np.log(self.coordinates.count)), run.budget.population)
+        super().__init__(log, rng, settings.fitness, settings.scoring, policy)
+        usual = min(4 + int(3 * np.log(self.coordinates.count)), log.budget.population)
         first = settings.population or usual
         self._search = RestartedCma(self.coordinates.count, first, settings, int(rng.integers(2**62)))
         self._scored = 0
-        self._best = Best.none(self.coordinates.count)
+        self._best = Best(self.coordinates.count)
 
     @property
     def finished(self) -> bool:
         """Whether the next population would be more than what is left of the budget."""
-        budget = self.run.budget
+        budget = self.log.budget
         return bool(self._scored + self._search.population > budget.population * budget.generations)
 
     def step(self) -> None:
         """Ask, score and tell, until the share of one of the budget's generations is used up."""
-        share = (len(self.run.trace) + 1) * self.run.budget.population
+        share = (len(self.log.trace) + 1) * self.log.budget.population
         scored = diverged = 0.0
         while True:
             unit, restarts, sigma = self._search.ask(), self._search.restarts, self._search.sigma
@@ -210,7 +209,7 @@ class _Cma(ScoredStepper):
             self._search.tell(-fitness)
             self._scored += len(unit)
             scored, diverged = scored + values["scored"], diverged + values["diverged"]
-            self._best = self._best.updated(unit, fitness, restarts, keep=self.stationary)
+            self._best.tell(unit, fitness, restarts, keep=self.stationary)
             if self.finished or self._scored + self._search.population > share:
                 break
         self.note(
@@ -226,64 +225,40 @@ class _Cma(ScoredStepper):
             },
         )
 
-    def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`.
+    def found(self) -> tuple[Members, Members]:
+        """Return the best member of all runs, and the population of its run.
 
-        The estimate is the best member of all runs, the population that of its run; where the fitness changes
-        over the generations, the best of the last one.
+        Where the fitness changes over the generations, the best of the last one.
         """
-        centre = self.coordinates.members(self._best.unit[None])
-        return self.run.result(
-            self.coordinates,
-            centre,
-            self.coordinates.members(self._best.population),
-            settings=self._settings,
-            chi2=self.residual(centre),
-            alarms=self.alarms(),
-            extra={"restarts": self._search.restarts, "interval": "population spread, uncalibrated"},
-        )
+        best = self._best
+        return self.coordinates.members(best.unit[None]), self.coordinates.members(best.population)
 
-    def save(self) -> State:
-        """See :meth:`Stepper.save`."""
-        return {
-            "search": self._search.save(),
-            "fitness": self.fitness.save(),
-            "scored": self._scored,
-            "best": asdict(self._best),
-        }
-
-    def load(self, state: State) -> None:
-        """See :meth:`Stepper.load`."""
-        self._search.load(state["search"])
-        self.fitness.load(state["fitness"])
-        self._scored = int(state["scored"])
-        self._best = Best(**state["best"])
+    def facts(self) -> dict[str, Any]:
+        """See :meth:`ScoredStepper.facts`."""
+        return {"restarts": self._search.restarts}
 
 
-@dataclass(frozen=True, slots=True)
-class Best:
-    """The best member so far.
+class Best(Kept):
+    """The best member so far; before any was scored, the centre of the range.
+
+    Args:
+        count: Coordinates C.
 
     Attributes:
-        unit: Its unit coordinates, (C,); the centre of the range before any was scored.
+        unit: Its unit coordinates, (C,).
         fitness: Its fitness.
         run: The run it belongs to.
         population: The last population of that run, (n, C).
     """
 
-    unit: FloatArray
-    fitness: float
-    run: int
-    population: FloatArray
+    KEPT = ("unit", "fitness", "run", "population")
 
-    @classmethod
-    def none(cls, count: int) -> Best:
-        """Return what is known before any member was scored."""
-        corners = np.stack([np.zeros(count), np.ones(count)])
-        return cls(np.full(count, 0.5), -float("inf"), 0, corners)
+    def __init__(self, count: int) -> None:
+        self.unit, self.fitness, self.run = np.full(count, 0.5), -float("inf"), 0
+        self.population = np.stack([np.zeros(count), np.ones(count)])
 
-    def updated(self, unit: FloatArray, fitness: FloatArray, run: int, *, keep: bool) -> Best:
-        """Return the best after a further population.
+    def tell(self, unit: FloatArray, fitness: FloatArray, run: int, *, keep: bool) -> None:
+        """Look at a further population.
 
         Args:
             unit: The population, (n, C).
@@ -293,8 +268,9 @@ class Best:
         """
         top = int(np.argmax(fitness))
         if fitness[top] > self.fitness or (not keep and np.isfinite(fitness[top])):
-            return Best(unit[top], float(fitness[top]), run, unit)
-        return replace(self, population=unit) if run == self.run else self
+            self.unit, self.fitness, self.run = unit[top], float(fitness[top]), run
+        if run == self.run:
+            self.population = unit
 
 
 def _finite(cost: FloatArray) -> FloatArray:

@@ -20,10 +20,9 @@ from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.checkpoint import State
 from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.log import Run
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -70,7 +69,7 @@ def elite_weights(population: int, elites: int) -> FloatArray:
     return np.asarray(raw / raw.sum())
 
 
-class EliteGaussian:
+class EliteGaussian(Kept):
     """A diagonal Gaussian in the unit cube that is refitted to the best members of its own sample.
 
     Knows no simulator: it is asked for a population and told its fitness.
@@ -80,6 +79,8 @@ class EliteGaussian:
         survive_rate: Share of members that are elites.
         rng: Draws all later members.
     """
+
+    KEPT = ("_population", "mean", "std")
 
     def __init__(self, population: FloatArray, survive_rate: float, rng: np.random.Generator) -> None:
         if len(population) < 2:
@@ -113,15 +114,6 @@ class EliteGaussian:
             self.std = np.sqrt(weights @ (elites - self.mean) ** 2)
         draw = self._rng.standard_normal(self._population.shape)
         self._population = np.clip(self.mean + self.std * draw, 0.0, 1.0)
-
-    def save(self) -> State:
-        """Return everything that changes."""
-        return {"population": self._population, "mean": self.mean, "std": self.std}
-
-    def load(self, state: State) -> None:
-        """Continue from a saved state."""
-        self._population = np.array(state["population"])
-        self.mean, self.std = np.array(state["mean"]), np.array(state["std"])
 
 
 class Box:
@@ -158,9 +150,9 @@ class Easi(Search):
     settings: EasiSettings = field(default_factory=EasiSettings)
     policy: PopulationPolicy | None = None
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """See :meth:`Search.begin`."""
-        return _Easi(run, rng, self.settings, self.policy)
+        return _Easi(log, rng, self.settings, self.policy)
 
 
 def published() -> Easi:
@@ -170,15 +162,18 @@ def published() -> Easi:
 
 class _Easi(ScoredStepper):
     def __init__(
-        self, run: Run, rng: np.random.Generator, settings: EasiSettings, policy: PopulationPolicy | None
+        self,
+        log: SearchLog,
+        rng: np.random.Generator,
+        settings: EasiSettings,
+        policy: PopulationPolicy | None,
     ) -> None:
-        critic = replace(settings.critic, batch=settings.batch_per_member * run.budget.population)
+        critic = replace(settings.critic, batch=settings.batch_per_member * log.budget.population)
         scoring = replace(settings.scoring, critic=critic)
-        super().__init__(run, rng, settings.fitness, scoring, policy)
-        self._settings = settings
+        super().__init__(log, rng, settings.fitness, scoring, policy)
         self._box = Box(self.coordinates, settings.scale)
         # The latency's coordinate is drawn without its margin, all others uniformly.
-        start = self.coordinates.sample(rng, run.budget.population)
+        start = self.coordinates.sample(rng, log.budget.population)
         self._search = EliteGaussian(start, settings.survive_rate, rng)
 
     def step(self) -> None:
@@ -189,24 +184,6 @@ class _Easi(ScoredStepper):
         spread = float(self._search.std.mean())
         self.note(f"spread {spread:.3g} of the range", members, {**values, "spread": spread})
 
-    def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`; the estimate is the Gaussian's mean."""
-        centre = self._box.members(self._search.mean[None])
-        return self.run.result(
-            self.coordinates,
-            centre,
-            self._box.members(self._search.ask()),
-            settings=self._settings,
-            chi2=self.residual(centre),
-            alarms=self.alarms(),
-            extra={"interval": "population spread, uncalibrated"},
-        )
-
-    def save(self) -> State:
-        """See :meth:`Stepper.save`."""
-        return {"search": self._search.save(), "fitness": self.fitness.save()}
-
-    def load(self, state: State) -> None:
-        """See :meth:`Stepper.load`."""
-        self._search.load(state["search"])
-        self.fitness.load(state["fitness"])
+    def found(self) -> tuple[Members, Members]:
+        """Return the Gaussian's mean and its last sample."""
+        return self._box.members(self._search.mean[None]), self._box.members(self._search.ask())

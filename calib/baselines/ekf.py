@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import (
     LATENCY_STEP_S,
@@ -25,7 +24,7 @@ from deal_hw.calib.fit.residual import (
     value_bounds,
 )
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.uncertainty.intervals import Z90, intervals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
@@ -95,10 +94,6 @@ class ExtendedKalman:
         self.covariance[:n, :n] = np.diag(std**2)
 
 
-DIVERGED = 3.0
-"""Innovations that are so many times their own variance say that the filter does not follow the recording."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfSettings:
     """Settings of `ekf`.
@@ -112,12 +107,15 @@ class EkfSettings:
             of the start states' uncertainty.
         first_noise_factor: Factor on the sensors' standard deviations in the first pass; it falls by equal
             ratios to 1 in the last. While the parameters are far off, what bends outweighs the noise.
+        diverged: Innovations that are so many times their own variance say that the filter does not follow
+            the recording.
     """
 
     passes: int = 8
     parameter_drift: float = 1e-3
     velocity_noise: float = 0.0
     first_noise_factor: float = 30.0
+    diverged: float = 3.0
 
 
 class Ekf(Search):
@@ -132,26 +130,28 @@ class Ekf(Search):
     def __init__(self, settings: EkfSettings | None = None) -> None:
         self.settings = settings or EkfSettings()
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run before its first pass; the filter draws nothing."""
-        return _Passes(run, self.settings)
+        return _Passes(log, self.settings)
 
 
 class _Passes(Stepper):
     """One run: a generation is one pass along all recordings.
 
     Args:
-        run: Book-keeping.
+        log: Book-keeping of the run.
         settings: How to run.
     """
 
-    def __init__(self, run: Run, settings: EkfSettings) -> None:
-        self._run, self._settings, self._problem = run, settings, run.problem
-        self._coordinates = Coordinates(run.problem)
-        self._samples: Sequence[WindowData] = run.problem.windows(1)
-        self._low, self._high = value_bounds(run.problem)
-        space = run.problem.space
-        self._free_latency = run.problem.fixed_latency_s is None
+    KEPT = ("_value", "_covariance", "_lost", "_misfit")
+
+    def __init__(self, log: SearchLog, settings: EkfSettings) -> None:
+        super().__init__(log)
+        self._settings = settings
+        self._samples: Sequence[WindowData] = log.problem.windows(1)
+        self._low, self._high = value_bounds(log.problem)
+        space = log.problem.space
+        self._free_latency = log.problem.fixed_latency_s is None
         # A range is a flat prior: its centre and its standard deviation, where nothing better is expected.
         expected, spread = space.prior
         known = np.isfinite(spread)
@@ -160,7 +160,7 @@ class _Passes(Stepper):
         self._prior_std[:-1] = np.where(known, spread, self._prior_std[:-1])
         middle = 0.5 * (self._low[-1] + self._high[-1])
         start = space.to_scale(np.where(known, expected, space.center))
-        self._value = np.append(start, self._coordinates.clip_latency(float(middle)))
+        self._value = np.append(start, self.coordinates.clip_latency(float(middle)))
         if not self._free_latency:
             self._prior_std = self._prior_std[:-1]
         self._covariance = np.diag(self._prior_std**2)
@@ -169,28 +169,28 @@ class _Passes(Stepper):
     @property
     def finished(self) -> bool:
         """Whether all passes are done, or the budget is used up."""
-        return len(self._run.trace) >= self._passes
+        return len(self.log.trace) >= self._passes
 
     @property
     def _passes(self) -> int:
-        return max(min(self._settings.passes, self._run.budget.generations), 1)
+        return max(min(self._settings.passes, self.log.budget.generations), 1)
 
     def step(self) -> None:
         """Run along all recordings once."""
         filter_ = self._filter()
-        left = 1.0 - len(self._run.trace) / max(self._passes - 1, 1)
+        left = 1.0 - len(self.log.trace) / max(self._passes - 1, 1)
         factor = self._settings.first_noise_factor ** max(left, 0.0)
         misfits: list[float] = []
         self._lost = 0
         for data in self._samples:
             misfits += self._along(filter_, data, factor)
-        n = 2 * self._problem.coordinates
+        n = 2 * self.problem.coordinates
         self._value[: len(self._prior_std)] = filter_.mean[n:]
         self._covariance = filter_.covariance[n:, n:]
         usable = np.array(misfits)[np.isfinite(misfits)]
         self._misfit = float(usable.mean()) if len(usable) else math.inf
         members = self._members(self._value[None])
-        self._run.note(
+        self.log.note(
             f"innovations {self._misfit:.3g} times their variance, {self._lost} steps lost",
             members.theta,
             {"misfit": self._misfit, "lost": float(self._lost)},
@@ -198,7 +198,7 @@ class _Passes(Stepper):
         )
 
     def _filter(self) -> ExtendedKalman:
-        problem, settings = self._problem, self._settings
+        problem, settings = self.problem, self._settings
         C, P = problem.coordinates, len(self._prior_std)
         n = 2 * C
         covariance = np.zeros((n + P, n + P))
@@ -217,7 +217,7 @@ class _Passes(Stepper):
 
     def _along(self, filter_: ExtendedKalman, data: WindowData, factor: float) -> Iterator[float]:
         """Run along one recording with the sensors' standard deviations times a factor."""
-        problem = self._problem
+        problem = self.problem
         C, P = problem.coordinates, len(self._prior_std)
         states = problem.starts[data.episode]
         std = np.concatenate([states.position_std, states.velocity_std])
@@ -248,28 +248,26 @@ class _Passes(Stepper):
             filter_.mean[2 * C :] = inside
 
     def _members(self, values: FloatArray) -> Members:
-        theta = self._problem.space.from_scale(values[:, :-1])
+        theta = self.problem.space.from_scale(values[:, :-1])
         return Members(theta, np.maximum(values[:, -1], 0.0))
 
     def result(self) -> CalibrationResult:
         """Return the last pass's parameters and the filter's own covariance."""
-        space = self._problem.space
+        space = self.problem.space
         K = len(space)
         centre = self._members(self._value[None])
         covariance = self._covariance[:K, :K]
-        latency = float(self._value[-1])
+        latency, clip = float(self._value[-1]), self.coordinates.clip_latency
         alarms = []
-        if not self._misfit < DIVERGED:
+        if not self._misfit < self._settings.diverged:
             alarms.append(
                 f"the filter's innovations are {self._misfit:.1f} times their own variance: it diverged, and "
                 "its covariance means nothing"
             )
         spread = Z90 * math.sqrt(max(self._covariance[K, K], 0.0)) if self._free_latency else 0.0
-        plain = self._run.result(
-            self._coordinates,
+        plain = self.log.result(
             centre,
             centre,
-            settings=self._settings,
             chi2=self._misfit,
             alarms=alarms,
             extra={"lost_steps": self._lost, "interval": "the filter's own covariance of the last pass"},
@@ -278,25 +276,8 @@ class _Passes(Stepper):
             plain,
             interval=intervals(space, centre.theta[0], covariance),
             covariance=covariance,
-            latency_interval_s=(
-                self._coordinates.clip_latency(latency - spread),
-                self._coordinates.clip_latency(latency + spread),
-            ),
+            latency_interval_s=(clip(latency - spread), clip(latency + spread)),
         )
-
-    def save(self) -> dict[str, Any]:
-        """Return the parameters and their covariance."""
-        return {
-            "value": self._value,
-            "covariance": self._covariance,
-            "lost": self._lost,
-            "misfit": self._misfit,
-        }
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state."""
-        self._value, self._covariance = state["value"].copy(), state["covariance"]
-        self._lost, self._misfit = state["lost"], state["misfit"]
 
 
 def only(data: WindowData, w: int) -> WindowData:

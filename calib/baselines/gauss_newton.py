@@ -1,37 +1,29 @@
-"""`gauss-newton`: random draws, the best refined side by side, drawn again until the residual is explained.
+"""`gauss-newton`: random draws, the best refined one by one, drawn again until the residual is explained.
 
 Many scattered starts beat one concentrated search here: a draw whose effort or speed limit is never reached
 sits on a plateau with a zero gradient, and only another draw leads away from it. The residual is that of
-`weki`, window innovations whitened for sensor noise and start-state error, so start states need no unknowns
-of their own; one batch of simulations holds all starts with all their finite differences.
+`eki`, window innovations whitened for sensor noise and start-state error, so start states need no unknowns of
+their own; the solver is that of all fits (:func:`deal_hw.calib.fit.solver.minimise`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
-from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
-from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.contacts import damped_step
+from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import cut, is_noisy, linearise, whitened_residual
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, value_bounds
+from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.uncertainty.intervals import uncertainty
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
-
-DAMPINGS = 10.0 ** np.arange(-5.0, 4.0, 2.0)
-"""With ten starts each costs ten simulations of the recording."""
-
-DRAW_SHARE = 3
-"""Drawing takes at most one part in so many of a small budget's generations."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,27 +32,31 @@ class GaussNewtonSettings:
 
     Attributes:
         draws: Parameter vectors that are scored before each multi-start.
+        draw_share: Drawing takes at most one part in so many of a small budget's generations.
         starts: The best of them that are refined.
         survivors: Starts that go on to each further stage.
         noisy_ticks: Window lengths of the stages in control periods, where positions carry noise.
         clean_ticks: The same where they carry none.
-        stage_generations: Most iterations of one stage.
-        converged: Relative gain of a start's cost below which it is at rest.
+        rounds: How often a start is refined in one stage, whitened anew around where it is.
+        solver: How it is refined. The prior around the start is wide: what is not seen is drawn, not held.
+        converged: Relative gain of the residual below which a further round is not worth its simulations.
         restart_chi2: A residual above this is not explained: draw again.
     """
 
     draws: int = 500
+    draw_share: int = 3
     starts: int = 10
     survivors: int = 4
     noisy_ticks: tuple[int, ...] = (5, 20)
     clean_ticks: tuple[int, ...] = (5, 10)
-    stage_generations: int = 12
+    rounds: int = 3
+    solver: SolverSettings = dataclasses.field(default_factory=lambda: SolverSettings(reach=30.0))
     converged: float = 1e-3
     restart_chi2: float = 3.0
 
 
 class GaussNewton(Search):
-    """Multi-start Levenberg-Marquardt on whitened window innovations.
+    """Multi-start least squares on whitened window innovations.
 
     Args:
         settings: How to run.
@@ -71,49 +67,37 @@ class GaussNewton(Search):
     def __init__(self, settings: GaussNewtonSettings | None = None) -> None:
         self.settings = settings or GaussNewtonSettings()
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run before its first draw."""
-        return _MultiStart(run, rng, self.settings)
-
-
-@dataclass(frozen=True, slots=True)
-class Linear:
-    """Residuals of several starts and their derivatives, all in one metric.
-
-    Attributes:
-        residual: Whitened residuals, (S, M).
-        cost: Their sums of squares, (S,); infinite where a start diverged.
-        gradient: Half the costs' gradients, (S, K + 1); 0 for a latency that is given.
-        hessian: Half their Gauss-Newton Hessians, (S, K + 1, K + 1).
-    """
-
-    residual: FloatArray
-    cost: FloatArray
-    gradient: FloatArray
-    hessian: FloatArray
+        return _MultiStart(log, rng, self.settings)
 
 
 class Innovations:
-    """Whitened window innovations as functions of parameters in their own scale and of the latency.
+    """Window innovations, whitened around one simulator, of parameters in their own scale and the latency.
 
     What is expected of parameters (their priors) stands behind them as one more residual each.
 
     Args:
         problem: Data and simulator.
         ticks: Window length in control periods.
-        follow: Linearise around the start states that were most probable in the last iteration, not around
-            the smoothed ones; right once the simulator is nearly right.
+        centre: The simulator to linearise around, (K + 1,).
+        follow: Linearise around the start states that are most probable there, not around the smoothed ones;
+            right once the simulator is nearly right.
     """
 
-    def __init__(self, problem: Problem, ticks: int, follow: bool) -> None:
-        self.problem = problem
-        self.windows: list[WindowData] = cut(problem, ticks)
-        self.offsets: list[FloatArray] | None = None
-        if follow:
-            self.offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self.windows]
-        K = len(problem.space)
-        steps = np.append(np.full(K, PARAMETER_STEP), LATENCY_STEP_S)
-        self._steps = steps[: K + (problem.fixed_latency_s is None)]
+    def __init__(self, problem: Problem, ticks: int, centre: FloatArray, *, follow: bool) -> None:
+        self.problem, self.windows = problem, cut(problem, ticks)
+        around = self.members(centre[None])
+        self._whitenings = None
+        if not problem.exact:
+            self._whitenings = [linearise(problem, around, data) for data in self.windows]
+            if follow:
+                self._whitenings = [
+                    linearise(problem, around, data, whitening.next_offset(data.measured))
+                    for data, whitening in zip(self.windows, self._whitenings, strict=True)
+                ]
+        steps = np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)
+        self._steps = steps[: len(steps) - (problem.fixed_latency_s is not None)]
         mean, std = problem.space.prior
         self._expected = np.flatnonzero(np.isfinite(std))
         self._mean, self._std = problem.space.to_scale(mean)[self._expected], std[self._expected]
@@ -122,42 +106,27 @@ class Innovations:
         """Return values, (N, K + 1), in physical units."""
         return Members(self.problem.space.from_scale(values[:, :-1]), values[:, -1])
 
-    def residual(self, values: FloatArray, centre: FloatArray) -> FloatArray:
-        """Return whitened residuals of values, (N, K + 1), in the metric of one of them, (K + 1,): (N, M)."""
-        offsets = None if self.offsets is None else list(self.offsets)
-        members, around = self.members(values), self.members(centre[None])
-        found = whitened_residual(self.problem, members, around, self.windows, offsets)
-        if not len(self._expected):
-            return found
-        return np.concatenate([found, (values[:, self._expected] - self._mean) / self._std], axis=1)
+    def residuals(self, values: FloatArray) -> FloatArray:
+        """Return the whitened residuals of values, (N, K + 1), in one batch: (N, M)."""
+        members = self.members(values)
+        found = whitened_residual(self.problem, members, members, self.windows, whitenings=self._whitenings)
+        off = (values[:, self._expected] - self._mean) / self._std
+        return np.concatenate([found, off], axis=1)
 
-    def follow(self, centre: FloatArray) -> None:
-        """Move the start states to the most probable ones under a simulator, (K + 1,)."""
-        if self.offsets is not None:
-            around = self.members(centre[None])
-            whitened_residual(self.problem, around, around, self.windows, self.offsets)
+    def residual(self, value: FloatArray) -> FloatArray:
+        """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
+        return np.asarray(self.residuals(value[None])[0])
 
-    def linear(self, values: FloatArray, centre: FloatArray) -> Linear:
-        """Return residuals and forward differences at several values, (S, K + 1), in one batch.
-
-        Args:
-            values: Where.
-            centre: Whose metric, (K + 1,).
-        """
-        S, C = values.shape
-        count = len(self._steps)
-        points = np.repeat(values[:, None], 1 + count, axis=1)
-        points[:, 1:, :count] += np.diag(self._steps)
-        flat = self.residual(points.reshape(-1, C), centre)
-        r = flat.reshape(S, 1 + count, -1)
-        base = r[:, 0]
+    def jacobian(self, value: FloatArray) -> FloatArray:
+        """Return forward differences, (M, K + 1); 0 for a latency that is given."""
+        points = np.repeat(value[None], 1 + len(self._steps), axis=0)
+        points[1:, : len(self._steps)] += np.diag(self._steps)
+        r = self.residuals(points)
+        found = np.zeros((r.shape[1], len(value)))
         # A column that diverges where its base does not says nothing about the way to go.
-        jac = np.nan_to_num((r[:, 1:] - base[:, None]) / self._steps[:, None], posinf=0.0, neginf=0.0)
-        clean = np.nan_to_num(base)
-        gradient, hessian = np.zeros((S, C)), np.zeros((S, C, C))
-        gradient[:, :count] = np.einsum("scm,sm->sc", jac, clean)
-        hessian[:, :count, :count] = np.einsum("scm,sdm->scd", jac, jac)
-        return Linear(base, costs(base), gradient, hessian)
+        slopes = (r[1:] - r[0]) / self._steps[:, None]
+        found[:, : len(self._steps)] = np.nan_to_num(slopes, posinf=0.0, neginf=0.0).T
+        return found
 
     def split(self, residual: FloatArray) -> tuple[FloatArray, ...]:
         """Return one residual, (M,), by episodes: (W, H, channels) each; without what is expected."""
@@ -166,182 +135,139 @@ class Innovations:
         return tuple(p.reshape(d.measured.shape) for p, d in zip(parts, self.windows, strict=True))
 
 
-def costs(residual: FloatArray) -> FloatArray:
-    """Return sums of squares, (N,), of residuals, (N, M); infinite where one diverged."""
-    total = np.sum(residual**2, axis=1)
-    return np.where(np.isfinite(total), total, np.inf)
-
-
 class _MultiStart(Stepper):
-    """One run: draw, refine in stages, draw again.
+    """One run: draw, refine one start a generation, stage by stage, draw again.
 
     Args:
-        run: Book-keeping.
+        log: Book-keeping of the run.
         rng: Draws.
         settings: How to run.
     """
 
-    def __init__(self, run: Run, rng: np.random.Generator, settings: GaussNewtonSettings) -> None:
-        self._run, self._rng, self._settings = run, rng, settings
-        self._problem = run.problem
-        self._coordinates = Coordinates(run.problem)
-        self._low, self._high = value_bounds(run.problem)
-        self._ticks = settings.noisy_ticks if is_noisy(run.problem) else settings.clean_ticks
-        self._stage, self._iteration, self._restarts = -1, 0, 0
-        self._innovations = Innovations(run.problem, self._ticks[0], follow=False)
-        C = len(run.problem.space) + 1
-        # The best draws so far with their scores, later the starts with their costs.
-        self._values, self._cost, self._drawn = np.empty((0, C)), np.empty(0), 0
-        self._best: tuple[float, FloatArray] = (math.inf, self._centre())
-        self._explained = False
+    KEPT = ("_stage", "_number", "_restarts", "_explained", "_drawn", "_values", "_chi2", "_best")
 
-    def _centre(self) -> FloatArray:
-        middle = self._coordinates.members(np.full((1, self._coordinates.count), 0.5))
-        return np.asarray(self._value_of(middle)[0], dtype=np.float64)
+    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: GaussNewtonSettings) -> None:
+        super().__init__(log)
+        self._rng, self._settings = rng, settings
+        self._bounds = value_bounds(self.problem)
+        self._ticks = settings.noisy_ticks if is_noisy(self.problem) else settings.clean_ticks
+        middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
+        self._centre = self._values_of(middle)[0]
+        self._restarts, self._explained = 0, False
+        self._best = (math.inf, self._centre)
+        self._begin_draws()
 
-    def _value_of(self, members: Members) -> FloatArray:
-        value = np.column_stack([self._problem.space.to_scale(members.theta), members.latency_s])
-        return np.asarray(np.clip(value, *self._bounds()))
+    def _begin_draws(self) -> None:
+        # The best draws so far with their scores, later the starts with their mean squared residuals.
+        self._values, self._chi2 = np.empty((0, len(self._centre))), np.empty(0)
+        self._stage, self._number, self._drawn = -1, 0, 0
 
-    def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        fixed = self._problem.fixed_latency_s
-        if fixed is None:
-            return self._low, self._high
-        return np.append(self._low[:-1], fixed), np.append(self._high[:-1], fixed)
+    def _values_of(self, members: Members) -> FloatArray:
+        values = np.column_stack([self.problem.space.to_scale(members.theta), members.latency_s])
+        low, high = self._bounds
+        fixed = self.problem.fixed_latency_s
+        values = np.clip(values, low, high)
+        if fixed is not None:
+            values[:, -1] = fixed
+        return values
 
     @property
     def finished(self) -> bool:
         """Whether the residual is explained or the budget is used up."""
-        return self._explained or len(self._run.trace) >= max(self._run.budget.generations, 1)
+        return self._explained or len(self.log.trace) >= max(self.log.budget.generations, 1)
 
     def step(self) -> None:
-        """Draw once more, or refine all starts by one iteration."""
+        """Draw once more, or refine the next start."""
         if self._stage < 0:
             self._draw()
         else:
             self._refine()
 
     def _draw(self) -> None:
-        budget, settings = self._run.budget, self._settings
-        members = self._coordinates.members(self._coordinates.sample(self._rng, budget.population))
-        values = self._value_of(members)
+        budget, settings = self.log.budget, self._settings
+        members = self.coordinates.members(self.coordinates.sample(self._rng, budget.population))
+        values = self._values_of(members)
         # One metric for all draws, that of the range's centre, and absolute values: most draws are so far
         # off that squares would rank them by their one worst window.
-        score = np.mean(np.abs(self._innovations.residual(values, self._centre())), axis=1)
+        innovations = Innovations(self.problem, self._ticks[0], self._centre, follow=False)
+        score = np.mean(np.abs(innovations.residuals(values)), axis=1) ** 2
         pool = np.concatenate([self._values, values])
-        scores = np.concatenate([self._cost, np.where(np.isfinite(score), score, np.inf)])
+        scores = np.concatenate([self._chi2, np.where(np.isfinite(score), score, np.inf)])
         order = np.argsort(scores, kind="stable")[: settings.starts]
-        self._values, self._cost = pool[order], scores[order]
+        self._values, self._chi2 = pool[order], scores[order]
         self._drawn += len(values)
-        best = float(self._cost[0])
-        self._run.note(
-            f"{self._drawn} draws: best {best:.3g}",
-            members.theta,
-            {"stage": -1.0, "chi2": best**2, "starts": 0.0},
-            members.latency_s,
-        )
+        self._note(f"{self._drawn} draws: best {math.sqrt(self._chi2[0]):.3g}", members)
         if self._best[0] == math.inf:
-            self._best = (math.inf, self._values[0].copy())
-        share = max(budget.generations // DRAW_SHARE, 1)
+            self._best = (math.inf, self._values[0])
+        share = max(budget.generations // settings.draw_share, 1)
         if self._drawn >= min(settings.draws, share * budget.population):
-            self._begin_stage(0)
-
-    def _begin_stage(self, stage: int) -> None:
-        self._stage, self._iteration = stage, 0
-        self._innovations = Innovations(self._problem, self._ticks[stage], follow=stage > 0)
+            self._stage = 0
 
     def _refine(self) -> None:
-        low, high = self._bounds()
-        centre = self._values[0]
-        linear = self._innovations.linear(self._values, centre)
-        steps = [
-            damped_step(value, linear.gradient[s], linear.hessian[s], damping, low, high, self._fixed)
-            for s, value in enumerate(self._values)
-            for damping in DAMPINGS
-        ]
-        S, D = len(self._values), len(DAMPINGS)
-        tried = np.repeat(self._values, D, axis=0) + np.stack(steps)
-        cost = costs(self._innovations.residual(tried, centre)).reshape(S, D)
-        chosen = np.argmin(cost, axis=1)
-        reached = cost[np.arange(S), chosen]
-        better = reached < linear.cost
-        moved = tried.reshape(S, D, -1)[np.arange(S), chosen]
-        self._values = np.where(better[:, None], moved, self._values)
-        after = np.where(better, reached, linear.cost)
-        with np.errstate(invalid="ignore"):
-            gain = np.where(np.isfinite(linear.cost), (linear.cost - after) / linear.cost, 0.0)
-        resting = np.nan_to_num(gain) < self._settings.converged
-        order = np.argsort(after, kind="stable")
-        self._values, self._cost = self._values[order], after[order]
-        self._iteration += 1
-        self._innovations.follow(self._values[0])
-        self._note(linear.residual.shape[1])
-        self._maybe_next(bool(resting[order[0]]), bool(resting.all()), linear.residual.shape[1])
-
-    @property
-    def _fixed(self) -> bool:
-        return self._problem.fixed_latency_s is not None
-
-    def _note(self, count: int) -> None:
-        chi2, members = self._cost / count, self._innovations.members(self._values)
-        self._run.note(
-            f"windows of {self._ticks[self._stage]} ticks: chi2 {chi2[0]:.3g}, worst start {chi2[-1]:.3g}",
-            members.theta,
-            {"stage": float(self._stage), "chi2": float(chi2[0]), "starts": float(len(chi2))},
-            members.latency_s,
+        settings, number = self._settings, self._number
+        ticks, follow = self._ticks[self._stage], self._stage > 0
+        value, chi2 = self._values[number], math.inf
+        for _ in range(settings.rounds):
+            innovations = Innovations(self.problem, ticks, value, follow=follow)
+            value, _ = minimise(
+                innovations,
+                value,
+                self._bounds,
+                settings.solver,
+                fixed_latency=self.problem.fixed_latency_s is not None,
+            )
+            before, chi2 = chi2, float(np.mean(innovations.residual(value) ** 2))
+            if not chi2 < before * (1 - settings.converged):
+                break
+        self._values[number], self._chi2[number] = value, chi2 if math.isfinite(chi2) else math.inf
+        members = innovations.members(self._values)
+        self._note(
+            f"windows of {ticks} ticks: start {number + 1} of {len(self._values)}, chi2 {chi2:.3g}", members
         )
-
-    def _maybe_next(self, best_rests: bool, all_rest: bool, count: int) -> None:
-        """Go on to the next stage, or end this multi-start, where no more can be gained."""
-        settings = self._settings
-        chi2 = float(self._cost[0]) / count
+        self._number += 1
         last = self._stage == len(self._ticks) - 1
-        if last and chi2 <= self._best[0]:
-            self._best = (chi2, self._values[0].copy())
-        elif self._best[0] == math.inf:
-            self._best = (math.inf, self._values[0].copy())
-        # Once the best start explains everything there is nothing to wait for in the others.
-        rests = all_rest or (best_rests and chi2 <= settings.restart_chi2)
-        if not rests and self._iteration < settings.stage_generations:
-            return
-        if not last:
-            self._values = self._values[: settings.survivors]
-            self._begin_stage(self._stage + 1)
-        elif chi2 <= settings.restart_chi2:
+        if (last or self._best[0] == math.inf) and chi2 <= self._best[0]:
+            self._best = (chi2 if last else math.inf, value)
+        # Once a start explains everything there is nothing to wait for in the others.
+        explained = chi2 <= settings.restart_chi2
+        if explained or self._number == len(self._values):
+            self._end_stage(last, explained)
+
+    def _end_stage(self, last: bool, explained: bool) -> None:
+        if last and explained:
             self._explained = True
-        else:
+        elif last:
             self._restarts += 1
-            self._values, self._cost, self._drawn = self._values[:0], self._cost[:0], 0
-            self._stage = -1
-            self._innovations = Innovations(self._problem, self._ticks[0], follow=False)
+            self._begin_draws()
+        else:
+            order = np.argsort(self._chi2[: self._number], kind="stable")[: self._settings.survivors]
+            self._values, self._chi2 = self._values[order], self._chi2[order]
+            self._stage, self._number = self._stage + 1, 0
+
+    def _note(self, message: str, members: Members) -> None:
+        values = {"stage": float(self._stage), "chi2": float(np.min(self._chi2))}
+        self.log.note(message, members.theta, values, members.latency_s)
 
     def result(self) -> CalibrationResult:
         """Return the best start, with intervals from the normal equations there."""
-        problem, settings = self._problem, self._settings
-        innovations = Innovations(problem, self._ticks[-1], follow=True)
-        value = self._best[1]
-        innovations.follow(value)
-        linear = innovations.linear(value[None], value)
-        chi2 = float(linear.cost[0]) / linear.residual.shape[1]
-        theta = problem.space.from_scale(value[:-1])
-        latency = self._coordinates.clip_latency(float(value[-1]))
+        problem, value = self.problem, self._best[1]
+        innovations = Innovations(problem, self._ticks[-1], value, follow=True)
+        residual, jacobian = np.nan_to_num(innovations.residual(value)), innovations.jacobian(value)
+        chi2 = float(np.mean(residual**2))
         known = uncertainty(
             problem.space,
-            theta,
-            latency,
-            linear.hessian[0],
-            chi2 if math.isfinite(chi2) else 1.0,
-            innovations.split(np.nan_to_num(linear.residual[0])),
+            problem.space.from_scale(value[:-1]),
+            self.coordinates.clip_latency(float(value[-1])),
+            jacobian.T @ jacobian,
+            chi2,
+            innovations.split(residual),
             problem.latency_range_s,
-            fixed_latency=self._fixed,
+            fixed_latency=problem.fixed_latency_s is not None,
             timing_std_s=problem.noise.timing_std_s,
         )
-        last = self._values if len(self._values) else value[None]
-        plain = self._run.result(
-            self._coordinates,
+        plain = self.log.result(
             innovations.members(value[None]),
-            innovations.members(last),
-            settings=settings,
+            innovations.members(self._values if len(self._values) else value[None]),
             chi2=chi2,
             alarms=known.alarms,
             extra={"restarts": self._restarts, "interval": "90 %, from the normal equations"},
@@ -354,27 +280,3 @@ class _MultiStart(Stepper):
             null_directions=known.null_directions,
             latency_interval_s=known.latency_interval_s,
         )
-
-    def save(self) -> dict[str, Any]:
-        """Return the starts and where the run stands."""
-        return {
-            "stage": self._stage,
-            "iteration": self._iteration,
-            "restarts": self._restarts,
-            "explained": self._explained,
-            "drawn": self._drawn,
-            "values": self._values,
-            "cost": self._cost,
-            "best": [self._best[0], self._best[1]],
-            "offsets": self._innovations.offsets,
-        }
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state."""
-        self._begin_stage(max(state["stage"], 0))
-        self._stage, self._iteration = state["stage"], state["iteration"]
-        self._innovations.offsets = state["offsets"]
-        self._restarts, self._explained = state["restarts"], state["explained"]
-        self._drawn = state["drawn"]
-        self._values, self._cost = state["values"], state["cost"]
-        self._best = (state["best"][0], state["best"][1])

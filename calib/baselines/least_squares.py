@@ -20,29 +20,20 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
 from deal_hw.calib.fit.residual import PARAMETER_STEP
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import State
 from deal_hw.calib.uncertainty.intervals import intervals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
-
-EXPLAINED_TICKS = 10
-"""Window length of the residual that the result states, in control periods."""
-
-DIVERGED = 1e3
-"""Difference, in typical changes, that stands for a simulation that diverged: scipy takes no infinities."""
-
-
-PART_S = 2.5
-"""Recordings are cut into parts of this length, of which some are taken [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,9 +42,12 @@ class LeastSquaresSettings:
 
     Attributes:
         tolerance: Relative change of cost and parameters at which the search rests.
+        diverged: Difference, in typical changes, that stands for a simulation that diverged: scipy takes no
+            infinities.
     """
 
     tolerance: float = 1e-8
+    diverged: float = 1e3
 
 
 class LeastSquares(Search):
@@ -71,15 +65,15 @@ class LeastSquares(Search):
     def __init__(self, settings: LeastSquaresSettings | None = None) -> None:
         self.settings = settings or LeastSquaresSettings()
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run before its only generation; nothing is drawn."""
-        problem, settings = run.problem, self.settings
-        latency_s = Coordinates(problem).clip_latency(0.0)
+        problem, settings = log.problem, self.settings
+        latency_s = log.coordinates.clip_latency(0.0)
 
         def solve() -> Found:
-            return _solve(problem, latency_s, run.budget.generations, settings.tolerance)
+            return _solve(problem, latency_s, log.budget.generations, settings)
 
-        return OneShot(run, settings, solve, f"textbook s^2 inv(J'J), latency {latency_s:g} s")
+        return OneShot(log, solve, f"textbook s^2 inv(J'J), latency {latency_s:g} s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,14 +105,17 @@ class OneShot(Stepper):
     """A run of an optimiser that cannot be stopped in the middle: one generation.
 
     Args:
-        run: Book-keeping.
-        settings: The method's settings, a dataclass.
+        log: Book-keeping of the run.
         solve: The optimiser.
         interval: Where the intervals come from, in words.
     """
 
-    def __init__(self, run: Run, settings: Any, solve: Callable[[], Found], interval: str) -> None:
-        self._run, self._settings, self._solve, self._interval = run, settings, solve, interval
+    EXPLAINED_TICKS = 10
+    """Window length of the residual that the result states, in control periods."""
+
+    def __init__(self, log: SearchLog, solve: Callable[[], Found], interval: str) -> None:
+        super().__init__(log)
+        self._solve, self._interval = solve, interval
         self._found: Found | None = None
 
     @property
@@ -130,7 +127,7 @@ class OneShot(Stepper):
         """Run the optimiser to its end."""
         found = self._solve()
         self._found = found
-        self._run.note(
+        self.log.note(
             f"{found.iterations} iterations: {found.message}",
             found.theta[None],
             {"iterations": float(found.iterations)},
@@ -138,18 +135,15 @@ class OneShot(Stepper):
 
     def result(self) -> CalibrationResult:
         """Return what the optimiser found."""
-        found, problem = self._found, self._run.problem
+        found, problem = self._found, self.problem
         if found is None:
             raise InsufficientDataError("the optimiser has not run yet; call step() first")
-        coordinates = Coordinates(problem)
-        latency = coordinates.clip_latency(found.latency_s)
+        latency = self.coordinates.clip_latency(found.latency_s)
         centre = Members(found.theta[None], np.array([latency]))
-        plain = self._run.result(
-            coordinates,
+        plain = self.log.result(
             centre,
             centre,
-            settings=self._settings,
-            chi2=explained(problem, centre, EXPLAINED_TICKS),
+            chi2=explained(problem, centre, self.EXPLAINED_TICKS),
             alarms=found.alarms,
             extra={
                 "interval": self._interval,
@@ -164,11 +158,11 @@ class OneShot(Stepper):
         steps = plain.steps + found.steps
         return dataclasses.replace(plain, interval=interval, covariance=found.covariance, steps=steps)
 
-    def save(self) -> dict[str, Any]:
+    def save(self) -> State:
         """Return what was found."""
         return {"found": None if self._found is None else dataclasses.asdict(self._found)}
 
-    def load(self, state: Mapping[str, Any]) -> None:
+    def load(self, state: State) -> None:
         """Continue from a saved state."""
         saved = state["found"]
         self._found = None if saved is None else Found(**{**saved, "alarms": tuple(saved["alarms"])})
@@ -190,10 +184,10 @@ def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: F
     return np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
 
 
-def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float) -> Found:
+def _solve(problem: Problem, latency_s: float, iterations: int, settings: LeastSquaresSettings) -> Found:
     space = problem.space
-    error = OneStep(problem, latency_s)
-    ends = dict.fromkeys(("ftol", "xtol", "gtol"), tolerance) | {"max_nfev": max(iterations, 1)}
+    error = OneStep(problem, latency_s, settings.diverged)
+    ends = dict.fromkeys(("ftol", "xtol", "gtol"), settings.tolerance) | {"max_nfev": max(iterations, 1)}
     solution = _minimise(error, 0.0, space.to_scale(space.center), ends)
     count = len(solution.fun)
     if np.isfinite(space.prior[1]).any():
@@ -240,10 +234,11 @@ class OneStep:
     Args:
         problem: Data and simulator.
         latency_s: Latency that is assumed [s].
+        diverged: See :class:`LeastSquaresSettings`.
     """
 
-    def __init__(self, problem: Problem, latency_s: float) -> None:
-        self._problem, self._latency_s = problem, latency_s
+    def __init__(self, problem: Problem, latency_s: float, diverged: float = 1e3) -> None:
+        self._problem, self._latency_s, self._diverged = problem, latency_s, diverged
         self.space = problem.space
         self._data = problem.windows(samples_per_tick(problem))
         self._recorded = [self._states(d) for d in self._data]
@@ -279,8 +274,8 @@ class OneStep:
             ahead = np.concatenate([predicted.position[:, :, -1], predicted.velocity[:, :, -1]], axis=-1)
             difference = (ahead - recorded[1])[..., self._counts] / self._scale
             parts.append(difference.reshape(len(values), -1))
-        whole = np.concatenate(parts, axis=1)
-        return np.asarray(np.nan_to_num(whole, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED))
+        whole, far = np.concatenate(parts, axis=1), self._diverged
+        return np.asarray(np.nan_to_num(whole, nan=far, posinf=far, neginf=-far))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -292,6 +287,7 @@ class MultiStartSettings:
         survivors: Best starts that go on with all recordings.
         window_s: Length of the windows [s].
         first_s: How much of the recordings, evenly spread, the starts are first fitted to [s].
+        part_s: The recordings are cut into parts of this length, of which these are taken [s].
         first_iterations: Iterations of each start there.
     """
 
@@ -299,6 +295,7 @@ class MultiStartSettings:
     survivors: int = 2
     window_s: float = 0.4
     first_s: float = 12.0
+    part_s: float = 2.5
     first_iterations: int = 8
 
 
@@ -320,17 +317,17 @@ class MultiStartLeastSquares(Search):
     def __init__(self, settings: MultiStartSettings | None = None) -> None:
         self.settings = settings or MultiStartSettings()
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run with its starts drawn."""
-        coordinates, settings = Coordinates(run.problem), self.settings
+        coordinates, settings = log.coordinates, self.settings
         drawn = coordinates.members(coordinates.sample(rng, settings.starts - 1))
-        nominal = run.problem.space.nominal, coordinates.clip_latency(0.0)
+        nominal = log.problem.space.nominal, coordinates.clip_latency(0.0)
         starts = [nominal, *zip(drawn.theta, map(float, drawn.latency_s), strict=True)]
 
         def solve() -> Found:
-            return _solve_starts(run.problem, starts, settings, run.budget.generations)
+            return _solve_starts(log.problem, starts, settings, log.budget.generations)
 
-        return OneShot(run, settings, solve, f"textbook s^2 inv(J'J), best of {settings.starts} starts")
+        return OneShot(log, solve, f"textbook s^2 inv(J'J), best of {settings.starts} starts")
 
 
 def _solve_starts(
@@ -340,7 +337,7 @@ def _solve_starts(
     iterations: int,
 ) -> Found:
     recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
-    parts = [p for e in problem.episodes for p in stretches(e, PART_S)]
+    parts = [p for e in problem.episodes for p in stretches(e, settings.part_s)]
     part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
     rough = [fit_horizon(part, *start, recipe, iterations=settings.first_iterations) for start in starts]
     order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import explained
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Stepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})
@@ -22,35 +25,41 @@ class ScoredStepper(Stepper):
     """A run whose members are told one number each.
 
     Args:
-        run: The run's book-keeping.
+        log: Book-keeping of the run.
         rng: Seeds the fitness.
         fitness: Name of the fitness.
         settings: How to score; its horizon is also that of the residual that the result states.
         policy: pi_0 to run in the loop of the rollouts.
     """
 
+    KEPT: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
+    INTERVAL = "population spread, uncalibrated"
+
     def __init__(
         self,
-        run: Run,
+        log: SearchLog,
         rng: np.random.Generator,
         fitness: str,
         settings: FitnessSettings,
         policy: PopulationPolicy | None = None,
     ) -> None:
-        self.run = run
-        self.coordinates = Coordinates(run.problem)
-        self.fitness = make_fitness(fitness, run.problem, rng, settings, policy)
+        super().__init__(log)
+        self._fitness = make_fitness(fitness, self.problem, rng, settings, policy)
         self.stationary = fitness not in CHANGING
         self._ticks = settings.horizon_ticks
+
+    @abc.abstractmethod
+    def found(self) -> tuple[Members, Members]:
+        """Return the estimate, one member, and the population of the result."""
 
     @property
     def finished(self) -> bool:
         """Whether the budget's generations are used up."""
-        return len(self.run.trace) >= self.run.budget.generations
+        return len(self.log.trace) >= self.log.budget.generations
 
     def score(self, members: Members) -> tuple[FloatArray, dict[str, float]]:
         """Score members and return their fitness, (N,), -inf where one diverged, and what the trace says."""
-        fitness = np.asarray(self.fitness.score(members), dtype=float)
+        fitness = np.asarray(self._fitness.score(members), dtype=float)
         usable = np.isfinite(fitness)
         finite = fitness[usable]
         return np.where(usable, fitness, -np.inf), {
@@ -58,25 +67,31 @@ class ScoredStepper(Stepper):
             "best": float(finite.max()) if finite.size else float("nan"),
             "scored": float(len(fitness)),
             "diverged": float(np.sum(~usable)),
-            **self.fitness.values,
+            **self._fitness.values,
         }
 
     def note(self, message: str, members: Members, values: Mapping[str, float]) -> None:
-        """Write one generation into the trace; see :meth:`Run.note`."""
+        """Write one generation into the trace; see :meth:`SearchLog.note`."""
         searched = self.coordinates.fixed_latency_s is None
-        self.run.note(message, members.theta, values, members.latency_s if searched else None)
+        self.log.note(message, members.theta, values, members.latency_s if searched else None)
 
-    def residual(self, centre: Members) -> float:
-        """Return the mean squared whitened residual of one member."""
-        return explained(self.run.problem, centre, self._ticks)
+    def result(self) -> CalibrationResult:
+        """See :meth:`Stepper.result`; there is an alarm where too many members had no score."""
+        centre, population = self.found()
+        scored = sum(row["scored"] for row in self.log.trace)
+        lost = sum(row["diverged"] for row in self.log.trace)
+        alarms = [
+            f"{lost:.0f} of {scored:.0f} members diverged and had no score; narrow the ranges or shorten the "
+            "physics step"
+        ]
+        return self.log.result(
+            centre,
+            population,
+            chi2=explained(self.problem, centre, self._ticks),
+            alarms=alarms if lost > 0.5 * scored else (),
+            extra={"interval": self.INTERVAL, **self.facts()},
+        )
 
-    def alarms(self) -> list[str]:
-        """Return reasons to distrust the result: too many members that had no score."""
-        scored = sum(row["scored"] for row in self.run.trace if "scored" in row)
-        lost = sum(row["diverged"] for row in self.run.trace if "diverged" in row)
-        if scored and lost > 0.5 * scored:
-            return [
-                f"{lost:.0f} of {scored:.0f} members diverged and had no score; narrow the ranges or shorten "
-                "the physics step"
-            ]
-        return []
+    def facts(self) -> dict[str, Any]:
+        """Return what else the provenance says."""
+        return {}

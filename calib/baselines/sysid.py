@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.baselines.least_squares import Found, OneShot, textbook_covariance
-from deal_hw.calib.data.coordinates import Coordinates
 from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.recordings.sysid_adapter import Recording, check_space, identify, require_sysid
 
@@ -55,25 +54,25 @@ class MujocoSysid(Search):
     def __init__(self, settings: SysidSettings | None = None) -> None:
         self.settings = settings or SysidSettings()
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run before its only generation; nothing is drawn.
 
         Raises:
             ConfigurationError: A parameter has no counterpart, or joint positions were not measured.
             MissingExtraError: ``mujoco.sysid`` is not installed.
         """
-        problem, settings = run.problem, self.settings
+        problem, settings = log.problem, self.settings
         require_sysid()
         check_space(problem.space)
         _check_channels(problem)
         given = settings.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
         if settings.delay and given is None:
-            return OneShot(run, settings, lambda: _solve(run, settings, problem.first_latency_s), "its own")
+            return OneShot(log, lambda: _solve(log, settings, problem.first_latency_s), "its own")
         source = "given" if given is not None else "none, as its user would have it"
-        latency_s = Coordinates(problem).clip_latency(given or 0.0)
+        latency_s = log.coordinates.clip_latency(given or 0.0)
         words = f"its own, {1e3 * latency_s:g} ms of latency ({source})"
         settings = dataclasses.replace(settings, delay=False)
-        return OneShot(run, settings, lambda: _solve(run, settings, latency_s), words)
+        return OneShot(log, lambda: _solve(log, settings, latency_s), words)
 
 
 def with_delay(window_s: float) -> MujocoSysid:
@@ -95,8 +94,8 @@ def _check_channels(problem: Problem) -> None:
         )
 
 
-def _solve(run: Run, settings: SysidSettings, latency_s: float) -> Found:
-    problem, ticks = run.problem, settings.ticks
+def _solve(log: SearchLog, settings: SysidSettings, latency_s: float) -> Found:
+    problem, ticks = log.problem, settings.ticks
     if settings.window_s is not None:
         ticks = max(round(settings.window_s * problem.robot.description.control_rate_hz), 1)
     recordings = [
@@ -110,7 +109,7 @@ def _solve(run: Run, settings: SysidSettings, latency_s: float) -> Found:
         recordings,
         latency_s=latency_s,
         latency_range_s=problem.latency_range_s if settings.delay else None,
-        iterations=run.budget.generations,
+        iterations=log.budget.generations,
         threads=problem.threads,
     )
     # From derivatives by the value to those by its logarithm, where that is the scale.

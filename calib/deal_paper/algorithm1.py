@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -18,9 +17,8 @@ from deal_hw.calib.deal_paper.diffusion_evolution import DiffusionEvolution, Dif
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.checkpoint import State
 from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -92,9 +90,9 @@ class DealPaper(Search):
     policy: PopulationPolicy | None = None
     name: str = "deal-paper"
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """See :meth:`Search.begin`."""
-        return _DealPaper(run, rng, self.settings, self.policy)
+        return _DealPaper(log, rng, self.settings, self.policy)
 
 
 def paper() -> DealPaper:
@@ -126,18 +124,24 @@ def flat() -> DealPaper:
 class _DealPaper(Stepper):
     """A run of Algorithm 1: one denoising step a generation."""
 
+    KEPT = ("_search", "_fitness")
+
     def __init__(
-        self, run: Run, rng: np.random.Generator, settings: PaperSettings, policy: PopulationPolicy | None
+        self,
+        log: SearchLog,
+        rng: np.random.Generator,
+        settings: PaperSettings,
+        policy: PopulationPolicy | None,
     ) -> None:
-        self._run, self._settings = run, settings
-        self._box = _Box(Coordinates(run.problem), normalise=settings.normalise)
+        super().__init__(log)
+        self._box = _Box(self.coordinates, normalise=settings.normalise)
         self._search = DiffusionEvolution(
             # Line 1: theta^T from the search range, uniform in the normalised box.
-            self._box.from_unit(self._box.coordinates.sample(rng, run.budget.population)),
-            dataclasses.replace(settings.diffusion, generations=max(run.budget.generations, 1)),
+            self._box.from_unit(self.coordinates.sample(rng, log.budget.population)),
+            dataclasses.replace(settings.diffusion, generations=max(log.budget.generations, 1)),
             rng,
         )
-        self._fitness = make_fitness(settings.fitness, run.problem, rng, settings.scoring, policy)
+        self._fitness = make_fitness(settings.fitness, self.problem, rng, settings.scoring, policy)
 
     @property
     def finished(self) -> bool:
@@ -150,7 +154,7 @@ class _DealPaper(Stepper):
         fitness = self._fitness.score(members)
         step = self._search.tell(fitness)
         finite = fitness[np.isfinite(fitness)]
-        self._run.note(
+        self.log.note(
             f"effective size {step.effective_size:.0f} of {len(fitness)}",
             members.theta,
             {
@@ -170,22 +174,11 @@ class _DealPaper(Stepper):
         final = self._search.ask()
         # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best
         # member differ from it by less than the population's own error.
-        return self._run.result(
-            self._box.coordinates,
+        return self.log.result(
             self._box.members(final.mean(axis=0, keepdims=True)),
             self._box.members(final),
-            settings=self._settings,
             extra={"interval": "population spread, uncalibrated", "estimate": "mean of the last population"},
         )
-
-    def save(self) -> dict[str, Any]:
-        """See :meth:`Stepper.save`."""
-        return {"search": self._search.save(), "fitness": self._fitness.save()}
-
-    def load(self, state: State) -> None:
-        """See :meth:`Stepper.load`."""
-        self._search.load(state["search"])
-        self._fitness.load(state["fitness"])
 
 
 class _Box:

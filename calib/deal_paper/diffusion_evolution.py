@@ -11,13 +11,13 @@ the search starts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.special import logsumexp, softmax
 
+from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -96,7 +96,7 @@ class DiffusionStep:
     clamped: bool
 
 
-class DiffusionEvolution:
+class DiffusionEvolution(Kept):
     """A population (N, K) in a box around zero; a uniform start of unit variance fits eq. 12 best.
 
     Args:
@@ -104,6 +104,8 @@ class DiffusionEvolution:
         settings: Schedules and choices.
         rng: Draws omega.
     """
+
+    KEPT = ("_theta", "t")
 
     def __init__(self, population: FloatArray, settings: DiffusionSettings, rng: np.random.Generator) -> None:
         self._theta = np.array(population, dtype=float)
@@ -120,15 +122,6 @@ class DiffusionEvolution:
     def finished(self) -> bool:
         """Whether theta^0 has been reached."""
         return self.t == 0
-
-    def save(self) -> dict[str, Any]:
-        """Return theta^t and t; the generator is the caller's."""
-        return {"theta": self._theta.copy(), "t": self.t}
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from what :meth:`save` returned."""
-        self._theta = np.array(state["theta"], dtype=float)
-        self.t = int(state["t"])
 
     def tell(self, fitness: FloatArray) -> DiffusionStep:
         """Take the step t -> t - 1.

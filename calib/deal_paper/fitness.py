@@ -6,10 +6,10 @@ generations compare for all but the critic, which goes on learning.
 
 from __future__ import annotations
 
+import abc
 import importlib
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from deal_hw.calib.deal_paper.rollouts import (
     rollout_population,
     transitions,
 )
+from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
 
@@ -77,23 +78,37 @@ class FitnessSettings:
             raise ConfigurationError(f"the bandwidth must be above 0 or None, got {self.bandwidth:g}")
 
 
-class Fitness(Protocol):
+class Fitness(Kept, abc.ABC):
     """What a search is told of its members.
+
+    Args:
+        problem: Data and simulator.
+        settings: How to score.
+        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
+        rng: Seeds the critic; the others learn nothing and keep nothing.
 
     Attributes:
         values: What the last call of `score` found besides, for the trace.
     """
 
-    values: dict[str, float]
+    def __init__(
+        self,
+        problem: Problem,
+        settings: FitnessSettings,
+        policy: PopulationPolicy | None,
+        rng: np.random.Generator,
+    ) -> None:
+        self._problem, self._settings = problem, settings
+        self.values: dict[str, float] = {}
+        self._prepare(policy, rng)
 
+    @abc.abstractmethod
+    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+        """Make what scoring needs."""
+
+    @abc.abstractmethod
     def score(self, members: Members) -> FloatArray:
         """Return one number a member, (N,): higher is better, -inf where the simulation diverged."""
-
-    def save(self) -> dict[str, Any]:
-        """Return what later scores depend on: arrays and plain values."""
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from what :meth:`save` returned."""
 
 
 def make_fitness(
@@ -125,39 +140,7 @@ def make_fitness(
     return made
 
 
-class Stateless:
-    """A fitness that learns nothing, so there is nothing to save.
-
-    Args:
-        problem: Data and simulator.
-        settings: How to score.
-        policy: pi_0 to run in the loop.
-        rng: Not drawn from.
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        settings: FitnessSettings,
-        policy: PopulationPolicy | None,
-        rng: np.random.Generator,
-    ) -> None:
-        self._problem, self._settings = problem, settings
-        self.values: dict[str, float] = {}
-        self._prepare(policy, rng)
-
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
-        """Make what scoring needs."""
-
-    def save(self) -> dict[str, Any]:
-        """Return nothing."""
-        return {}
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Do nothing."""
-
-
-class FlatFitness(Stateless):
+class FlatFitness(Fitness):
     """The same number for every member: a search that cannot see the data."""
 
     def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
@@ -169,7 +152,7 @@ class FlatFitness(Stateless):
         return np.zeros(len(members.theta))
 
 
-class TrajectoryFitness(Stateless):
+class TrajectoryFitness(Fitness):
     """Prediction error at a horizon: minus the logarithm of the mean squared whitened window innovation.
 
     The logarithm, because errors of far members span many decades: a softmax of the errors themselves would
@@ -224,7 +207,7 @@ class RolloutView:
         return self._scale.apply(raw), usable
 
 
-class EnergyFitness(Stateless):
+class EnergyFitness(Fitness):
     """Minus the energy distance between the recording's transitions and the member's own."""
 
     def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:

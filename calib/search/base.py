@@ -13,13 +13,20 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.checkpoint import State, generator_state, restore_generator
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import Kept, restore_generator
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback, StateStore
 
 
-class Stepper(abc.ABC):
-    """One run of a search, between its generations."""
+class Stepper(Kept, abc.ABC):
+    """One run of a search, between its generations.
+
+    Args:
+        log: Book-keeping of the run.
+    """
+
+    def __init__(self, log: SearchLog) -> None:
+        self.log, self.problem, self.coordinates = log, log.problem, log.coordinates
 
     @property
     @abc.abstractmethod
@@ -28,26 +35,24 @@ class Stepper(abc.ABC):
 
     @abc.abstractmethod
     def step(self) -> None:
-        """Do one generation and note it (``Run.note``), which is once for each call."""
+        """Do one generation and note it (``SearchLog.note``), which is once for each call."""
 
     @abc.abstractmethod
     def result(self) -> CalibrationResult:
         """Return what was found so far."""
 
-    @abc.abstractmethod
-    def save(self) -> State:
-        """Return everything that later generations depend on, but for the generator and the trace."""
-
-    @abc.abstractmethod
-    def load(self, state: State) -> None:
-        """Continue from a saved state."""
-
 
 class Search(CalibrationMethod[Problem]):
-    """A calibration method whose run is a sequence of generations."""
+    """A calibration method whose run is a sequence of generations.
+
+    Attributes:
+        settings: How to run, a dataclass.
+    """
+
+    settings: Any
 
     @abc.abstractmethod
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """Return the run before its first generation."""
 
     def run(
@@ -59,20 +64,17 @@ class Search(CalibrationMethod[Problem]):
         checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
         """Search to the end; see :meth:`deal_hw.calibration.CalibrationMethod.run`."""
-        run = Run(self.name, problem, budget, progress)
-        stepper = self.begin(run, rng)
+        log = SearchLog(self.name, problem, budget, progress, self.settings)
+        stepper = self.begin(log, rng)
         saved = checkpoint.load() if checkpoint is not None else None
         if saved is not None:
-            run.load(saved["run"])
+            log.load(saved["log"])
             stepper.load(saved["search"])
             # Last: making and loading the stepper may have drawn from it.
             restore_generator(rng, saved["generator"])
         while not stepper.finished:
             stepper.step()
             if checkpoint is not None:
-                checkpoint.save(_whole(run, stepper, rng))
+                state = {"log": log.save(), "search": stepper.save(), "generator": rng.bit_generator.state}
+                checkpoint.save(state)
         return stepper.result()
-
-
-def _whole(run: Run, stepper: Stepper, rng: np.random.Generator) -> dict[str, Any]:
-    return {"run": run.save(), "search": stepper.save(), "generator": generator_state(rng)}

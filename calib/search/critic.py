@@ -9,13 +9,13 @@ generator: the same seed, the same critic.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from deal_hw.calib.search.resume import Kept, State
 from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray
 
@@ -60,7 +60,7 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class Critic:
+class Critic(Kept):
     """A network with two hidden layers, ReLU, and one output (the paper's D).
 
     Args:
@@ -133,7 +133,7 @@ class Critic:
             gap = self._update(batches[k], copies[k])
         return gap
 
-    def save(self) -> dict[str, Any]:
+    def save(self) -> State:
         """Return weights, the optimiser's memory and the generator as arrays."""
         memory = self.optimiser.state_dict()["state"]
         return {
@@ -146,7 +146,7 @@ class Critic:
         }
 
     @torch.no_grad()
-    def load(self, state: Mapping[str, Any]) -> None:
+    def load(self, state: State) -> None:
         """Continue from what :meth:`save` returned."""
         for parameter, values in zip(self._parameters, state["weights"], strict=True):
             parameter.copy_(torch.tensor(values))

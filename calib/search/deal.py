@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,10 +28,10 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import cut, explained, is_noisy, linearise, predict, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.checkpoint import State
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
-from deal_hw.calib.search.kalman_search import KalmanStepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.ensemble_kalman import KalmanStepper
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import Kept, State
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -84,20 +83,22 @@ class Deal(Search):
     name = "deal"
     settings: DealSettings = field(default_factory=DealSettings)
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """See :meth:`Search.begin`."""
-        return _Deal(run, rng, self.settings)
+        return _Deal(log, rng, self.settings)
 
 
 class _Deal(KalmanStepper):
     """A run of `deal`: stages of windows, one round of critic updates and one Kalman step a generation."""
 
-    def __init__(self, run: Run, rng: np.random.Generator, settings: DealSettings) -> None:
-        super().__init__(run, rng, settings.step_clip)
+    KEPT = ("kalman", "_stage", "_spread", "_view")
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: DealSettings) -> None:
+        super().__init__(log, rng, settings.step_clip)
         self._settings = settings
-        self._noisy = is_noisy(run.problem)
+        self._noisy = is_noisy(self.problem)
         self._lengths = settings.noisy_ticks if self._noisy else settings.clean_ticks
-        self._most = min(settings.generations, run.budget.generations)
+        self._most = min(settings.generations, log.budget.generations)
         self._view: _View
         self._enter_stage(0)
         self._skip_empty_stages()
@@ -117,7 +118,7 @@ class _Deal(KalmanStepper):
         # begins. Noise-free ones have no such end: each step takes a fixed share of what is left.
         step = self.kalman.tell(residual, keep=None if self._noisy else self._settings.keep)
         self._spread = step.spread
-        self.run.note(
+        self.log.note(
             f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
             members.theta,
             {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
@@ -128,19 +129,17 @@ class _Deal(KalmanStepper):
     def result(self) -> CalibrationResult:
         """See :meth:`Stepper.result`."""
         members, centre = self.population(self.kalman.ask())
-        chi2 = explained(self.run.problem, centre, self._lengths[-1])
+        chi2 = explained(self.problem, centre, self._lengths[-1])
         alarms = []
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
         if self._noisy and not chi2 <= self._settings.alarm_chi2:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(self.run.trace)} generations; polish it, search again with another seed, or use weki"
+                f"{len(self.log.trace)} generations; polish it, search again with another seed, or use eki"
             )
-        return self.run.result(
-            self.coordinates,
+        return self.log.result(
             centre,
             members,
-            settings=self._settings,
             chi2=chi2,
             alarms=alarms,
             extra={
@@ -149,21 +148,10 @@ class _Deal(KalmanStepper):
             },
         )
 
-    def save(self) -> dict[str, Any]:
-        """See :meth:`Stepper.save`."""
-        return {
-            "kalman": self.kalman.save(),
-            "stage": self._stage,
-            "spread": self._spread,
-            "view": self._view.save(),
-        }
-
     def load(self, state: State) -> None:
-        """See :meth:`Stepper.load`."""
-        self._enter_stage(state["stage"])
-        self.kalman.load(state["kalman"])
-        self._spread = state["spread"]
-        self._view.load(state["view"])
+        """See :meth:`Kept.load`."""
+        self._enter_stage(state["_stage"])
+        super().load(state)
 
     @property
     def _last(self) -> bool:
@@ -174,7 +162,7 @@ class _Deal(KalmanStepper):
         # Earlier stages bring the population near; a third of the budget is kept for the last.
         end = self._most if self._last else 2 * self._most // 3
         told_apart = self._spread > self._settings.least_spread
-        return len(self.run.trace) >= end or self.kalman.finished or not told_apart
+        return len(self.log.trace) >= end or self.kalman.finished or not told_apart
 
     def _skip_empty_stages(self) -> None:
         while self._stage_over and not self._last:
@@ -185,10 +173,10 @@ class _Deal(KalmanStepper):
         if stage:
             self.kalman.widen(self._settings.widen)
         kind: type[_View] = _NoisyView if self._noisy else _CleanView
-        self._view = kind(self.run.problem, self._settings, self._lengths[stage], self.rng, stage > 0)
+        self._view = kind(self.problem, self._settings, self._lengths[stage], self.rng, stage > 0)
 
 
-class _View(abc.ABC):
+class _View(Kept, abc.ABC):
     """What the critic sees of recording and population, and what the members are told.
 
     Args:
@@ -198,6 +186,8 @@ class _View(abc.ABC):
         rng: Seeds the critic and draws the noise.
         move_starts: Linearise anew around each generation's most probable start states.
     """
+
+    KEPT = ("_critic", "_offsets")
 
     def __init__(
         self,
@@ -209,7 +199,7 @@ class _View(abc.ABC):
     ) -> None:
         self._problem, self._settings, self._rng, self._ticks = problem, settings, rng, ticks
         self._move_starts = move_starts
-        self._offsets: dict[int, FloatArray] = {}
+        self._offsets: list[FloatArray | None] = [None] * len(problem.episodes)
         self._every = samples_per_tick(problem)
         self._windows = cut(problem, ticks)
         context = np.concatenate([self._make_context(data) for data in self._windows])
@@ -254,18 +244,6 @@ class _View(abc.ABC):
         residual = target - found
         residual[~good] = np.nan
         return residual, gap
-
-    def save(self) -> dict[str, Any]:
-        """Return the critic and the start states of the next generation."""
-        return {
-            "critic": self._critic.save(),
-            "offsets": {str(episode): offset for episode, offset in self._offsets.items()},
-        }
-
-    def load(self, state: State) -> None:
-        """Continue from what :meth:`save` returned."""
-        self._critic.load(state["critic"])
-        self._offsets = {int(episode): offset for episode, offset in state["offsets"].items()}
 
     def _join(self, values: FloatArray, scale: FloatArray) -> Samples:
         # Far members' windows run away by many scales; a critic that spends itself on them sees nothing in
@@ -332,7 +310,7 @@ class _NoisyView(_View):
     def _innovations(
         self, members: Members, centre: Members, data: WindowData
     ) -> tuple[FloatArray, FloatArray]:
-        offset = self._offsets.get(data.episode)
+        offset = self._offsets[data.episode]
         whitening = linearise(self._problem, centre, data, offset)
         predicted = predict(self._problem, members, data, *whitening.starts(data)).observed
         if self._move_starts:

@@ -1,4 +1,4 @@
-"""`weki`: ensemble Kalman inversion on window innovations that are whitened for noise and start-state error.
+"""`eki`: ensemble Kalman inversion on window innovations that are whitened for noise and start-state error.
 
 No critic: the vector of all whitened innovations itself is regressed on. Short windows come first, because
 over a long one the unstable pole makes the prediction of a wrong simulator meaningless; long ones then hold
@@ -8,22 +8,21 @@ the information.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.data.innovations import cut, explained, is_noisy, whitened_residual
 from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.checkpoint import State
-from deal_hw.calib.search.kalman_search import KalmanStepper
-from deal_hw.calib.search.log import Run
+from deal_hw.calib.search.ensemble_kalman import KalmanStepper
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import State
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WekiSettings:
-    """Settings of `weki`.
+class EkiSettings:
+    """Settings of `eki`.
 
     Attributes:
         noisy_ticks: Window lengths of the stages in control periods, where positions carry noise.
@@ -49,28 +48,30 @@ class WekiSettings:
 
 
 @dataclass(frozen=True)
-class Weki(Search):
+class Eki(Search):
     """Whitened ensemble Kalman inversion; restarts while the residual is unexplained and the budget lasts.
 
     Attributes:
         settings: How to run.
     """
 
-    name = "weki"
-    settings: WekiSettings = field(default_factory=WekiSettings)
+    name = "eki"
+    settings: EkiSettings = field(default_factory=EkiSettings)
 
-    def begin(self, run: Run, rng: np.random.Generator) -> Stepper:
+    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
         """See :meth:`Search.begin`."""
-        return _Weki(run, rng, self.settings)
+        return _Eki(log, rng, self.settings)
 
 
-class _Weki(KalmanStepper):
-    """A run of `weki`: searches, each of several stages, each of several generations."""
+class _Eki(KalmanStepper):
+    """A run of `eki`: searches, each of several stages, each of several generations."""
 
-    def __init__(self, run: Run, rng: np.random.Generator, settings: WekiSettings) -> None:
-        super().__init__(run, rng, settings.step_clip)
+    KEPT = ("kalman", "_restarts", "_best", "_over", "_stage", "_generation", "_offsets")
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: EkiSettings) -> None:
+        super().__init__(log, rng, settings.step_clip)
         self._settings = settings
-        problem = run.problem
+        problem = self.problem
         self._lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
         self._brief = settings.before_polish and (problem.robot.base is not None or problem.exact)
         if self._brief:
@@ -78,7 +79,7 @@ class _Weki(KalmanStepper):
         self._near = False
         self._restarts = 0
         self._best: tuple[float, FloatArray] | None = None
-        self._over = run.budget.generations <= 0
+        self._over = log.budget.generations <= 0
         self._offsets: list[FloatArray] | None = None
         self._enter_stage(0)
 
@@ -91,12 +92,12 @@ class _Weki(KalmanStepper):
         """One Kalman step; at the end of a stage or search also the beginning of the next."""
         z = self.kalman.ask()
         members, centre = self.population(z)
-        problem = self.run.problem
-        step = self.kalman.tell(whitened_residual(problem, members, centre, self._windows, self._offsets))
+        residual = whitened_residual(self.problem, members, centre, self._windows, self._offsets)
+        step = self.kalman.tell(residual)
         self._generation += 1
-        self._near = self._brief and problem.exact and step.spread < self._settings.least_spread
+        self._near = self._brief and self.problem.exact and step.spread < self._settings.least_spread
         ticks = self._lengths[self._stage]
-        self.run.note(
+        self.log.note(
             f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
             members.theta,
             {
@@ -121,39 +122,22 @@ class _Weki(KalmanStepper):
         if not chi2 <= self._settings.restart_chi2 and not self._brief:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(self.run.trace)} generations; "
+                f"{len(self.log.trace)} generations; "
                 "allow more generations, widen the ranges, or suspect the model"
             )
         members, centre = self.population(z)
-        return self.run.result(
-            self.coordinates,
+        return self.log.result(
             centre,
             members,
-            settings=self._settings,
             chi2=chi2,
             alarms=alarms,
             extra={"restarts": self._restarts, "interval": "ensemble spread, uncalibrated"},
         )
 
-    def save(self) -> dict[str, Any]:
-        """See :meth:`Stepper.save`."""
-        return {
-            "kalman": self.kalman.save(),
-            "restarts": self._restarts,
-            "best": self._best,
-            "over": self._over,
-            "stage": self._stage,
-            "generation": self._generation,
-            "offsets": self._offsets,
-        }
-
     def load(self, state: State) -> None:
-        """See :meth:`Stepper.load`."""
-        self._enter_stage(state["stage"])
-        self.kalman.load(state["kalman"])
-        self._restarts, self._over = state["restarts"], state["over"]
-        self._best = None if state["best"] is None else (state["best"][0], state["best"][1])
-        self._generation, self._offsets = state["generation"], state["offsets"]
+        """See :meth:`Kept.load`."""
+        self._enter_stage(state["_stage"])
+        super().load(state)
 
     @property
     def _stage_over(self) -> bool:
@@ -161,12 +145,12 @@ class _Weki(KalmanStepper):
             self.kalman.finished
             or self._near
             or self._generation >= self._settings.stage_generations
-            or len(self.run.trace) >= self.run.budget.generations
+            or len(self.log.trace) >= self.log.budget.generations
         )
 
     def _enter_stage(self, stage: int) -> None:
         self._stage, self._generation = stage, 0
-        self._windows = cut(self.run.problem, self._lengths[stage])
+        self._windows = cut(self.problem, self._lengths[stage])
         self._offsets = None
         if stage:
             self.kalman.widen(self._settings.widen)
@@ -176,10 +160,10 @@ class _Weki(KalmanStepper):
 
     def _end_search(self) -> None:
         z = self.kalman.ask()
-        chi2 = explained(self.run.problem, self.population(z)[1], self._lengths[-1])
+        chi2 = explained(self.problem, self.population(z)[1], self._lengths[-1])
         if self._best is None or chi2 < self._best[0]:
             self._best = (chi2, z)
-        spent = len(self.run.trace) >= self.run.budget.generations
+        spent = len(self.log.trace) >= self.log.budget.generations
         if self._brief or spent or chi2 <= self._settings.restart_chi2:
             self._over = True
             return

@@ -1,6 +1,7 @@
 """Ensemble Kalman inversion: a population moves by the regression of its coordinates on its residuals.
 
-Knows no simulator: it is asked for an ensemble and told that ensemble's whitened residuals. Perturbed
+:class:`EnsembleKalman` knows no simulator: it is asked for an ensemble and told that ensemble's whitened
+residuals. :class:`KalmanStepper` moves it in logits of a search range, for `eki` and `deal`. Perturbed
 observations and the tempered update are those of Iglesias, Law and Stuart (2013); the data-misfit controller
 is that of Iglesias and Yang (2021), the discrepancy rule for the regularisation that of Iglesias (2016). On a
 linear model with a Gaussian prior the ensemble is, for large N, a sample of the exact posterior once the
@@ -9,12 +10,14 @@ tempering reaches 1.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from deal_hw.calib.data.coordinates import Members, logistic, logit
+from deal_hw.calib.search.base import Stepper
+from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.resume import Kept
 from deal_hw.types import FloatArray
 
 
@@ -33,7 +36,7 @@ class KalmanStep:
     spread: float
 
 
-class EnsembleKalman:
+class EnsembleKalman(Kept):
     """An ensemble (N, C) that is moved towards residual zero.
 
     Args:
@@ -41,6 +44,8 @@ class EnsembleKalman:
         rng: Draws the perturbations.
         step_clip: Largest move of a coordinate in one step; a regression far from its samples means nothing.
     """
+
+    KEPT = ("_members", "tempering")
 
     def __init__(self, ensemble: FloatArray, rng: np.random.Generator, step_clip: float = 2.0) -> None:
         self._members = np.array(ensemble, dtype=float)
@@ -56,15 +61,6 @@ class EnsembleKalman:
     def finished(self) -> bool:
         """Whether the whole likelihood has been used."""
         return self.tempering >= 1.0 - 1e-12
-
-    def save(self) -> dict[str, Any]:
-        """Return members and tempering; the generator is the caller's."""
-        return {"members": self._members.copy(), "tempering": self.tempering}
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from what :meth:`save` returned."""
-        self._members = np.array(state["members"], dtype=float)
-        self.tempering = float(state["tempering"])
 
     def tell(self, residual: FloatArray, keep: float | None = None) -> KalmanStep:
         """Move the ensemble.
@@ -143,3 +139,28 @@ def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray,
             break
         inflation *= 2.0
     return inflation
+
+
+class KalmanStepper(Stepper):
+    """A run whose population is an ensemble Kalman inversion's, in logits.
+
+    Args:
+        log: Book-keeping of the run.
+        rng: Draws the ensemble and the perturbations.
+        step_clip: Largest step of a coordinate, in logits.
+    """
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, step_clip: float) -> None:
+        super().__init__(log)
+        self.rng, self._step_clip = rng, step_clip
+        self.kalman = self.new_ensemble()
+
+    def new_ensemble(self) -> EnsembleKalman:
+        """Return an ensemble drawn over the whole range."""
+        unit = self.coordinates.sample(self.rng, self.log.budget.population)
+        return EnsembleKalman(logit(unit), self.rng, step_clip=self._step_clip)
+
+    def population(self, z: FloatArray) -> tuple[Members, Members]:
+        """Return the members at logits z, (N, C), and the one at their mean."""
+        middle = logistic(z.mean(axis=0, keepdims=True))
+        return self.coordinates.members(logistic(z)), self.coordinates.members(middle)

@@ -18,7 +18,7 @@ Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
 
 
-class Run:
+class SearchLog:
     """Book-keeping of one search.
 
     Args:
@@ -26,14 +26,19 @@ class Run:
         problem: What is searched.
         budget: What may be used.
         progress: Called after each generation.
+        settings: The method's settings, a dataclass.
     """
 
     def __init__(
-        self, method: str, problem: Problem, budget: Budget, progress: ProgressCallback | None
+        self,
+        method: str,
+        problem: Problem,
+        budget: Budget,
+        progress: ProgressCallback | None,
+        settings: Any,
     ) -> None:
-        self.method = method
-        self.problem = problem
-        self.budget = budget
+        self.method, self.problem, self.budget, self._settings = method, problem, budget, settings
+        self.coordinates = Coordinates(problem)
         self.trace: list[dict[str, float]] = []
         self._progress = progress
         self._steps = problem.steps
@@ -83,11 +88,9 @@ class Run:
 
     def result(
         self,
-        coordinates: Coordinates,
         centre: Members,
         population: Members,
         *,
-        settings: Any,
         chi2: float = float("nan"),
         alarms: Sequence[str] = (),
         extra: Mapping[str, Any] | None = None,
@@ -96,14 +99,11 @@ class Run:
 
         The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
         calibrated: a searcher's population shrinks as its step rule says, too far where the ensemble is
-            small, and to nothing
-        for diffusion evolution. The polish computes intervals from the data.
+        small, and to nothing for diffusion evolution. The polish computes intervals from the data.
 
         Args:
-            coordinates: The search's coordinates.
             centre: The estimate, one member.
             population: The last population.
-            settings: The method's settings, a dataclass.
             chi2: Mean squared whitened residual at the estimate.
             alarms: Reasons to distrust the result.
             extra: Further provenance.
@@ -116,7 +116,8 @@ class Run:
         interval = np.stack(
             [space.from_scale(middle - Z90 * std), space.from_scale(middle + Z90 * std)], axis=1
         )
-        latency = coordinates.clip_latency(float(centre.latency_s[0]))
+        clip = self.coordinates.clip_latency
+        latency = clip(float(centre.latency_s[0]))
         spread = float(population.latency_s.std(ddof=1)) if len(scaled) > 1 else 0.0
         return CalibrationResult(
             method=self.method,
@@ -126,14 +127,11 @@ class Run:
             covariance=covariance,
             population=population.theta,
             latency_s=latency,
-            latency_interval_s=(
-                coordinates.clip_latency(latency - Z90 * spread),
-                coordinates.clip_latency(latency + Z90 * spread),
-            ),
+            latency_interval_s=(clip(latency - Z90 * spread), clip(latency + Z90 * spread)),
             chi2=chi2,
             alarms=tuple(alarms),
             trace=tuple(self.trace),
             steps=self.steps,
             seconds=self.seconds,
-            provenance={"settings": asdict(settings), "budget": asdict(self.budget), **(extra or {})},
+            provenance={"settings": asdict(self._settings), "budget": asdict(self.budget), **(extra or {})},
         )

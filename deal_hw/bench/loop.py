@@ -29,7 +29,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
 
 TASK_EPISODES = 5
-SEARCHES = ("deal", "weki", "deal-paper", "deal-paper-flat", "centre")
+SEARCHES = ("deal", "eki", "deal-paper", "deal-paper-flat", "centre")
 """Run without the polish, beside the default with everything."""
 
 

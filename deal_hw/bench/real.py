@@ -25,7 +25,7 @@ from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
 
 KEY = ("task", "split", "method", "polish", "xi", "seed")
-METHODS = ("nominal", "open-loop", "weki", "mujoco-sysid", "least-squares-multistart")
+METHODS = ("nominal", "open-loop", "eki", "mujoco-sysid", "least-squares-multistart")
 """Rows where nothing else is asked for."""
 
 UNTOLD = frozenset({"nominal", "open-loop"})

@@ -78,8 +78,8 @@ class Calibrate(Checked):
     """Held-out predictions restart from the measured state this often [s]."""
 
     method: str = DEFAULT
-    """How to search: default, open-loop, weki, deal, deal-paper, ... (an unknown name lists all). The default
-    is weki and its polish; with --model, for a robot that servos hold on a fixed base, it is open-loop unless
+    """How to search: default, open-loop, eki, deal, deal-paper, ... (an unknown name lists all). The default
+    is eki and its polish; with --model, for a robot that servos hold on a fixed base, it is open-loop unless
     --residual-std or --no-polish say how to treat what no model explains."""
 
     space: str = ""
@@ -261,7 +261,7 @@ def usual_method(config: Calibrate, robot: RobotModel) -> str:
         # Predictions of seconds, which open-loop compares, mean nothing for a robot that falls.
         return config.method
     if not config.quiet:
-        print("method: open-loop (--method weki to search and polish to the sensor noise)", file=sys.stderr)
+        print("method: open-loop (--method eki to search and polish to the sensor noise)", file=sys.stderr)
     return "open-loop"
 
 

@@ -20,7 +20,7 @@ from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
-    from deal_hw.calib.search.checkpoint import Checkpoint
+    from deal_hw.calib.search.resume import Checkpoint
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.overlay import Overlay
 
@@ -49,8 +49,7 @@ def open_checkpoint(
         budget: How much it may use.
         rng: The run's generator, before it has drawn anything.
     """
-    from deal_hw.calib.search.checkpoint import Checkpoint
-    from deal_hw.calib.search.identity import run_identity
+    from deal_hw.calib.search.resume import Checkpoint, run_identity
 
     return Checkpoint(path, run_identity(problem, method, budget, rng), fresh=not resume)
 

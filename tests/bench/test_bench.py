@@ -50,7 +50,7 @@ def test_rows_have_the_fields_of_the_benchmark_and_are_not_run_twice(tmp_path: P
 
 def test_unknown_method_is_refused_before_anything_runs(tmp_path: Path) -> None:
     """The methods are listed."""
-    with pytest.raises(UnknownNameError, match="weki"):
+    with pytest.raises(UnknownNameError, match="eki"):
         bench(Bench(bench="loop", methods="magic", out=tmp_path / "loop.json"))
 
 

@@ -15,7 +15,7 @@ from deal_hw.calib.baselines.bayesian import (
     critic_return,
 )
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.checkpoint import Checkpoint
+from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace

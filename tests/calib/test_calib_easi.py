@@ -11,7 +11,7 @@ from deal_hw.calib.baselines.easi import Box, Easi, EasiSettings, EliteGaussian,
 from deal_hw.calib.data.coordinates import Coordinates
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FITNESSES
-from deal_hw.calib.search.checkpoint import Checkpoint
+from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace

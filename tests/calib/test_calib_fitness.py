@@ -95,7 +95,7 @@ def test_flat_sees_nothing(problem: Problem) -> None:
 @pytest.mark.parametrize("name", FITNESSES)
 def test_saved_fitness_goes_on_exactly(problem: Problem, name: str) -> None:
     """After save and load into a new one, later scores are the same to the last bit."""
-    from deal_hw.calib.search.checkpoint import pack, unpack
+    from deal_hw.calib.search.resume import pack, unpack
 
     settings = dataclasses.replace(SETTINGS, replay_generations=3)
     first = make_fitness(name, problem, np.random.default_rng(1), settings)
@@ -116,7 +116,7 @@ def test_replay_that_is_forgotten_is_not_saved(problem: Problem) -> None:
         fitness = make_fitness("critic", problem, np.random.default_rng(1), settings)
         for _ in range(4):
             fitness.score(members(problem))
-        assert len(fitness.save()["replay"]) == kept
+        assert len(fitness.save()["_replay"]) == kept
 
 
 @pytest.mark.parametrize("name", ["trajectory", "energy", "mmd"])

@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import LeastSquares, OneStep, textbook_covariance
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.checkpoint import Checkpoint
+from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.episode import Episode

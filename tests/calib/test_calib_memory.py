@@ -24,7 +24,7 @@ class Enough(Exception):  # noqa: N818
     """The wanted number of generations is reached."""
 
 
-@pytest.mark.parametrize("name", ["weki", "cma", "random"])
+@pytest.mark.parametrize("name", ["eki", "cma", "random"])
 def test_memory_stays_flat(name: str, small_problem: Callable[..., Problem]) -> None:
     """Between the 5th and the 11th generation next to nothing is kept, however many runs they take."""
     problem, held = small_problem(seconds=0.6), []

@@ -13,9 +13,9 @@ from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import METHODS, NULL_METHODS, WHOLE_METHODS, check_method, make_method
 from deal_hw.calib.pipeline import PolishedMethod
-from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calib.search.deal import Deal
-from deal_hw.calib.search.eki import Weki
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -73,14 +73,14 @@ def case_of(name: str, budget: Budget, tolerance: float | None) -> MethodCase:
     )
 
 
-class TestWeki(MethodSuite):
-    """`weki`: within 0.1 %."""
+class TestEki(MethodSuite):
+    """`eki`: within 0.1 %."""
 
     @pytest.fixture(scope="class")
     @classmethod
     def case(cls) -> MethodCase:
         """Return the method under test."""
-        return case_of("weki", Budget(population=20, generations=25), 1e-3)
+        return case_of("eki", Budget(population=20, generations=25), 1e-3)
 
 
 class TestDeal(MethodSuite):
@@ -157,7 +157,7 @@ def test_unknown_method_lists_the_names() -> None:
     """The error of a mistyped name helps."""
     for call in (check_method, make_method):
         with pytest.raises(
-            UnknownNameError, match="unknown calibration method 'dael'; known: default, weki, deal"
+            UnknownNameError, match="unknown calibration method 'dael'; known: default, eki, deal"
         ):
             call("dael")
 
@@ -192,11 +192,11 @@ def test_constant_fitness_does_not_find_the_truth() -> None:
     assert np.all(values.std(axis=0) < 0.3)
 
 
-def test_weki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
+def test_eki_finds_nine_parameters_and_the_latency_of_a_noisy_robot() -> None:
     """Tuning seed 0, profile sensor: mean |ln| below 0.05 where the centre has 0.6, latency within 1 ms."""
     d = recorded("sensor", 0)
     problem = Problem(d.robot, d.space, [d.fit], threads=1)
-    result = Weki().run(problem, Budget(population=60, generations=15), np.random.default_rng(0))
+    result = Eki().run(problem, Budget(population=60, generations=15), np.random.default_rng(0))
     assert np.mean(np.abs(np.log(result.estimate / d.theta))) < 0.05
     assert abs(result.latency_s - d.truth.latency_s) < 1e-3
     assert result.chi2 < 3.0
@@ -214,10 +214,10 @@ def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
     assert abs(result.latency_s - d.truth.latency_s) < 10e-3
 
 
-def test_weki_says_when_the_residual_is_not_explained() -> None:
+def test_eki_says_when_the_residual_is_not_explained() -> None:
     """A budget of two generations leaves a residual, and the result carries an alarm that says so."""
     d = recorded("sensor", 0)
     problem = Problem(d.robot, d.space, [d.fit], threads=1)
-    result = Weki().run(problem, Budget(population=10, generations=2), np.random.default_rng(0))
+    result = Eki().run(problem, Budget(population=10, generations=2), np.random.default_rng(0))
     assert result.chi2 > 3.0
     assert "residual" in result.alarms[0]

@@ -45,7 +45,7 @@ def result(searched: ParameterSpace, **changes: Any) -> CalibrationResult:
     """Return a result at the centre of its range."""
     K = len(searched)
     values = {
-        "method": "weki",
+        "method": "eki",
         "estimate": np.full(K, 10.0),
         "interval": np.tile([5.0, 20.0], (K, 1)),
         "covariance": np.eye(K) * 0.01,

@@ -12,10 +12,9 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
 from deal_hw.calib.pipeline import PolishedMethod
-from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calib.search.deal import Deal, DealSettings
-from deal_hw.calib.search.eki import Weki, WekiSettings
-from deal_hw.calib.search.identity import run_identity
+from deal_hw.calib.search.eki import Eki, EkiSettings
+from deal_hw.calib.search.resume import Checkpoint, run_identity
 from deal_hw.calib.validation.checks import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -66,9 +65,9 @@ def check_same(a: CalibrationResult, b: CalibrationResult) -> None:
 
 
 @pytest.mark.parametrize("stop", [2, 5, 9])
-def test_weki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
+def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
     """Whatever it was about: the first stage, a later one with moved start states, or a restart."""
-    method = Weki(WekiSettings(noisy_ticks=(5, 10), stage_generations=3, restart_chi2=1e-6))
+    method = Eki(EkiSettings(noisy_ticks=(5, 10), stage_generations=3, restart_chi2=1e-6))
     budget, path = Budget(population=10, generations=12), tmp_path / "checkpoint.npz"
     whole = run(method, make_problem(1e-3), budget, None, 0)
     assert whole.provenance["restarts"] >= 1
@@ -99,7 +98,7 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
     # Nothing is ever explained and no two searches agree: all three attempts are made.
     monkeypatch.setattr(pipeline, "MISMATCH_CHI2", 0.0)
     monkeypatch.setattr(pipeline, "RESTARTS", pipeline.RestartSettings(same=0.0, fewest_generations=1))
-    search = Weki(WekiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
+    search = Eki(EkiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
     method = PolishedMethod(search, settings=Validation(local_first=False))
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
     stages: list[str] = []
@@ -116,11 +115,11 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
     with pytest.raises(StoppedError):
         run(method, make_problem(), budget, Checkpoint(path, "a"), in_polish)
     saved = Checkpoint(path, "a").load()
-    assert saved is not None and len(saved["finished"]) == 1 and saved["running"] is None
+    assert saved is not None and len(saved["searches"]) == 1
     with pytest.raises(StoppedError):
         run(method, make_problem(), budget, Checkpoint(path, "a"), polishes + 3)
     saved = Checkpoint(path, "a").load()
-    assert saved is not None and len(saved["finished"]) == 1 and saved["running"] is not None
+    assert saved is not None and len(saved["searches"]) == 2
     resumed = run(method, make_problem(), budget, Checkpoint(path, "a"), 0)
     check_same(resumed, whole)
     assert resumed.provenance["restarts"] == 2
@@ -146,7 +145,7 @@ def test_identity_changes_with_all_that_decides_the_numbers() -> None:
     def identity(
         problem: Problem = problem, method: Any = None, budget: Budget | None = None, seed: int = 0
     ) -> str:
-        return run_identity(problem, method or Weki(), budget or Budget(), rng(seed))
+        return run_identity(problem, method or Eki(), budget or Budget(), rng(seed))
 
     def other(**changes: Any) -> Problem:
         fields: dict[str, Any] = {"threads": 1, "fixed_latency_s": None, "space": problem.space}
@@ -160,14 +159,14 @@ def test_identity_changes_with_all_that_decides_the_numbers() -> None:
         identity(other(fixed_latency_s=0.003)),
         identity(other(space=problem.space.with_ratio(3.0))),
         identity(method=Deal()),
-        identity(method=Weki(WekiSettings(widen=0.6))),
-        identity(method=PolishedMethod(Weki())),
-        identity(method=PolishedMethod(Weki(WekiSettings(widen=0.6)))),
+        identity(method=Eki(EkiSettings(widen=0.6))),
+        identity(method=PolishedMethod(Eki())),
+        identity(method=PolishedMethod(Eki(EkiSettings(widen=0.6)))),
         identity(budget=Budget(population=99)),
         identity(seed=1),
         run_identity(
             Problem(load_model(DESCRIPTION, 0.0005), problem.space, problem.episodes, threads=1),
-            Weki(), Budget(), rng(0),
+            Eki(), Budget(), rng(0),
         ),
     ]  # fmt: skip
     assert len(set(different)) == len(different)

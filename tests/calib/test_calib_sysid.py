@@ -12,7 +12,7 @@ import pytest
 
 from deal_hw.calib.baselines.sysid import MujocoSysid, SysidSettings, with_delay
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.checkpoint import Checkpoint
+from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, MissingExtraError

@@ -96,7 +96,7 @@ def test_range_without_the_nominal_value_is_refused(dataset: Path) -> None:
 
 def test_unknown_method_lists_the_methods(dataset: Path) -> None:
     """A wrong method is answered with the right ones."""
-    with pytest.raises(UnknownNameError, match=r"gradient.*weki"):
+    with pytest.raises(UnknownNameError, match=r"gradient.*eki"):
         calibrate(settings(dataset, method="gradient"))
 
 

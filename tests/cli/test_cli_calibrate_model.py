@@ -187,7 +187,7 @@ def test_spikes_do_not_move_the_estimate(
         )
 
 
-@pytest.mark.parametrize("method", ["near", "weki"])
+@pytest.mark.parametrize("method", ["near", "eki"])
 def test_latency_at_the_end_of_its_range(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:

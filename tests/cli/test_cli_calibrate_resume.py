@@ -46,7 +46,7 @@ def command(dataset: Path, out: Path, *more: str) -> list[str]:
     words = ["calibrate", str(dataset), "--out", str(out), "--free", "cart.mass", "servo.stiffness"]
     words += ["--latency", "0.009", "--population", "12", "--generations", "8", "--quiet"]
     # A search that is named is always run.
-    words += ["--method", "weki"]
+    words += ["--method", "eki"]
     return [*words, *more]
 
 
@@ -146,7 +146,7 @@ def test_the_best_fit_so_far_is_said_and_kept(
 
         yield progress
 
-    words = [w for w in command(dataset, tmp_path) if w not in ("--quiet", "--method", "weki")]
+    words = [w for w in command(dataset, tmp_path) if w not in ("--quiet", "--method", "eki")]
     latency = words.index("--latency")
     del words[latency : latency + 2]
     with monkeypatch.context() as patch:
@@ -208,5 +208,5 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     assert f"the results in {tmp_path / 'calibration'} are whole" in told and "--resume" not in told
     assert {file.name for file in (tmp_path / "calibration").iterdir()} == FILES
     assert [file.name for file in tmp_path.iterdir()] == ["calibration"]
-    assert calibration.read_result(tmp_path / "calibration").method == "weki"
+    assert calibration.read_result(tmp_path / "calibration").method == "eki"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -116,7 +116,7 @@ def test_distributions_draw_what_they_say() -> None:
 def test_result_there_and_back() -> None:
     """A result comes back from its JSON text; intervals make a distribution where no covariance is."""
     result = CalibrationResult(
-        method="weki", space=SPACE, estimate=np.array([2.0, 0.5]),
+        method="eki", space=SPACE, estimate=np.array([2.0, 0.5]),
         interval=np.array([[1.8, 2.2], [0.4, 0.6]]), verdicts=("identifiable", "weak"), latency_s=0.012,
         latency_interval_s=(0.0115, 0.0125), alarms=("x",), heldout_nrmse={"nominal": 0.3},
     )  # fmt: skip

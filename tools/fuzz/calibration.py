@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from mcap_ros2.writer import Writer
 
-from deal_hw.calib.search.checkpoint import Checkpoint, pack
+from deal_hw.calib.search.resume import Checkpoint, pack
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.cli.emulate_common import read_truth
 from deal_hw.cli.train import read_distribution

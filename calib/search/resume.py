@@ -1,0 +1,275 @@
+"""What a stopped run needs to go on: its state between two generations, a file for it, and whose file it is.
+
+A state is nested mappings and lists of plain JSON values and NumPy arrays; nothing is ever pickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import time
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback, StateStore
+from deal_hw.errors import ConfigurationError, DatasetError, short, shown
+from deal_hw.reading import RECORDING_BYTES, object_of, read_arrays, read_bytes, reading
+from deal_hw.sim.engine.digest import model_digest
+
+State = Mapping[str, Any]
+"""Nested mappings and lists of plain JSON values and NumPy arrays."""
+
+FORMAT = "deal_hw.checkpoint/2"
+_HEADER, _ARRAY = "state", "__array__"
+
+PACKAGES = ("deal-hw", "mujoco", "numpy", "scipy", "torch", "botorch", "cma", "gpytorch")
+"""Whose versions may change a run's numbers, where they are installed."""
+
+
+class Kept:
+    """An object whose state is some of its attributes: plain values, arrays or objects of this kind."""
+
+    KEPT: ClassVar[tuple[str, ...]] = ()
+    """Names of the attributes on which all that follows depends."""
+
+    def save(self) -> State:
+        """Return the state; what changes later does not change it."""
+        held = {name: getattr(self, name) for name in self.KEPT}
+        return {k: v.save() if isinstance(v, Kept) else copy.deepcopy(v) for k, v in held.items()}
+
+    def load(self, state: State) -> None:
+        """Continue from what :meth:`save` returned."""
+        for name in self.KEPT:
+            held = getattr(self, name)
+            if isinstance(held, Kept):
+                held.load(state[name])
+            else:
+                setattr(self, name, copy.deepcopy(state[name]))
+
+
+def restore_generator(rng: np.random.Generator, state: State) -> None:
+    """Set a generator to the state of ``rng.bit_generator``, so that it draws what it would have drawn.
+
+    Raises:
+        ConfigurationError: It is the state of another kind of generator.
+    """
+    try:
+        rng.bit_generator.state = dict(state)
+    except (ValueError, TypeError) as err:
+        raise ConfigurationError(f"the checkpoint's generator state does not fit: {err}") from err
+
+
+def pack(state: State) -> bytes:
+    """Return a state as the bytes of an NPZ file: a JSON tree whose leaves name arrays beside it.
+
+    Raises:
+        TypeError: It holds something else than plain values and arrays of numbers.
+    """
+    arrays: dict[str, Any] = {}
+
+    def named(value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "biufc":
+            raise TypeError(f"a checkpoint holds plain values and arrays of numbers, not {short(value, 60)}")
+        arrays[f"a{len(arrays)}"] = value
+        return {_ARRAY: f"a{len(arrays) - 1}"}
+
+    tree = json.dumps({"format": FORMAT, "state": state}, default=named)
+    buffer = io.BytesIO()
+    arrays[_HEADER] = np.frombuffer(tree.encode("ascii"), dtype=np.uint8)
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def unpack(data: bytes) -> dict[str, Any]:
+    """Return the state that :func:`pack` wrote; tuples come back as lists.
+
+    Raises:
+        DatasetError: These are not the bytes of a checkpoint.
+    """
+    with reading("the state", FORMAT):
+        arrays, left_out = read_arrays(data, lambda dtype, shape: dtype.kind in "biufc")
+        if left_out:
+            raise ValueError(f"{short(next(iter(left_out)), 60)} is no array of numbers")
+        text = arrays.pop(_HEADER).tobytes()
+        header = json.loads(text, object_hook=lambda v: arrays[v[_ARRAY]] if set(v) == {_ARRAY} else v)
+        if object_of(header)["format"] != FORMAT:
+            raise ValueError(f"format {shown(header['format'])}")
+        return dict(object_of(header["state"]))
+
+
+class Checkpoint:
+    """A checkpoint file of one run; written whole or not at all. A :class:`deal_hw.calibration.StateStore`.
+
+    Args:
+        path: The file.
+        identity: Digest of everything that decides the run's numbers; a file of another run is refused.
+        fresh: Begin anew: a file that is there is not read, and is replaced by the first state.
+    """
+
+    def __init__(self, path: Path, identity: str, *, fresh: bool = False) -> None:
+        self.path, self.identity, self._fresh = path, identity, fresh
+
+    def save(self, state: State) -> None:
+        """Replace the file by this state.
+
+        Raises:
+            DatasetError: The file cannot be written.
+        """
+        waiting = self.path.with_suffix(".part")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            waiting.write_bytes(pack({"identity": self.identity, "run": state}))
+            os.replace(waiting, self.path)
+            self._fresh = False
+        except OSError as err:
+            raise DatasetError(f"{self.path} cannot be written: {err.strerror}") from err
+
+    def load(self) -> dict[str, Any] | None:
+        """Return the saved state, or None where there is none to continue.
+
+        Raises:
+            ConfigurationError: The file belongs to another run.
+            DatasetError: The file is unreadable.
+        """
+        if self._fresh or not self.path.exists():
+            return None
+        with reading(self.path, "a calibration's state", "remove it and begin again"):
+            saved = unpack(read_bytes(self.path, RECORDING_BYTES))
+            if saved.get("identity") != self.identity:
+                raise ConfigurationError(
+                    f"{self.path} is of a run with other data, settings or versions and cannot be resumed; "
+                    "remove it, or repeat the settings of that run"
+                )
+            return dict(object_of(saved["run"]))
+
+    def remove(self) -> None:
+        """Remove the file: the run is over."""
+        for path in (self.path, self.path.with_suffix(".part")):
+            path.unlink(missing_ok=True)
+
+
+class Restarts:
+    """Runs a search again and again; what an interrupted run had finished is not run a second time.
+
+    It is the running search's store: the last state of each search goes into the whole run's store. From its
+    last state a search that is over makes its result again, and the generator is where that search left it.
+
+    Args:
+        search: The search.
+        rng: The only source of randomness.
+        store: Where the whole run is kept; None to keep nothing.
+    """
+
+    def __init__(
+        self, search: CalibrationMethod[Problem], rng: np.random.Generator, store: StateStore | None
+    ) -> None:
+        self._search, self._rng, self._store = search, rng, store
+        saved = store.load() if store is not None else None
+        self._states: list[State] = [] if saved is None else list(saved["searches"])
+        self._number = 0
+        self.earlier_steps = 0
+        """Physics steps that the searches simulated before this process resumed them."""
+        self.earlier_seconds = 0.0
+        """Wall clock that they took before this process resumed them [s]."""
+
+    def run(
+        self, problem: Problem, number: int, budget: Budget, progress: ProgressCallback | None
+    ) -> CalibrationResult:
+        """Return the result of search ``number``, 0 for the first.
+
+        Args:
+            problem: Data and simulator.
+            number: Which search; each follows the one before.
+            budget: What that search may use.
+            progress: Called after each of its generations.
+        """
+        self._number = number
+        steps, began = problem.steps, time.perf_counter()
+        kept = () if self._store is None else (self,)
+        result = self._search.run(problem, budget, self._rng, progress, *kept)
+        self.earlier_steps += result.steps - (problem.steps - steps)
+        self.earlier_seconds += max(result.seconds - (time.perf_counter() - began), 0.0)
+        return result
+
+    def save(self, state: State) -> None:
+        """Keep the running search's state; see :class:`deal_hw.calibration.StateStore`."""
+        self._states[self._number :] = [state]
+        if self._store is not None:
+            self._store.save({"searches": self._states})
+
+    def load(self) -> State | None:
+        """Return the running search's state, or None where it has not begun."""
+        return self._states[self._number] if self._number < len(self._states) else None
+
+
+def run_identity(
+    problem: Problem, method: CalibrationMethod[Problem], budget: Budget, rng: np.random.Generator
+) -> str:
+    """Return the digest of a run, by which its checkpoint is known.
+
+    It covers the recordings' samples and commands, what is known of their noise and latency, model, space,
+    method with its settings, budget, generator and versions; not the number of threads, which changes no
+    number.
+
+    Args:
+        problem: Data and simulator.
+        method: The method.
+        budget: How much it may use.
+        rng: The run's generator, before it has drawn anything.
+
+    Raises:
+        TypeError: The method holds something that cannot be told apart, such as a function.
+    """
+    versions = {}
+    for name in PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    given = [f.name for f in dataclasses.fields(problem) if f.init]
+    return digest(
+        {
+            "problem": {k: getattr(problem, k) for k in given if k not in {"robot", "space", "threads"}},
+            "model": model_digest(problem.robot),
+            "description": problem.robot.description.to_json(),
+            "space": problem.space.to_json(),
+            "method": method,
+            "budget": budget,
+            "generator": rng.bit_generator.state,
+            "versions": versions,
+        }
+    )
+
+
+def digest(value: Any) -> str:
+    """Return the SHA-256 of nested mappings, sequences, dataclasses, methods, arrays and plain values.
+
+    Raises:
+        TypeError: There is something else among them.
+    """
+    return hashlib.sha256(json.dumps(value, default=_told_apart).encode()).hexdigest()
+
+
+def _told_apart(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return {"array": [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]}
+    if isinstance(value, CalibrationMethod):
+        return {"method": type(value).__qualname__, "name": value.name, **vars(value)}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {"dataclass": type(value).__qualname__, **fields}
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a {type(value).__name__} has no digest")
