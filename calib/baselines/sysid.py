@@ -7,14 +7,13 @@ intervals are its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.baselines.least_squares import Found, OneShot, textbook_covariance
+from deal_hw.calib.baselines.least_squares import Found, OneShotSearch, textbook_covariance
 from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.recordings.sysid_adapter import Recording, check_space, identify, require_sysid
@@ -34,23 +33,15 @@ class SysidSettings:
     latency_s: float | None = None
 
 
-class MujocoSysid(Search):
-    """``mujoco.sysid`` with its default optimiser.
-
-    That optimiser is one call, so a run is one generation: interrupted in the middle of it, a run begins
-    anew, to the same numbers. The budget's generations bound its iterations.
-
-    Args:
-        settings: How to run.
-    """
+@dataclass(frozen=True)
+class MujocoSysid(OneShotSearch):
+    """``mujoco.sysid`` with its default optimiser; nothing is drawn."""
 
     name = "mujoco-sysid"
+    settings: SysidSettings = field(default_factory=SysidSettings)
 
-    def __init__(self, settings: SysidSettings | None = None) -> None:
-        self.settings = settings or SysidSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run before its only generation; nothing is drawn.
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+        """See :meth:`OneShotSearch.solve`.
 
         Raises:
             ConfigurationError: A parameter has no counterpart, or joint positions were not measured.
@@ -64,7 +55,7 @@ class MujocoSysid(Search):
         source = "given" if given is not None else "none, as its user would have it"
         latency_s = log.coordinates.clip_latency(given or 0.0)
         words = f"its own, {1e3 * latency_s:g} ms of latency ({source})"
-        return OneShot(log, lambda: _solve(log, settings.ticks, latency_s), words)
+        return _solve(log, settings.ticks, latency_s, words)
 
 
 def _check_channels(problem: Problem) -> None:
@@ -77,7 +68,7 @@ def _check_channels(problem: Problem) -> None:
         )
 
 
-def _solve(log: SearchLog, ticks: int, latency_s: float) -> Found:
+def _solve(log: SearchLog, ticks: int, latency_s: float, source: str) -> Found:
     problem = log.problem
     recordings = [
         Recording(problem.episodes[d.episode], d.windows, d.start_position, d.start_velocity)
@@ -101,6 +92,7 @@ def _solve(log: SearchLog, ticks: int, latency_s: float) -> Found:
         latency_s=latency_s,
         iterations=found.iterations,
         message=found.message,
+        source=source,
         steps=found.steps,
         interval=np.clip(interval, space.low[:, None], space.high[:, None]),
     )
