@@ -33,11 +33,9 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 from scipy.stats.qmc import Sobol
 
-from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
-from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -304,43 +302,19 @@ def _box(points: FloatArray, value: FloatArray, model: Any, side: float | None) 
     return np.asarray(np.clip(np.stack([best - half, best + half]), 0.0, 1.0))
 
 
-@dataclass(frozen=True)
-class BayesianOptimisation(Search):
-    """Bayesian optimisation of a pluggable fitness.
-
-    Attributes:
-        settings: How to run.
-        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
-    """
-
-    name = "bo"
-    settings: BoSettings = field(default_factory=BoSettings)
-    policy: PopulationPolicy | None = None
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Bo(log, rng, self.settings, self.policy)
-
-
-def critic_return() -> BayesianOptimisation:
-    """Return the paper's row: Bayesian optimisation of the critic's return."""
-    return BayesianOptimisation(BoSettings(fitness="critic"))
-
-
 class _Bo(ScoredStepper):
     INTERVAL = "spread of the best points, uncalibrated"
 
-    def __init__(
-        self, log: SearchLog, rng: np.random.Generator, settings: BoSettings, policy: PopulationPolicy | None
-    ) -> None:
-        super().__init__(log, rng, settings.fitness, settings.scoring, policy)
-        self._settings = settings
+    settings: BoSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+        super().__init__(log, rng, search)
         # Now rather than after the first generation has been simulated.
         _require_botorch()
         self._search = GaussianProcessSearch(
             self.coordinates.count,
             log.budget.population,
-            settings,
+            self.settings,
             int(rng.integers(2**31)),
             stationary=self.stationary,
         )
@@ -367,8 +341,22 @@ class _Bo(ScoredStepper):
     def found(self) -> tuple[Members, Members]:
         """Return the best point and the best few."""
         found = self._search.points[self._search.order] if self.log.trace else self._search.ask()
-        elite = self.coordinates.members(found[: self._settings.elite])
+        elite = self.coordinates.members(found[: self.settings.elite])
         return Members(elite.theta[:1], elite.latency_s[:1]), elite
+
+
+@dataclass(frozen=True)
+class BayesianOptimisation(ScoredSearch):
+    """Bayesian optimisation of a pluggable fitness."""
+
+    name = "bo"
+    stepper = _Bo
+    settings: BoSettings = field(default_factory=BoSettings)
+
+
+def critic_return() -> BayesianOptimisation:
+    """Return the paper's row: Bayesian optimisation of the critic's return."""
+    return BayesianOptimisation(BoSettings(fitness="critic"))
 
 
 @functools.cache

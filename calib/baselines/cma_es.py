@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
-from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import Kept, State
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
@@ -161,31 +159,14 @@ class RestartedCma(Kept):
             )
 
 
-@dataclass(frozen=True)
-class Cma(Search):
-    """CMA-ES with restarts, inside the budget's population times generations.
-
-    Attributes:
-        settings: How to run.
-        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
-    """
-
-    name = "cma"
-    settings: CmaSettings = field(default_factory=CmaSettings)
-    policy: PopulationPolicy | None = None
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Cma(log, rng, self.settings, self.policy)
-
-
 class _Cma(ScoredStepper):
     KEPT = ("_search", "_fitness", "_scored", "_best")
 
-    def __init__(
-        self, log: SearchLog, rng: np.random.Generator, settings: CmaSettings, policy: PopulationPolicy | None
-    ) -> None:
-        super().__init__(log, rng, settings.fitness, settings.scoring, policy)
+    settings: CmaSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+        super().__init__(log, rng, search)
+        settings = self.settings
         usual = min(4 + int(3 * np.log(self.coordinates.count)), log.budget.population)
         first = settings.population or usual
         self._search = RestartedCma(self.coordinates.count, first, settings, int(rng.integers(2**62)))
@@ -234,8 +215,16 @@ class _Cma(ScoredStepper):
         return self.coordinates.members(best.unit[None]), self.coordinates.members(best.population)
 
     def facts(self) -> dict[str, Any]:
-        """See :meth:`ScoredStepper.facts`."""
         return {"restarts": self._search.restarts}
+
+
+@dataclass(frozen=True)
+class Cma(ScoredSearch):
+    """CMA-ES with restarts, inside the budget's population times generations."""
+
+    name = "cma"
+    stepper = _Cma
+    settings: CmaSettings = field(default_factory=CmaSettings)
 
 
 class Best(Kept):

@@ -15,11 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from deal_hw.calib.baselines.scored import ScoredStepper
+from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
-from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import Kept
@@ -137,44 +135,20 @@ class Box:
         return Members(np.clip(theta, space.low, space.high), members.latency_s)
 
 
-@dataclass(frozen=True)
-class Easi(Search):
-    """EASI: critic, elites and a diagonal Gaussian.
-
-    Attributes:
-        settings: How to run.
-        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
-    """
-
-    name = "easi"
-    settings: EasiSettings = field(default_factory=EasiSettings)
-    policy: PopulationPolicy | None = None
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Easi(log, rng, self.settings, self.policy)
-
-
-def published() -> Easi:
-    """Return EASI in the box as published: linear, whatever the parameters' scale."""
-    return Easi(EasiSettings(scale="linear"))
-
-
 class _Easi(ScoredStepper):
-    def __init__(
-        self,
-        log: SearchLog,
-        rng: np.random.Generator,
-        settings: EasiSettings,
-        policy: PopulationPolicy | None,
-    ) -> None:
-        critic = replace(settings.critic, batch=settings.batch_per_member * log.budget.population)
-        scoring = replace(settings.scoring, critic=critic)
-        super().__init__(log, rng, settings.fitness, scoring, policy)
+    settings: EasiSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+        super().__init__(log, rng, search)
+        settings = self.settings
         self._box = Box(self.coordinates, settings.scale)
         # The latency's coordinate is drawn without its margin, all others uniformly.
         start = self.coordinates.sample(rng, log.budget.population)
         self._search = EliteGaussian(start, settings.survive_rate, rng)
+
+    def scoring(self) -> FitnessSettings:
+        batch = self.settings.batch_per_member * self.log.budget.population
+        return replace(self.settings.scoring, critic=replace(self.settings.critic, batch=batch))
 
     def step(self) -> None:
         """Roll out, train the critic, score by the trained critic, select."""
@@ -187,3 +161,17 @@ class _Easi(ScoredStepper):
     def found(self) -> tuple[Members, Members]:
         """Return the Gaussian's mean and its last sample."""
         return self._box.members(self._search.mean[None]), self._box.members(self._search.ask())
+
+
+@dataclass(frozen=True)
+class Easi(ScoredSearch):
+    """EASI: critic, elites and a diagonal Gaussian."""
+
+    name = "easi"
+    stepper = _Easi
+    settings: EasiSettings = field(default_factory=EasiSettings)
+
+
+def published() -> Easi:
+    """Return EASI in the box as published: linear, whatever the parameters' scale."""
+    return Easi(EasiSettings(scale="linear"))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -118,36 +118,14 @@ class EkfSettings:
     diverged: float = 3.0
 
 
-class Ekf(Search):
-    """Augmented extended Kalman filter.
-
-    Args:
-        settings: How to run.
-    """
-
-    name = "ekf"
-
-    def __init__(self, settings: EkfSettings | None = None) -> None:
-        self.settings = settings or EkfSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run before its first pass; the filter draws nothing."""
-        return _Passes(log, self.settings)
-
-
 class _Passes(Stepper):
-    """One run: a generation is one pass along all recordings.
+    """One run: a generation is one pass along all recordings."""
 
-    Args:
-        log: Book-keeping of the run.
-        settings: How to run.
-    """
-
+    settings: EkfSettings
     KEPT = ("_value", "_covariance", "_lost", "_misfit")
 
-    def __init__(self, log: SearchLog, settings: EkfSettings) -> None:
-        super().__init__(log)
-        self._settings = settings
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
         self._samples: Sequence[WindowData] = log.problem.windows(1)
         self._low, self._high = value_bounds(log.problem)
         space = log.problem.space
@@ -173,13 +151,13 @@ class _Passes(Stepper):
 
     @property
     def _passes(self) -> int:
-        return max(min(self._settings.passes, self.log.budget.generations), 1)
+        return max(min(self.settings.passes, self.log.budget.generations), 1)
 
     def step(self) -> None:
         """Run along all recordings once."""
         filter_ = self._filter()
         left = 1.0 - len(self.log.trace) / max(self._passes - 1, 1)
-        factor = self._settings.first_noise_factor ** max(left, 0.0)
+        factor = self.settings.first_noise_factor ** max(left, 0.0)
         misfits: list[float] = []
         self._lost = 0
         for data in self._samples:
@@ -198,7 +176,7 @@ class _Passes(Stepper):
         )
 
     def _filter(self) -> ExtendedKalman:
-        problem, settings = self.problem, self._settings
+        problem, settings = self.problem, self.settings
         C, P = problem.coordinates, len(self._prior_std)
         n = 2 * C
         covariance = np.zeros((n + P, n + P))
@@ -259,25 +237,31 @@ class _Passes(Stepper):
         covariance = self._covariance[:K, :K]
         latency, clip = float(self._value[-1]), self.coordinates.clip_latency
         alarms = []
-        if not self._misfit < self._settings.diverged:
+        if not self._misfit < self.settings.diverged:
             alarms.append(
                 f"the filter's innovations are {self._misfit:.1f} times their own variance: it diverged, and "
                 "its covariance means nothing"
             )
         spread = Z90 * math.sqrt(max(self._covariance[K, K], 0.0)) if self._free_latency else 0.0
-        plain = self.log.result(
+        return self.log.result(
             centre,
             centre,
             chi2=self._misfit,
             alarms=alarms,
             extra={"lost_steps": self._lost, "interval": "the filter's own covariance of the last pass"},
-        )
-        return dataclasses.replace(
-            plain,
             interval=intervals(space, centre.theta[0], covariance),
             covariance=covariance,
             latency_interval_s=(clip(latency - spread), clip(latency + spread)),
         )
+
+
+@dataclass(frozen=True)
+class Ekf(Search):
+    """Augmented extended Kalman filter; it draws nothing."""
+
+    name = "ekf"
+    stepper = _Passes
+    settings: EkfSettings = field(default_factory=EkfSettings)
 
 
 def only(data: WindowData, w: int) -> WindowData:

@@ -8,9 +8,8 @@ their own; the solver is that of all fits (:func:`deal_hw.calib.fit.solver.minim
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -50,26 +49,9 @@ class GaussNewtonSettings:
     noisy_ticks: tuple[int, ...] = (5, 20)
     clean_ticks: tuple[int, ...] = (5, 10)
     rounds: int = 3
-    solver: SolverSettings = dataclasses.field(default_factory=lambda: SolverSettings(reach=30.0))
+    solver: SolverSettings = field(default_factory=lambda: SolverSettings(reach=30.0))
     converged: float = 1e-3
     restart_chi2: float = 3.0
-
-
-class GaussNewton(Search):
-    """Multi-start least squares on whitened window innovations.
-
-    Args:
-        settings: How to run.
-    """
-
-    name = "gauss-newton"
-
-    def __init__(self, settings: GaussNewtonSettings | None = None) -> None:
-        self.settings = settings or GaussNewtonSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run before its first draw."""
-        return _MultiStart(log, rng, self.settings)
 
 
 class Innovations:
@@ -136,19 +118,14 @@ class Innovations:
 
 
 class _MultiStart(Stepper):
-    """One run: draw, refine one start a generation, stage by stage, draw again.
+    """One run: draw, refine one start a generation, stage by stage, draw again."""
 
-    Args:
-        log: Book-keeping of the run.
-        rng: Draws.
-        settings: How to run.
-    """
-
+    settings: GaussNewtonSettings
     KEPT = ("_stage", "_number", "_restarts", "_explained", "_drawn", "_values", "_chi2", "_best")
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: GaussNewtonSettings) -> None:
-        super().__init__(log)
-        self._rng, self._settings = rng, settings
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
+        settings = self.settings
         self._bounds = value_bounds(self.problem)
         self._ticks = settings.noisy_ticks if is_noisy(self.problem) else settings.clean_ticks
         middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
@@ -184,8 +161,8 @@ class _MultiStart(Stepper):
             self._refine()
 
     def _draw(self) -> None:
-        budget, settings = self.log.budget, self._settings
-        members = self.coordinates.members(self.coordinates.sample(self._rng, budget.population))
+        budget, settings = self.log.budget, self.settings
+        members = self.coordinates.members(self.coordinates.sample(self.rng, budget.population))
         values = self._values_of(members)
         # One metric for all draws, that of the range's centre, and absolute values: most draws are so far
         # off that squares would rank them by their one worst window.
@@ -204,7 +181,7 @@ class _MultiStart(Stepper):
             self._stage = 0
 
     def _refine(self) -> None:
-        settings, number = self._settings, self._number
+        settings, number = self.settings, self._number
         ticks, follow = self._ticks[self._stage], self._stage > 0
         value, chi2 = self._values[number], math.inf
         for _ in range(settings.rounds):
@@ -240,7 +217,7 @@ class _MultiStart(Stepper):
             self._restarts += 1
             self._begin_draws()
         else:
-            order = np.argsort(self._chi2[: self._number], kind="stable")[: self._settings.survivors]
+            order = np.argsort(self._chi2[: self._number], kind="stable")[: self.settings.survivors]
             self._values, self._chi2 = self._values[order], self._chi2[order]
             self._stage, self._number = self._stage + 1, 0
 
@@ -265,18 +242,24 @@ class _MultiStart(Stepper):
             fixed_latency=problem.fixed_latency_s is not None,
             timing_std_s=problem.noise.timing_std_s,
         )
-        plain = self.log.result(
+        return self.log.result(
             innovations.members(value[None]),
             innovations.members(self._values if len(self._values) else value[None]),
             chi2=chi2,
             alarms=known.alarms,
             extra={"restarts": self._restarts, "interval": "90 %, from the normal equations"},
-        )
-        return dataclasses.replace(
-            plain,
             interval=known.interval,
             covariance=known.covariance,
             verdicts=known.verdicts,
             null_directions=known.null_directions,
             latency_interval_s=known.latency_interval_s,
         )
+
+
+@dataclass(frozen=True)
+class GaussNewton(Search):
+    """Multi-start least squares on whitened window innovations."""
+
+    name = "gauss-newton"
+    stepper = _MultiStart
+    settings: GaussNewtonSettings = field(default_factory=GaussNewtonSettings)

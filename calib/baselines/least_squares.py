@@ -12,9 +12,10 @@ parameters, and a start on a plateau stays there. Parameters are in their own sc
 
 from __future__ import annotations
 
+import abc
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,32 +51,6 @@ class LeastSquaresSettings:
     diverged: float = 1e3
 
 
-class LeastSquares(Search):
-    """Single-start least squares on the one-step prediction error.
-
-    The optimiser's state is inside scipy, so a run is one generation: interrupted in the middle of it, a run
-    begins anew, to the same numbers. The budget's generations bound the optimiser's iterations.
-
-    Args:
-        settings: How to run.
-    """
-
-    name = "least-squares"
-
-    def __init__(self, settings: LeastSquaresSettings | None = None) -> None:
-        self.settings = settings or LeastSquaresSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run before its only generation; nothing is drawn."""
-        problem, settings = log.problem, self.settings
-        latency_s = log.coordinates.clip_latency(0.0)
-
-        def solve() -> Found:
-            return _solve(problem, latency_s, log.budget.generations, settings)
-
-        return OneShot(log, solve, f"textbook s^2 inv(J'J), latency {latency_s:g} s")
-
-
 @dataclass(frozen=True, slots=True)
 class Found:
     """What a one-shot optimiser found.
@@ -86,6 +61,7 @@ class Found:
         latency_s: Latency that was assumed [s].
         iterations: Iterations of the optimiser.
         message: Why it stopped.
+        source: Where the intervals come from, in words.
         steps: Physics steps that it simulated past the problem's own simulator.
         alarms: Reasons to distrust it.
         interval: 90 % intervals where the optimiser has its own, (K, 2); None: from the covariance.
@@ -96,26 +72,21 @@ class Found:
     latency_s: float
     iterations: int
     message: str
+    source: str
     steps: int = 0
     alarms: tuple[str, ...] = ()
     interval: FloatArray | None = None
 
 
 class OneShot(Stepper):
-    """A run of an optimiser that cannot be stopped in the middle: one generation.
-
-    Args:
-        log: Book-keeping of the run.
-        solve: The optimiser.
-        interval: Where the intervals come from, in words.
-    """
+    """A run of an optimiser that cannot be stopped in the middle: one generation."""
 
     EXPLAINED_TICKS = 10
     """Window length of the residual that the result states, in control periods."""
 
-    def __init__(self, log: SearchLog, solve: Callable[[], Found], interval: str) -> None:
-        super().__init__(log)
-        self._solve, self._interval = solve, interval
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: OneShotSearch) -> None:
+        super().__init__(log, rng, search)
+        self._solve = search.solve
         self._found: Found | None = None
 
     @property
@@ -125,7 +96,7 @@ class OneShot(Stepper):
 
     def step(self) -> None:
         """Run the optimiser to its end."""
-        found = self._solve()
+        found = self._solve(self.log, self.rng)
         self._found = found
         self.log.note(
             f"{found.iterations} iterations: {found.message}",
@@ -140,23 +111,23 @@ class OneShot(Stepper):
             raise InsufficientDataError("the optimiser has not run yet; call step() first")
         latency = self.coordinates.clip_latency(found.latency_s)
         centre = Members(found.theta[None], np.array([latency]))
-        plain = self.log.result(
+        return self.log.result(
             centre,
             centre,
             chi2=explained(problem, centre, self.EXPLAINED_TICKS),
             alarms=found.alarms,
             extra={
-                "interval": self._interval,
+                "interval": found.source,
                 "iterations": found.iterations,
                 "stopped": found.message,
                 "assumed_latency_s": found.latency_s,
             },
+            interval=found.interval
+            if found.interval is not None
+            else intervals(problem.space, found.theta, found.covariance),
+            covariance=found.covariance,
+            steps=self.log.steps + found.steps,
         )
-        interval = found.interval
-        if interval is None:
-            interval = intervals(problem.space, found.theta, found.covariance)
-        steps = plain.steps + found.steps
-        return dataclasses.replace(plain, interval=interval, covariance=found.covariance, steps=steps)
 
     def save(self) -> State:
         """Return what was found."""
@@ -166,6 +137,33 @@ class OneShot(Stepper):
         """Continue from a saved state."""
         saved = state["found"]
         self._found = None if saved is None else Found(**{**saved, "alarms": tuple(saved["alarms"])})
+
+
+class OneShotSearch(Search, abc.ABC):
+    """A search by an optimiser that is one call, so a run is one generation.
+
+    Interrupted in the middle of it, a run begins anew, to the same numbers. The budget's generations bound
+    the optimiser's iterations.
+    """
+
+    stepper = OneShot
+
+    @abc.abstractmethod
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+        """Run the optimiser to its end."""
+
+
+@dataclass(frozen=True)
+class LeastSquares(OneShotSearch):
+    """Single-start least squares on the one-step prediction error; nothing is drawn."""
+
+    name = "least-squares"
+    settings: LeastSquaresSettings = field(default_factory=LeastSquaresSettings)
+
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+        """See :meth:`OneShotSearch.solve`."""
+        latency_s = log.coordinates.clip_latency(0.0)
+        return _solve(log.problem, latency_s, log.budget.generations, self.settings)
 
 
 def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
@@ -201,6 +199,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, settings: LeastS
         latency_s=latency_s,
         iterations=int(solution.nfev),
         message=str(solution.message),
+        source=f"textbook s^2 inv(J'J), latency {latency_s:g} s",
         alarms=() if solution.status else (f"not converged after {solution.nfev} iterations",),
     )
 
@@ -299,35 +298,24 @@ class MultiStartSettings:
     first_iterations: int = 8
 
 
-class MultiStartLeastSquares(Search):
+@dataclass(frozen=True)
+class MultiStartLeastSquares(OneShotSearch):
     """Least squares on open-loop predictions from smoothed states, the best of several starts.
 
     What a careful user writes: windows of some tenths of a second, Levenberg-Marquardt on the position error
     (each channel over its own root mean square residual), the latency one more unknown, the ranges as bounds
-    and no other prior; the best of several starts counts. The budget's generations bound the last fits'
-    iterations. The run is one generation: interrupted in the middle of it, it begins anew, to the same
-    numbers.
-
-    Args:
-        settings: How to run.
+    and no other prior; the best of several starts counts.
     """
 
     name = "least-squares-multistart"
+    settings: MultiStartSettings = field(default_factory=MultiStartSettings)
 
-    def __init__(self, settings: MultiStartSettings | None = None) -> None:
-        self.settings = settings or MultiStartSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run with its starts drawn."""
-        coordinates, settings = log.coordinates, self.settings
-        drawn = coordinates.members(coordinates.sample(rng, settings.starts - 1))
-        nominal = log.problem.space.nominal, coordinates.clip_latency(0.0)
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+        """See :meth:`OneShotSearch.solve`."""
+        drawn = log.coordinates.members(log.coordinates.sample(rng, self.settings.starts - 1))
+        nominal = log.problem.space.nominal, log.coordinates.clip_latency(0.0)
         starts = [nominal, *zip(drawn.theta, map(float, drawn.latency_s), strict=True)]
-
-        def solve() -> Found:
-            return _solve_starts(log.problem, starts, settings, log.budget.generations)
-
-        return OneShot(log, solve, f"textbook s^2 inv(J'J), best of {settings.starts} starts")
+        return _solve_starts(log.problem, starts, self.settings, log.budget.generations)
 
 
 def _solve_starts(
@@ -357,6 +345,7 @@ def _solve_starts(
         latency_s=best.latency_s,
         iterations=sum(fit.iterations for fit in (*rough, *fits)),
         message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
+        source=f"textbook s^2 inv(J'J), best of {settings.starts} starts",
         steps=part.steps,
         alarms=() if best.iterations < iterations else (f"not converged after {iterations} iterations",),
     )

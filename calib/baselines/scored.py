@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import explained
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
-from deal_hw.calib.search.base import Stepper
+from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
@@ -21,32 +22,36 @@ CHANGING = frozenset({"critic"})
 """Fitnesses that learn: numbers of different generations do not compare."""
 
 
+@dataclass(frozen=True)
+class ScoredSearch(Search):
+    """A search by a fitness.
+
+    Attributes:
+        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
+    """
+
+    policy: PopulationPolicy | None = field(default=None, kw_only=True)
+
+
 class ScoredStepper(Stepper):
     """A run whose members are told one number each.
 
-    Args:
-        log: Book-keeping of the run.
-        rng: Seeds the fitness.
-        fitness: Name of the fitness.
-        settings: How to score; its horizon is also that of the residual that the result states.
-        policy: pi_0 to run in the loop of the rollouts.
+    The settings name the fitness and say how it scores; its horizon is also that of the residual that the
+    result states.
     """
 
     KEPT: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
     INTERVAL = "population spread, uncalibrated"
 
-    def __init__(
-        self,
-        log: SearchLog,
-        rng: np.random.Generator,
-        fitness: str,
-        settings: FitnessSettings,
-        policy: PopulationPolicy | None = None,
-    ) -> None:
-        super().__init__(log)
-        self._fitness = make_fitness(fitness, self.problem, rng, settings, policy)
-        self.stationary = fitness not in CHANGING
-        self._ticks = settings.horizon_ticks
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+        super().__init__(log, rng, search)
+        name = self.settings.fitness
+        self._fitness = make_fitness(name, self.problem, rng, self.scoring(), search.policy)
+        self.stationary = name not in CHANGING
+
+    def scoring(self) -> FitnessSettings:
+        """Return how the fitness scores."""
+        return cast("FitnessSettings", self.settings.scoring)
 
     @abc.abstractmethod
     def found(self) -> tuple[Members, Members]:
@@ -87,7 +92,7 @@ class ScoredStepper(Stepper):
         return self.log.result(
             centre,
             population,
-            chi2=explained(self.problem, centre, self._ticks),
+            chi2=explained(self.problem, centre, self.settings.scoring.horizon_ticks),
             alarms=alarms if lost > 0.5 * scored else (),
             extra={"interval": self.INTERVAL, **self.facts()},
         )

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import abc
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from deal_hw.calib.data.innovations import cut, explained, whitened_residual
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calibration import CalibrationResult
+from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 
@@ -22,37 +24,15 @@ class NoSettings:
     """Settings of a method that has none."""
 
 
-class Centre(Search):
-    """Return the centre of every range, in the range's own scale; the interval is the range's."""
-
-    name = "centre"
-    settings = NoSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Draw(log, rng, log.problem.space.center)
-
-
-class Nominal(Search):
-    """Return the values of the user's own model; the interval is the range's."""
-
-    name = "nominal"
-    settings = NoSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Draw(log, rng, log.problem.space.nominal)
-
-
 class _Draw(Stepper):
     """One generation: the population is a uniform draw, so that the interval is the range's."""
 
     KEPT = ("_unit",)
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, estimate: FloatArray) -> None:
-        super().__init__(log)
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Ignorant) -> None:
+        super().__init__(log, rng, search)
         self._unit = self.coordinates.sample(rng, max(log.budget.population, 2))
-        self._estimate = estimate
+        self._estimate = search.estimate(self.problem.space)
 
     @property
     def finished(self) -> bool:
@@ -64,13 +44,43 @@ class _Draw(Stepper):
         self.log.note("no data is read", self.coordinates.members(self._unit).theta, {})
 
     def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`."""
         middle = self.coordinates.clip_latency(0.5 * sum(self.problem.latency_range_s))
         return self.log.result(
             Members(self._estimate[None], np.array([middle])),
             self.coordinates.members(self._unit),
             extra={"interval": "the range, uncalibrated"},
         )
+
+
+class Ignorant(Search, abc.ABC):
+    """A method that looks at nothing and states the whole range as interval."""
+
+    stepper = _Draw
+    settings = NoSettings()
+
+    @abc.abstractmethod
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the estimate, (K,)."""
+
+
+class Centre(Ignorant):
+    """Return the centre of every range, in the range's own scale."""
+
+    name = "centre"
+
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the centre."""
+        return space.center
+
+
+class Nominal(Ignorant):
+    """Return the values of the user's own model."""
+
+    name = "nominal"
+
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the nominal values."""
+        return space.nominal
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,33 +96,16 @@ class RandomSettings:
     elite: int = 10
 
 
-@dataclass(frozen=True)
-class RandomSearch(Search):
-    """Draw uniformly, score by the mean absolute whitened window innovation, return the best member.
-
-    The budget's population times generations are the draws.
-
-    Attributes:
-        settings: How to run.
-    """
-
-    name = "random"
-    settings: RandomSettings = field(default_factory=RandomSettings)
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Random(log, rng, self.settings)
-
-
 class _Random(Stepper):
     """A run of `random`: one draw of a population a generation, of which the best are kept."""
 
     KEPT = ("_unit", "_score")
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: RandomSettings) -> None:
-        super().__init__(log)
-        self._rng, self._settings = rng, settings
-        self._windows = cut(log.problem, settings.ticks)
+    settings: RandomSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
+        self._windows = cut(log.problem, self.settings.ticks)
         # One metric for all draws, that of the range's centre: scores of different metrics do not compare.
         self._middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
         self._unit = np.empty((0, self.coordinates.count))
@@ -125,24 +118,35 @@ class _Random(Stepper):
 
     def step(self) -> None:
         """Draw and score one population."""
-        unit = self.coordinates.sample(self._rng, self.log.budget.population)
+        unit = self.coordinates.sample(self.rng, self.log.budget.population)
         members = self.coordinates.members(unit)
         residual = whitened_residual(self.problem, members, self._middle, self._windows)
         score = np.mean(np.abs(residual), axis=1)
         score = np.where(np.isfinite(score), score, np.inf)
         units, scores = np.concatenate([self._unit, unit]), np.concatenate([self._score, score])
-        order = np.argsort(scores, kind="stable")[: max(self._settings.elite, 2)]
+        order = np.argsort(scores, kind="stable")[: max(self.settings.elite, 2)]
         self._unit, self._score = units[order], scores[order]
         values = {"best": float(score.min())}
         self.log.note(f"best {self._score[0]:.3g}", members.theta, values, members.latency_s)
 
     def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`."""
         elite = self.coordinates.members(self._unit)
         best = Members(elite.theta[:1], elite.latency_s[:1])
         return self.log.result(
             best,
             elite,
-            chi2=explained(self.problem, best, self._settings.ticks),
+            chi2=explained(self.problem, best, self.settings.ticks),
             extra={"interval": "spread of the best draws, uncalibrated"},
         )
+
+
+@dataclass(frozen=True)
+class RandomSearch(Search):
+    """Draw uniformly, score by the mean absolute whitened window innovation, return the best member.
+
+    The budget's population times generations are the draws.
+    """
+
+    name = "random"
+    stepper = _Random
+    settings: RandomSettings = field(default_factory=RandomSettings)

@@ -8,14 +8,13 @@ problem or the settings give, by nothing otherwise; or the latency is one more p
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.baselines.least_squares import Found, OneShot, textbook_covariance
+from deal_hw.calib.baselines.least_squares import Found, OneShotSearch, textbook_covariance
 from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.recordings.sysid_adapter import Recording, check_space, identify, require_sysid
@@ -39,23 +38,15 @@ class SysidSettings:
     delay: bool = False
 
 
-class MujocoSysid(Search):
-    """``mujoco.sysid`` with its default optimiser.
-
-    That optimiser is one call, so a run is one generation: interrupted in the middle of it, a run begins
-    anew, to the same numbers. The budget's generations bound its iterations.
-
-    Args:
-        settings: How to run.
-    """
+@dataclass(frozen=True)
+class MujocoSysid(OneShotSearch):
+    """``mujoco.sysid`` with its default optimiser; nothing is drawn."""
 
     name = "mujoco-sysid"
+    settings: SysidSettings = field(default_factory=SysidSettings)
 
-    def __init__(self, settings: SysidSettings | None = None) -> None:
-        self.settings = settings or SysidSettings()
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run before its only generation; nothing is drawn.
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+        """See :meth:`OneShotSearch.solve`.
 
         Raises:
             ConfigurationError: A parameter has no counterpart, or joint positions were not measured.
@@ -67,12 +58,11 @@ class MujocoSysid(Search):
         _check_channels(problem)
         given = settings.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
         if settings.delay and given is None:
-            return OneShot(log, lambda: _solve(log, settings, problem.first_latency_s), "its own")
+            return _solve(log, settings, problem.first_latency_s, "its own")
         source = "given" if given is not None else "none, as its user would have it"
         latency_s = log.coordinates.clip_latency(given or 0.0)
         words = f"its own, {1e3 * latency_s:g} ms of latency ({source})"
-        settings = dataclasses.replace(settings, delay=False)
-        return OneShot(log, lambda: _solve(log, settings, latency_s), words)
+        return _solve(log, dataclasses.replace(settings, delay=False), latency_s, words)
 
 
 def with_delay(window_s: float) -> MujocoSysid:
@@ -94,7 +84,7 @@ def _check_channels(problem: Problem) -> None:
         )
 
 
-def _solve(log: SearchLog, settings: SysidSettings, latency_s: float) -> Found:
+def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: str) -> Found:
     problem, ticks = log.problem, settings.ticks
     if settings.window_s is not None:
         ticks = max(round(settings.window_s * problem.robot.description.control_rate_hz), 1)
@@ -121,6 +111,7 @@ def _solve(log: SearchLog, settings: SysidSettings, latency_s: float) -> Found:
         latency_s=found.latency_s,
         iterations=found.iterations,
         message=found.message,
+        source=source,
         steps=found.steps,
         interval=np.clip(interval, space.low[:, None], space.high[:, None]),
     )

@@ -31,7 +31,7 @@ simulated at its edge, and the search is drawn into the corners.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PaperSettings:
+class PaperSettings(FitnessSettings):
     r"""Choices of `deal-paper`; the paper names those that are marked with a section.
 
     Attributes:
@@ -43,142 +43,12 @@ class PaperSettings:
         fitness: Name of the fitness (`deal_hw.calib.deal_paper.fitness`). "critic" is the paper's; "flat"
             scores every member 0, a search that cannot see the data. Eq. 9 reads the fitness as it is,
             whatever its scale.
-        replay_generations: How many generations' rollouts D_S holds, None for all. Algorithm 1 stores
-            rollouts and does not say whether it forgets; a critic that is still trained against populations
-            of long ago pushes the present one along with them (measured: no better than the centre), so the
-            default forgets.
-        ticks: Most transitions of a rollout (Table 4: 200).
-        horizon_ticks: Window length in control periods of the fitness "trajectory".
-        torch_threads: Threads of the critic's arithmetic.
     """
 
     critic: CriticSettings = field(default_factory=CriticSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     normalise: bool = True
     fitness: str = "critic"
-    replay_generations: int | None = 1
-    ticks: int = 200
-    horizon_ticks: int = 10
-    torch_threads: int = 1
-
-    @property
-    def scoring(self) -> FitnessSettings:
-        """What of these the fitness reads."""
-        return FitnessSettings(
-            horizon_ticks=self.horizon_ticks,
-            ticks=self.ticks,
-            critic=self.critic,
-            replay_generations=self.replay_generations,
-            torch_threads=self.torch_threads,
-        )
-
-
-@dataclass(frozen=True)
-class DealPaper(Search):
-    """DEAL as published; the budget's population is N, its generations are T.
-
-    The latency, of which the paper knows nothing, is one more searched coordinate unless the problem gives
-    it.
-
-    Attributes:
-        settings: How to run.
-        policy: pi_0 to run in the loop; None replays its recorded actions.
-        name: Name in results.
-    """
-
-    settings: PaperSettings = field(default_factory=PaperSettings)
-    policy: PopulationPolicy | None = None
-    name: str = "deal-paper"
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _DealPaper(log, rng, self.settings, self.policy)
-
-
-def paper() -> DealPaper:
-    """Return `deal-paper`: Algorithm 1, open choices made as well as we could."""
-    return DealPaper()
-
-
-def literal() -> DealPaper:
-    """Return Algorithm 1 to the letter: raw softmax (eq. 22), distance summed over K (eq. 1)."""
-    diffusion = DiffusionSettings(temperature=None, divide_distance=False)
-    return DealPaper(PaperSettings(diffusion=diffusion), name="deal-paper-literal")
-
-
-def without_noise_adaptation() -> DealPaper:
-    r"""Return the paper's ablation DEAL\FN: no eq. 9."""
-    return DealPaper(PaperSettings(diffusion=DiffusionSettings(adapt_noise=False)), name="deal-paper-fn")
-
-
-def without_normalisation() -> DealPaper:
-    r"""Return the paper's ablation DEAL\PN: the search moves in raw units."""
-    return DealPaper(PaperSettings(normalise=False), name="deal-paper-pn")
-
-
-def flat() -> DealPaper:
-    """Return `deal-paper` with a constant fitness: whatever it finds, it did not find in the data."""
-    return DealPaper(PaperSettings(fitness="flat"), name="deal-paper-flat")
-
-
-class _DealPaper(Stepper):
-    """A run of Algorithm 1: one denoising step a generation."""
-
-    KEPT = ("_search", "_fitness")
-
-    def __init__(
-        self,
-        log: SearchLog,
-        rng: np.random.Generator,
-        settings: PaperSettings,
-        policy: PopulationPolicy | None,
-    ) -> None:
-        super().__init__(log)
-        self._box = _Box(self.coordinates, normalise=settings.normalise)
-        self._search = DiffusionEvolution(
-            # Line 1: theta^T from the search range, uniform in the normalised box.
-            self._box.from_unit(self.coordinates.sample(rng, log.budget.population)),
-            dataclasses.replace(settings.diffusion, generations=max(log.budget.generations, 1)),
-            rng,
-        )
-        self._fitness = make_fitness(settings.fitness, self.problem, rng, settings.scoring, policy)
-
-    @property
-    def finished(self) -> bool:
-        """Whether theta^0 has been reached."""
-        return self._search.finished
-
-    def step(self) -> None:
-        """Lines 3 to 15: from theta^t to theta^(t - 1)."""
-        members = self._box.members(self._search.ask())
-        fitness = self._fitness.score(members)
-        step = self._search.tell(fitness)
-        finite = fitness[np.isfinite(fitness)]
-        self.log.note(
-            f"effective size {step.effective_size:.0f} of {len(fitness)}",
-            members.theta,
-            {
-                "fitness": float(finite.mean()) if finite.size else float("nan"),
-                **self._fitness.values,
-                "effective_size": step.effective_size,
-                "effective_neighbours": step.effective_neighbours,
-                "delta": step.delta,
-                "sigma": step.sigma,
-                "clamped": float(step.clamped),
-            },
-            members.latency_s,
-        )
-
-    def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`."""
-        final = self._search.ask()
-        # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best
-        # member differ from it by less than the population's own error.
-        return self.log.result(
-            self._box.members(final.mean(axis=0, keepdims=True)),
-            self._box.members(final),
-            extra={"interval": "population spread, uncalibrated", "estimate": "mean of the last population"},
-        )
 
 
 class _Box:
@@ -207,3 +77,104 @@ class _Box:
         if self.coordinates.fixed_latency_s is None:
             unit = np.concatenate([unit, self.coordinates.latency_unit(x[:, len(space)])[:, None]], axis=1)
         return self.coordinates.members(unit)
+
+
+class _DealPaper(Stepper):
+    """A run of Algorithm 1: one denoising step a generation."""
+
+    KEPT = ("_search", "_fitness")
+
+    settings: PaperSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: DealPaper) -> None:
+        super().__init__(log, rng, search)
+        settings = self.settings
+        self._box = _Box(self.coordinates, normalise=settings.normalise)
+        self._search = DiffusionEvolution(
+            # Line 1: theta^T from the search range, uniform in the normalised box.
+            self._box.from_unit(self.coordinates.sample(rng, log.budget.population)),
+            dataclasses.replace(settings.diffusion, generations=max(log.budget.generations, 1)),
+            rng,
+        )
+        self._fitness = make_fitness(settings.fitness, self.problem, rng, settings, search.policy)
+
+    @property
+    def finished(self) -> bool:
+        """Whether theta^0 has been reached."""
+        return self._search.finished
+
+    def step(self) -> None:
+        """Lines 3 to 15: from theta^t to theta^(t - 1)."""
+        members = self._box.members(self._search.ask())
+        fitness = self._fitness.score(members)
+        step = self._search.tell(fitness)
+        finite = fitness[np.isfinite(fitness)]
+        self.log.note(
+            f"effective size {step.effective_size:.0f} of {len(fitness)}",
+            members.theta,
+            {
+                "fitness": float(finite.mean()) if finite.size else float("nan"),
+                **self._fitness.values,
+                "effective_size": step.effective_size,
+                "effective_neighbours": step.effective_neighbours,
+                "delta": step.delta,
+                "sigma": step.sigma,
+                "clamped": float(step.clamped),
+            },
+            members.latency_s,
+        )
+
+    def result(self) -> CalibrationResult:
+        final = self._search.ask()
+        # The paper outputs a distribution theta^0; its mean is our estimate. The weighted mean and the best
+        # member differ from it by less than the population's own error.
+        return self.log.result(
+            self._box.members(final.mean(axis=0, keepdims=True)),
+            self._box.members(final),
+            extra={"interval": "population spread, uncalibrated", "estimate": "mean of the last population"},
+        )
+
+
+@dataclass(frozen=True)
+class DealPaper(Search):
+    """DEAL as published; the budget's population is N, its generations are T.
+
+    The latency, of which the paper knows nothing, is one more searched coordinate unless the problem gives
+    it.
+
+    Attributes:
+        settings: How to run.
+        policy: pi_0 to run in the loop; None replays its recorded actions.
+        name: Name in results.
+    """
+
+    settings: PaperSettings = field(default_factory=PaperSettings)
+    policy: PopulationPolicy | None = None
+    name: str = "deal-paper"
+    stepper = _DealPaper
+
+
+def paper() -> DealPaper:
+    """Return `deal-paper`: Algorithm 1, open choices made as well as we could."""
+    return DealPaper()
+
+
+def literal() -> DealPaper:
+    """Return Algorithm 1 to the letter: raw softmax (eq. 22), distance summed over K (eq. 1)."""
+    diffusion = DiffusionSettings(temperature=None, divide_distance=False)
+    return DealPaper(PaperSettings(diffusion=diffusion), name="deal-paper-literal")
+
+
+def without_noise_adaptation() -> DealPaper:
+    r"""Return the paper's ablation DEAL\FN: no eq. 9."""
+    return DealPaper(PaperSettings(diffusion=DiffusionSettings(adapt_noise=False)), name="deal-paper-fn")
+
+
+def without_normalisation() -> DealPaper:
+    r"""Return the paper's ablation DEAL\PN: the search moves in raw units."""
+    return DealPaper(PaperSettings(normalise=False), name="deal-paper-pn")
+
+
+def flat() -> DealPaper:
+    """Return `deal-paper` with a constant fitness: whatever it finds, it did not find in the data."""
+    return DealPaper(PaperSettings(fitness="flat"), name="deal-paper-flat")

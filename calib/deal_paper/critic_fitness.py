@@ -28,7 +28,7 @@ class CriticFitness(Fitness):
         N, _, width = rollouts.shape
         self._replay.append(rollouts[usable].reshape(-1, width))
         with torch_threads(self._settings.torch_threads):
-            gap = self._critic.train_on_blocks(self._view.real, self._replay)
+            gap = self._critic.train(self._view.real, *self._replay)
             score = self._critic.score(rollouts.reshape(-1, width))
         keep = self._settings.replay_generations
         if keep is not None:

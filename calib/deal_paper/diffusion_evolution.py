@@ -23,9 +23,6 @@ from deal_hw.types import FloatArray
 
 Schedule = Literal["cosine", "linear"]
 
-_ALPHA_LAST = 1e-3
-"""alpha_T: eq. 12 wants about 0; a true 0 would weigh all neighbours alike."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiffusionSettings:
@@ -34,6 +31,7 @@ class DiffusionSettings:
     Attributes:
         generations: Search steps T.
         schedule: How alpha_t falls from 1 to about 0; the paper names none.
+        alpha_last: alpha_T: eq. 12 wants about 0; a true 0 would weigh all neighbours alike.
         eta: sigma_t in units of the full DDPM noise; 0 is deterministic DDIM. The paper names no schedule.
         divide_distance: Whether the kernel's squared distance is divided by K. The paper's N(.; ., 1 - alpha)
             is a sum over coordinates, which at high K underflows: each member then has no neighbour but
@@ -47,6 +45,7 @@ class DiffusionSettings:
 
     generations: int = 50
     schedule: Schedule = "cosine"
+    alpha_last: float = 1e-3
     eta: float = 1.0
     divide_distance: bool = True
     temperature: float | None = 0.3
@@ -64,16 +63,17 @@ class DiffusionSettings:
             raise ConfigurationError(f"the temperature must be above 0 or None, got {self.temperature:g}")
 
 
-def alpha_schedule(generations: int, schedule: Schedule) -> FloatArray:
+def alpha_schedule(generations: int, schedule: Schedule, last: float = 1e-3) -> FloatArray:
     """Return alpha_0 = 1, ..., alpha_T = about 0, (T + 1,).
 
     Args:
         generations: Search steps T.
         schedule: "cosine" spends more steps at both ends; "linear" falls evenly.
+        last: alpha_T.
     """
     part = np.arange(generations + 1) / generations
     fall = (1 + np.cos(np.pi * part)) / 2 if schedule == "cosine" else 1 - part
-    return np.asarray(_ALPHA_LAST + (1 - _ALPHA_LAST) * fall)
+    return np.asarray(last + (1 - last) * fall)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class DiffusionEvolution(Kept):
         self._theta = np.array(population, dtype=float)
         self._settings = settings
         self._rng = rng
-        self.alpha = alpha_schedule(settings.generations, settings.schedule)
+        self.alpha = alpha_schedule(settings.generations, settings.schedule, settings.alpha_last)
         self.t = settings.generations
 
     def ask(self) -> FloatArray:

@@ -55,7 +55,10 @@ class FitnessSettings:
         bandwidth: Width of `mmd`'s kernel in standardised units; None for the median distance between the
             recording's transitions.
         critic: Size and training of the critic; None for the paper's.
-        replay_generations: How many generations' rollouts the critic is trained against, None for all.
+        replay_generations: How many generations' rollouts D_S the critic is trained against, None for all.
+            Algorithm 1 stores rollouts and does not say whether it forgets; a critic that is still trained
+            against populations of long ago pushes the present one along with them (measured: no better than
+            the centre), so the default forgets.
         torch_threads: Threads of the critic's arithmetic.
     """
 

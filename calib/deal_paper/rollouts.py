@@ -19,9 +19,6 @@ from deal_hw.sim.recordings.episode import Episode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray, IntArray
 
-INPUT_LIMIT = 5.0
-"""Standardised inputs of the critic are cut to this."""
-
 PopulationPolicy = Callable[[FloatArray, FloatArray, int], FloatArray]
 """pi_0 in the loop: position (N, J), velocity (N, J), tick -> position target (N, A)."""
 
@@ -205,10 +202,13 @@ class TransitionScale:
     Attributes:
         mean: (2 J + A + 2 J,).
         std: Likewise.
+        limit: Standardised inputs are cut to this. A member whose pole spins would own the critic's output,
+            and with it the softmax.
     """
 
     mean: FloatArray
     std: FloatArray
+    limit: float = 5.0
 
     @classmethod
     def of(cls, raw: FloatArray) -> TransitionScale:
@@ -219,8 +219,7 @@ class TransitionScale:
         """Standardise in place, (..., inputs)."""
         raw -= self.mean.astype(np.float32)
         raw *= (1.0 / self.std).astype(np.float32)
-        # A member whose pole spins would own the critic's output, and with it the softmax.
-        np.clip(raw, -INPUT_LIMIT, INPUT_LIMIT, out=raw)
+        np.clip(raw, -self.limit, self.limit, out=raw)
         return raw
 
 

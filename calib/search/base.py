@@ -8,7 +8,7 @@ decides all that follows.
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,10 +23,14 @@ class Stepper(Kept, abc.ABC):
 
     Args:
         log: Book-keeping of the run.
+        rng: The only source of randomness.
+        search: The method.
     """
 
-    def __init__(self, log: SearchLog) -> None:
-        self.log, self.problem, self.coordinates = log, log.problem, log.coordinates
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        self.log, self.rng = log, rng
+        self.problem, self.coordinates = log.problem, log.coordinates
+        self.settings: Any = search.settings
 
     @property
     @abc.abstractmethod
@@ -50,10 +54,8 @@ class Search(CalibrationMethod[Problem]):
     """
 
     settings: Any
-
-    @abc.abstractmethod
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """Return the run before its first generation."""
+    stepper: ClassVar[type[Stepper]]
+    """Makes a run before its first generation; its arguments are those of :class:`Stepper`."""
 
     def run(
         self,
@@ -65,7 +67,7 @@ class Search(CalibrationMethod[Problem]):
     ) -> CalibrationResult:
         """Search to the end; see :meth:`deal_hw.calibration.CalibrationMethod.run`."""
         log = SearchLog(self.name, problem, budget, progress, self.settings)
-        stepper = self.begin(log, rng)
+        stepper = self.stepper(log, rng, self)
         saved = checkpoint.load() if checkpoint is not None else None
         if saved is not None:
             log.load(saved["log"])

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import cut, explained, is_noisy, linearise, predict, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.base import Search
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
 from deal_hw.calib.search.ensemble_kalman import KalmanStepper
 from deal_hw.calib.search.log import SearchLog
@@ -72,30 +72,16 @@ class DealSettings:
     torch_threads: int = 1
 
 
-@dataclass(frozen=True)
-class Deal(Search):
-    """Critic features and an ensemble Kalman step.
-
-    Attributes:
-        settings: How to run.
-    """
-
-    name = "deal"
-    settings: DealSettings = field(default_factory=DealSettings)
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Deal(log, rng, self.settings)
-
-
 class _Deal(KalmanStepper):
     """A run of `deal`: stages of windows, one round of critic updates and one Kalman step a generation."""
 
     KEPT = ("kalman", "_stage", "_spread", "_view")
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: DealSettings) -> None:
-        super().__init__(log, rng, settings.step_clip)
-        self._settings = settings
+    settings: DealSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
+        settings = self.settings
         self._noisy = is_noisy(self.problem)
         self._lengths = settings.noisy_ticks if self._noisy else settings.clean_ticks
         self._most = min(settings.generations, log.budget.generations)
@@ -112,11 +98,11 @@ class _Deal(KalmanStepper):
         """One round of critic updates and one Kalman step."""
         z = self.kalman.ask()
         members, centre = self.population(z)
-        with torch_threads(self._settings.torch_threads):
+        with torch_threads(self.settings.torch_threads):
             residual, gap = self._view.residual(members, centre)
         # Statistics of noisy recordings are whitened by their noise, so the tempering ends where the noise
         # begins. Noise-free ones have no such end: each step takes a fixed share of what is left.
-        step = self.kalman.tell(residual, keep=None if self._noisy else self._settings.keep)
+        step = self.kalman.tell(residual, keep=None if self._noisy else self.settings.keep)
         self._spread = step.spread
         self.log.note(
             f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
@@ -127,12 +113,11 @@ class _Deal(KalmanStepper):
         self._skip_empty_stages()
 
     def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`."""
         members, centre = self.population(self.kalman.ask())
         chi2 = explained(self.problem, centre, self._lengths[-1])
         alarms = []
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
-        if self._noisy and not chi2 <= self._settings.alarm_chi2:
+        if self._noisy and not chi2 <= self.settings.alarm_chi2:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
                 f"{len(self.log.trace)} generations; polish it, search again with another seed, or use eki"
@@ -149,7 +134,6 @@ class _Deal(KalmanStepper):
         )
 
     def load(self, state: State) -> None:
-        """See :meth:`Kept.load`."""
         self._enter_stage(state["_stage"])
         super().load(state)
 
@@ -161,7 +145,7 @@ class _Deal(KalmanStepper):
     def _stage_over(self) -> bool:
         # Earlier stages bring the population near; a third of the budget is kept for the last.
         end = self._most if self._last else 2 * self._most // 3
-        told_apart = self._spread > self._settings.least_spread
+        told_apart = self._spread > self.settings.least_spread
         return len(self.log.trace) >= end or self.kalman.finished or not told_apart
 
     def _skip_empty_stages(self) -> None:
@@ -171,9 +155,9 @@ class _Deal(KalmanStepper):
     def _enter_stage(self, stage: int) -> None:
         self._stage, self._spread = stage, float("inf")
         if stage:
-            self.kalman.widen(self._settings.widen)
+            self.kalman.widen(self.settings.widen)
         kind: type[_View] = _NoisyView if self._noisy else _CleanView
-        self._view = kind(self.problem, self._settings, self._lengths[stage], self.rng, stage > 0)
+        self._view = kind(self.problem, self.settings, self._lengths[stage], self.rng, stage > 0)
 
 
 class _View(Kept, abc.ABC):
@@ -341,3 +325,12 @@ class _NoisyView(_View):
         covariance = 0.9 * covariance[np.ix_(alive, alive)] + 0.1 * np.diag(variance[alive])
         factor = np.linalg.inv(np.linalg.cholesky(covariance))
         return factor @ target[alive], found[:, alive] @ factor.T, gap
+
+
+@dataclass(frozen=True)
+class Deal(Search):
+    """Critic features and an ensemble Kalman step."""
+
+    name = "deal"
+    stepper = _Deal
+    settings: DealSettings = field(default_factory=DealSettings)

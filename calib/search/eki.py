@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import cut, explained, is_noisy, whitened_residual
-from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.base import Search
 from deal_hw.calib.search.ensemble_kalman import KalmanStepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import State
@@ -47,31 +47,16 @@ class EkiSettings:
     least_spread: float = 0.01
 
 
-@dataclass(frozen=True)
-class Eki(Search):
-    """Whitened ensemble Kalman inversion; restarts while the residual is unexplained and the budget lasts.
-
-    Attributes:
-        settings: How to run.
-    """
-
-    name = "eki"
-    settings: EkiSettings = field(default_factory=EkiSettings)
-
-    def begin(self, log: SearchLog, rng: np.random.Generator) -> Stepper:
-        """See :meth:`Search.begin`."""
-        return _Eki(log, rng, self.settings)
-
-
 class _Eki(KalmanStepper):
     """A run of `eki`: searches, each of several stages, each of several generations."""
 
     KEPT = ("kalman", "_restarts", "_best", "_over", "_stage", "_generation", "_offsets")
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, settings: EkiSettings) -> None:
-        super().__init__(log, rng, settings.step_clip)
-        self._settings = settings
-        problem = self.problem
+    settings: EkiSettings
+
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
+        problem, settings = self.problem, self.settings
         self._lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
         self._brief = settings.before_polish and (problem.robot.base is not None or problem.exact)
         if self._brief:
@@ -95,7 +80,7 @@ class _Eki(KalmanStepper):
         residual = whitened_residual(self.problem, members, centre, self._windows, self._offsets)
         step = self.kalman.tell(residual)
         self._generation += 1
-        self._near = self._brief and self.problem.exact and step.spread < self._settings.least_spread
+        self._near = self._brief and self.problem.exact and step.spread < self.settings.least_spread
         ticks = self._lengths[self._stage]
         self.log.note(
             f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
@@ -116,10 +101,9 @@ class _Eki(KalmanStepper):
                 self._end_search()
 
     def result(self) -> CalibrationResult:
-        """See :meth:`Stepper.result`."""
         chi2, z = self._best or (float("nan"), self.kalman.ask())
         alarms = []
-        if not chi2 <= self._settings.restart_chi2 and not self._brief:
+        if not chi2 <= self.settings.restart_chi2 and not self._brief:
             alarms.append(
                 f"the search left a residual of {chi2:.1f} times its expected variance after "
                 f"{len(self.log.trace)} generations; "
@@ -135,7 +119,6 @@ class _Eki(KalmanStepper):
         )
 
     def load(self, state: State) -> None:
-        """See :meth:`Kept.load`."""
         self._enter_stage(state["_stage"])
         super().load(state)
 
@@ -144,7 +127,7 @@ class _Eki(KalmanStepper):
         return (
             self.kalman.finished
             or self._near
-            or self._generation >= self._settings.stage_generations
+            or self._generation >= self.settings.stage_generations
             or len(self.log.trace) >= self.log.budget.generations
         )
 
@@ -153,7 +136,7 @@ class _Eki(KalmanStepper):
         self._windows = cut(self.problem, self._lengths[stage])
         self._offsets = None
         if stage:
-            self.kalman.widen(self._settings.widen)
+            self.kalman.widen(self.settings.widen)
             # From the second stage on the population is near enough to say better than a smoother where each
             # window began: start states are linearised anew around the last generation's most probable ones.
             self._offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self._windows]
@@ -164,9 +147,18 @@ class _Eki(KalmanStepper):
         if self._best is None or chi2 < self._best[0]:
             self._best = (chi2, z)
         spent = len(self.log.trace) >= self.log.budget.generations
-        if self._brief or spent or chi2 <= self._settings.restart_chi2:
+        if self._brief or spent or chi2 <= self.settings.restart_chi2:
             self._over = True
             return
         self._restarts += 1
         self.kalman = self.new_ensemble()
         self._enter_stage(0)
+
+
+@dataclass(frozen=True)
+class Eki(Search):
+    """Whitened ensemble Kalman inversion; restarts while the residual is unexplained and the budget lasts."""
+
+    name = "eki"
+    stepper = _Eki
+    settings: EkiSettings = field(default_factory=EkiSettings)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.coordinates import Members, logistic, logit
-from deal_hw.calib.search.base import Stepper
+from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import Kept
 from deal_hw.types import FloatArray
@@ -144,21 +144,17 @@ def _discrepancy(scale: FloatArray, projected: FloatArray, residual: FloatArray,
 class KalmanStepper(Stepper):
     """A run whose population is an ensemble Kalman inversion's, in logits.
 
-    Args:
-        log: Book-keeping of the run.
-        rng: Draws the ensemble and the perturbations.
-        step_clip: Largest step of a coordinate, in logits.
+    The search's settings say by how many logits a coordinate may move in one step (``step_clip``).
     """
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, step_clip: float) -> None:
-        super().__init__(log)
-        self.rng, self._step_clip = rng, step_clip
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
+        super().__init__(log, rng, search)
         self.kalman = self.new_ensemble()
 
     def new_ensemble(self) -> EnsembleKalman:
         """Return an ensemble drawn over the whole range."""
         unit = self.coordinates.sample(self.rng, self.log.budget.population)
-        return EnsembleKalman(logit(unit), self.rng, step_clip=self._step_clip)
+        return EnsembleKalman(logit(unit), self.rng, step_clip=self.settings.step_clip)
 
     def population(self, z: FloatArray) -> tuple[Members, Members]:
         """Return the members at logits z, (N, C), and the one at their mean."""

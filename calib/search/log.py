@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,7 @@ class SearchLog:
         chi2: float = float("nan"),
         alarms: Sequence[str] = (),
         extra: Mapping[str, Any] | None = None,
+        **better: Any,
     ) -> CalibrationResult:
         """Return the result.
 
@@ -107,6 +108,7 @@ class SearchLog:
             chi2: Mean squared whitened residual at the estimate.
             alarms: Reasons to distrust the result.
             extra: Further provenance.
+            better: Fields of the result that the method knows better than its population does.
         """
         space = self.problem.space
         scaled = space.to_scale(population.theta)
@@ -119,7 +121,7 @@ class SearchLog:
         clip = self.coordinates.clip_latency
         latency = clip(float(centre.latency_s[0]))
         spread = float(population.latency_s.std(ddof=1)) if len(scaled) > 1 else 0.0
-        return CalibrationResult(
+        plain = CalibrationResult(
             method=self.method,
             space=space,
             estimate=np.array(centre.theta[0]),
@@ -135,3 +137,4 @@ class SearchLog:
             seconds=self.seconds,
             provenance={"settings": asdict(self._settings), "budget": asdict(self.budget), **(extra or {})},
         )
+        return replace(plain, **better)

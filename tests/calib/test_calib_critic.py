@@ -73,7 +73,7 @@ def test_blocks_are_as_good_as_one_array() -> None:
     fake = cloud(2, -0.7, 300)
     whole, parts = (ClippedCritic(2, SMALL, np.random.default_rng(7)) for _ in range(2))
     whole.train(cloud(1, 0.7), fake)
-    parts.train_on_blocks(cloud(1, 0.7), [fake[:50], fake[50:120], fake[120:]])
+    parts.train(cloud(1, 0.7), fake[:50], fake[50:120], fake[120:])
     np.testing.assert_array_equal(whole.score(fake), parts.score(fake))
 
 
