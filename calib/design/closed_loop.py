@@ -19,6 +19,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import ClosedLoop
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
@@ -96,7 +97,6 @@ class TrialRunner:
             )
         self._robot, self._scenario = robot, scenario
         self._device_s = 1.0 / description.device_rate_hz
-        self._repeat = max(round(self._device_s / robot.step_s), 1)
         self._period = description.steps_per_control
         self._stride = round(description.device_rate_hz / description.state_rate_hz)
         if self._period % self._stride:
@@ -124,13 +124,17 @@ class TrialRunner:
         self._batch.set_state(scenario.position, np.zeros_like(scenario.position))
         loop = _Loop(description, scenario.position)
         positions, velocities = [self._batch.position[:, None]], [self._batch.velocity[:, None]]
-        path = _Path(self._batch, scenario, self._ticks * self._period, self._device_s)
+        path = ClosedLoop(self._batch, self._period, self._device_s)
+        start = scenario.position[:, list(description.actuated_index)]
+        motor = description.actuation == "motor"
+        path.restart(np.zeros_like(start) if motor else start, scenario.latency_s)
+        speed = self._batch.servo_factor("servo_speed_limit")
         for tick in range(self._ticks):
             sent = loop.command(behaviours, positions[-1][:, -1], velocities[-1][:, -1], tick)
             lead = sent[next((n for n, why in enumerate(loop.tripped) if not why), 0)]
             self._batch.set_sent(lead.stiffness, lead.damping, lead.effort_limit)
-            control = path.extend(np.stack([c.position_target for c in sent]), lead.speed_limit, self._period)
-            x, v = self._batch.advance(np.repeat(control, self._repeat, axis=1), self._stride * self._repeat)
+            rate = None if motor else speed * lead.speed_limit * self._device_s
+            x, v = path.advance(np.stack([c.position_target for c in sent]), rate, self._stride)
             positions.append(x)
             velocities.append(v)
             loop.watch(x, v)
@@ -158,42 +162,6 @@ class TrialRunner:
             start_setpoint=start,
         )
         return Trial(episode, loop.tripped[n], loop.clipped[n])
-
-
-class _Path:
-    """The set-points of all members so far: slewed at their own speed limits, then late by their latency."""
-
-    def __init__(self, batch: ServoBatch, scenario: Scenario, steps: int, step_s: float) -> None:
-        description = batch.robot.description
-        self._motor = description.actuation == "motor"
-        self._step_s = step_s
-        self._factor = batch.servo_factor("servo_speed_limit")
-        start = scenario.position[:, list(description.actuated_index)]
-        self._now = np.zeros_like(start) if self._motor else start.copy()
-        late = batch.lag_s(scenario.latency_s) / step_s
-        # (N, 1, 1), or (N, 1, A) where actuators have delays of their own.
-        late = late.reshape(len(late), 1, -1)
-        self._whole = np.floor(late).astype(int)
-        self._part = late - self._whole
-        self._margin = int(self._whole.max()) + 1
-        self._done = self._margin
-        self._path = np.repeat(self._now[:, None], self._margin + steps, axis=1)
-
-    def extend(self, target: FloatArray, speed_limit: FloatArray, steps: int) -> FloatArray:
-        """Return the late set-points of the next steps, (N, steps, A), for targets (N, A)."""
-        ahead = np.repeat(target[:, None], steps, axis=1)
-        if not self._motor:
-            gap = (target - self._now)[:, None]
-            rate = (self._factor * speed_limit)[:, None] * self._step_s
-            reach = rate * np.arange(1, steps + 1)[:, None]
-            ahead = self._now[:, None] + np.clip(gap, -reach, reach)
-        self._path[:, self._done : self._done + steps] = ahead
-        self._now = ahead[:, -1]
-        index = self._done + np.arange(steps)[:, None] - self._whole
-        self._done += steps
-        late = np.take_along_axis(self._path, index, axis=1)
-        later = np.take_along_axis(self._path, index - 1, axis=1)
-        return np.asarray((1 - self._part) * late + self._part * later)
 
 
 class _Loop:
