@@ -211,6 +211,17 @@ class Problem:
         ]
         return other
 
+    def on(self, episodes: Sequence[Episode], known_std: FloatArray | None) -> Problem:
+        """Return the problem of other recordings; noise is estimated anew, simulators are shared.
+
+        Args:
+            episodes: The recordings.
+            known_std: See :class:`Problem`.
+        """
+        other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
+        other._batches = self._batches
+        return other
+
     def with_robot(self, robot: RobotModel) -> Problem:
         """Return the problem with another model of the same robot; all else is shared."""
         other = copy.copy(self)

@@ -10,7 +10,7 @@ from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.uncertainty.at_fit import NEAR
 from deal_hw.calib.uncertainty.intervals import correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.latency_scan import LatencyScan
@@ -88,7 +88,7 @@ def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) ->
     def watch(p: Progress) -> None:
         stages.append(p.stage)
 
-    method = PolishedMethod(Near(noisy.theta, noisy.truth.latency_s), settings=Validation(local_first=False))
+    method = Calibration(Near(noisy.theta, noisy.truth.latency_s), settings=Validation(local_first=False))
     result = method.run(problem, Budget(), np.random.default_rng(0), watch)
     assert error_percent(result.estimate, noisy.theta) < 3.0
     assert abs(result.latency_s - noisy.truth.latency_s) < 1.1e-3
@@ -114,7 +114,7 @@ def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal:
     """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
     search = Near(ideal.theta, 0.02)
-    result = PolishedMethod(search).run(problem, Budget(), np.random.default_rng(0))
+    result = Calibration(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.runs >= 2
     assert any("does not explain" in words for words in result.alarms)
 
@@ -231,7 +231,7 @@ def test_recording_without_excitation_is_refused_before_any_search(ideal: Demons
     problem = Problem(ideal.robot, ideal.space, [still], threads=1)
     search = Near(ideal.theta, 0.0)
     with pytest.raises(InsufficientDataError, match=r"hardly moves.*--profile rich"):
-        PolishedMethod(search).run(problem, Budget(), np.random.default_rng(0))
+        Calibration(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.runs == 0
     short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 60)
     with pytest.raises(InsufficientDataError, match=r"0\.30 s of usable samples"):
