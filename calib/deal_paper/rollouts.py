@@ -9,14 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import ADVANCE_S
+from deal_hw.calib.data.innovations import early_setpoints
 from deal_hw.calib.data.problem import Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.recordings.episode import Episode
-from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray, IntArray
 
 INPUT_LIMIT = 5.0
@@ -130,9 +129,7 @@ def rollout_population(
 def _replay(
     batch: ServoBatch, episode: Episode, members: Members, ticks: Ticks
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    ahead = round(ADVANCE_S / episode.step_s)
-    late = setpoints(batch, episode, members.latency_s + ahead * episode.step_s)
-    path = np.concatenate([late[:, ahead:], np.repeat(late[:, -1:], ahead, axis=1)], axis=1)
+    path = early_setpoints(batch, episode, members.latency_s)
     N, T, J = batch.count, len(ticks), episode.position.shape[1]
     position, velocity = np.empty((N, T + 1, J)), np.empty((N, T + 1, J))
     position[:, 0], velocity[:, 0] = batch.position, batch.velocity
@@ -225,7 +222,7 @@ def transitions(position: FloatArray, velocity: FloatArray, action: FloatArray) 
 def demonstration(problem: Problem, index: int, ticks: Ticks) -> npt.NDArray[np.float32]:
     """Return the recording's own transitions D_T, (T, inputs), not yet standardised.
 
-    Noisy positions are smoothed first (:func:`deal_hw.calib.data.smoothing.smooth_states`), which helps the
+    Noisy positions are smoothed first (:func:`deal_hw.calib.data.noise.smooth_states`), which helps the
     paper's method.
     """
     starts, episode = problem.starts[index], problem.episodes[index]
