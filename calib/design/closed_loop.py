@@ -24,10 +24,6 @@ from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
-TRIP_SHARE = 0.85
-"""Share of the ranges that trip which a trial may use. A few dozen simulated robots are not all there are: a
-design that used the whole range on 48 of them tripped on one of the first three emulated ones."""
-
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
@@ -76,6 +72,9 @@ class TrialRunner:
         scenario: The members.
         seconds: Length of a run [s].
         threads: Simulation threads; None for all CPUs.
+        trip_share: Share of the ranges that trip which a trial may use. A few dozen simulated robots are not
+            all there are: a design that used the whole range on 48 of them tripped on one of the first three
+            emulated ones.
 
     Raises:
         ConfigurationError: The robot's base floats, or its rates do not divide.
@@ -88,6 +87,7 @@ class TrialRunner:
         scenario: Scenario,
         seconds: float,
         threads: int | None = None,
+        trip_share: float = 0.85,
     ) -> None:
         description = robot.description
         if robot.base is not None:
@@ -95,7 +95,7 @@ class TrialRunner:
                 f"robot {description.name!r} has a floating base; excitations are designed for robots on a "
                 "stand (such as go2_suspended), where falling over is no matter"
             )
-        self._robot, self._scenario = robot, scenario
+        self._robot, self._scenario, self._trip_share = robot, scenario, trip_share
         self._device_s = 1.0 / description.device_rate_hz
         self._period = description.steps_per_control
         self._stride = round(description.device_rate_hz / description.state_rate_hz)
@@ -122,7 +122,7 @@ class TrialRunner:
             behaviour.reset()
         self._batch.set_parameters(scenario.theta)
         self._batch.set_state(scenario.position, np.zeros_like(scenario.position))
-        loop = _Loop(description, scenario.position)
+        loop = _Loop(description, scenario.position, self._trip_share)
         positions, velocities = [self._batch.position[:, None]], [self._batch.velocity[:, None]]
         path = ClosedLoop(self._batch, self._period, self._device_s)
         start = scenario.position[:, list(description.actuated_index)]
@@ -167,8 +167,8 @@ class TrialRunner:
 class _Loop:
     """Behaviours behind the safety filter, and what the safety module would have said."""
 
-    def __init__(self, description: RobotDescription, position: FloatArray) -> None:
-        self._description = description
+    def __init__(self, description: RobotDescription, position: FloatArray, trip_share: float) -> None:
+        self._description, self._trip_share = description, trip_share
         self._index = list(description.actuated_index)
         self._filters = [SafetyFilter(description) for _ in position]
         self._start = position[:, self._index]
@@ -222,9 +222,9 @@ class _Loop:
         low, high = np.array(limits.trip_position).T
         bounded = np.isfinite(low) & np.isfinite(high)
         width = np.subtract(high, low, out=np.zeros_like(low), where=bounded)
-        spare = 0.5 * (1 - TRIP_SHARE) * width
+        spare = 0.5 * (1 - self._trip_share) * width
         low, high = low + spare, high - spare
-        fast = TRIP_SHARE * np.array(limits.trip_velocity)
+        fast = self._trip_share * np.array(limits.trip_velocity)
         for n in range(len(position)):
             if self.tripped[n]:
                 continue
