@@ -89,7 +89,7 @@ class OutputErrorSettings:
         }
 
     def recipe(self, name: str) -> Recipe:
-        """Return how a candidate's residuals are weighed, for intervals and halves."""
+        """Return how a candidate's residuals are weighed, for intervals and the split-half check."""
         long = Recipe(seconds=self.long_s, prior_std=self.priors[self.prior_of(name)])
         return self.variants.get(name, long)
 
@@ -154,14 +154,13 @@ class OutputErrorFits(Fits):
             "halves": halves.to_json(),
             "confounded": [pair.to_json() for pair in found],
         }
-        return Outcome(
-            searched=searched,
-            theta=theta,
-            latency_s=latency_s,
-            chi2=chi2,
-            known=dataclasses.replace(known, alarms=(*known.alarms, *self._unexplained(chi2))),
+        known = dataclasses.replace(
+            known,
+            alarms=(*known.alarms, *self._unexplained(chi2)),
             null_directions=tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))),
-            facts=facts,
+        )
+        return Outcome(
+            searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
         )
 
     def _reduced(self, problem: Problem, first: HorizonFit) -> Problem:

@@ -68,7 +68,6 @@ class Outcome:
         latency_s: Its latency [s].
         chi2: Mean squared residual over the noise's.
         known: What is known there.
-        null_directions: Combinations that the data cannot tell, in words.
         facts: What else the provenance says: plain JSON values.
     """
 
@@ -77,7 +76,6 @@ class Outcome:
     latency_s: float
     chi2: float
     known: Uncertainty
-    null_directions: tuple[str, ...]
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -199,7 +197,7 @@ class Calibration(CalibrationMethod[Problem]):
             interval=known.interval,
             covariance=known.covariance,
             verdicts=known.verdicts,
-            null_directions=found.null_directions,
+            null_directions=known.null_directions,
             latency_s=found.latency_s,
             latency_interval_s=known.latency_interval_s,
             chi2=found.chi2,
@@ -325,7 +323,6 @@ def to_the_noise(
         latency_s=refined.latency_s,
         chi2=refined.chi2,
         known=known,
-        null_directions=known.null_directions,
         facts=facts,
     )
 

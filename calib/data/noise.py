@@ -180,7 +180,7 @@ class StartStates:
     """Smoothed states at every sample of an episode, with their uncertainty.
 
     Attributes:
-        position: Chart coordinates, (T, C).
+        position: Tangent coordinates, (T, C).
         velocity: (T, C).
         position_std: Standard deviation of a smoothed position, (C,).
         velocity_std: Standard deviation of a smoothed velocity, (C,).
@@ -199,7 +199,7 @@ def smooth_states(
 
     Positions that are free of noise are left alone, and so are the reported velocities then: smoothing would
     only round off the impacts. Measured angular velocities of a base are smoothed; its rotation vector
-    vanishes, because the chart's reference is the smoothed orientation already. What was not measured stays
+    vanishes, because its reference is the smoothed orientation already. What was not measured stays
     the estimate that the episode holds.
 
     Args:

@@ -1,8 +1,8 @@
 """A calibration problem: recordings on the device's time grid, a batched simulator, and what is searched.
 
 Every method sees the data through this class, so that all of them use the same simulator, the same start
-states and the same count of simulated steps. States have C chart coordinates and as many velocities; what was
-measured of them are the M channels that predictions are compared with.
+states and the same count of simulated steps. States have C tangent coordinates and as many velocities; what
+was measured of them are the M channels that predictions are compared with.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Prediction:
 
     Attributes:
         observed: The measured channels, (N, W, H, M).
-        position: Chart coordinates, (N, W, H, C).
+        position: Tangent coordinates, (N, W, H, C).
         velocity: (N, W, H, C).
     """
 
@@ -229,7 +229,7 @@ class Problem:
 
     @property
     def coordinates(self) -> int:
-        """Chart coordinates C of a state."""
+        """Tangent coordinates C of a state."""
         return int(self.episodes[0].position.shape[1])
 
     @property

@@ -188,9 +188,10 @@ class _Loop:
                 # What a robot would do after a trip is of no interest: its trial is not used.
                 sent.append(self.sent[-1][n])
                 continue
-            wanted = behaviour.command(_state(position[n], velocity[n], tick), time_s)
-            measured, moving = position[n][self._index], velocity[n][self._index]
-            sent.append(self._filtered(n, wanted, measured, moving, time_s))
+            x, v = position[n], velocity[n]
+            state = RobotState(x, v, np.zeros_like(x), 0, 0, tick, -1, -1, Status.ARMED)
+            wanted = behaviour.command(state, time_s)
+            sent.append(self._filtered(n, wanted, x[self._index], v[self._index], time_s))
         running = [command for command, why in zip(sent, self.tripped, strict=True) if not why]
         if any(not _same_limits(running[0], other) for other in running):
             raise ConfigurationError("behaviours that run side by side must send the same gains and limits")
@@ -200,7 +201,8 @@ class _Loop:
     def _filtered(
         self, n: int, wanted: JointCommand, measured: FloatArray, velocity: FloatArray, time_s: float
     ) -> JointCommand:
-        if not is_finite_target(wanted):
+        # The speed limit need not be finite, without a set-point generator.
+        if not is_finite(dataclasses.replace(wanted, speed_limit=np.zeros_like(wanted.speed_limit))):
             self.tripped[n] = "the behaviour asked for a command that is not finite"
             return dataclasses.replace(wanted, position_target=self._previous[n])
         share = 1.0
@@ -239,17 +241,8 @@ class _Loop:
                 self.tripped[n] = f"{names[int(np.argmax(over))]} moved nearly too fast"
 
 
-def is_finite_target(command: JointCommand) -> bool:
-    """Return whether a command is finite; its speed limit need not be, without a set-point generator."""
-    return is_finite(dataclasses.replace(command, speed_limit=np.zeros_like(command.speed_limit)))
-
-
 def _same_limits(a: JointCommand, b: JointCommand) -> bool:
     return all(
         np.array_equal(getattr(a, name), getattr(b, name))
         for name in ("stiffness", "damping", "effort_limit", "speed_limit")
     )
-
-
-def _state(position: FloatArray, velocity: FloatArray, tick: int) -> RobotState:
-    return RobotState(position, velocity, np.zeros_like(position), 0, 0, tick, -1, -1, Status.ARMED)

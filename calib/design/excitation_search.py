@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -75,17 +76,6 @@ class Optimum:
     trace: tuple[float, ...]
 
 
-@dataclass(slots=True)
-class _Count:
-    tried: int = 0
-    tripped: dict[str, int] = field(default_factory=dict)
-
-    def note(self, prediction: Prediction) -> None:
-        self.tried += 1
-        if prediction.tripped:
-            self.tripped[prediction.tripped] = self.tripped.get(prediction.tripped, 0) + 1
-
-
 def search_excitation(
     experiment: Experiment,
     rng: np.random.Generator,
@@ -114,21 +104,23 @@ def search_excitation(
     """
     wanted = settings or SearchSettings()
     description = experiment.robot.description
-    count = _Count()
+    tried, tripped = 0, Counter[str]()
     designer = _Designer(description, experiment.seconds, balance is not None, wanted)
     designs = designer.usual() + [designer.draw(rng) for _ in range(wanted.candidates)]
     total = len(designs) + wanted.rounds + (wanted.confirmed if confirmation is not None else 0)
 
     def predict(design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment) -> Prediction:
+        nonlocal tried
         plan = make_plan(description, design)
         found = on.predict(
             lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None),
             lambda bound: score(bound, wanted) > bar,
         )
-        count.note(found)
+        tried += 1
+        tripped.update(filter(None, [found.tripped]))
         if notify is not None:
             outcome = "less than others" if found.beaten else found.tripped or f"{found.gain:.1f} nats"
-            notify(count.tried, total, f"{design.family}: {outcome}")
+            notify(tried, total, f"{design.family}: {outcome}")
         return found
 
     finals: list[tuple[Prediction, ExcitationDesign]] = []
@@ -139,9 +131,9 @@ def search_excitation(
             finals = sorted([*finals, (found, design)], key=lambda pair: -score(pair[0], wanted))
             finals = finals[: wanted.finalists]
     if not finals:
-        reasons = ", ".join(f"{n} x {why}" for why, n in count.tripped.items())
+        reasons = ", ".join(f"{n} x {why}" for why, n in tripped.items())
         raise CalibrationError(
-            f"none of {count.tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
+            f"none of {tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
             "draw from narrower ranges (--xi, --calibration), or try more (--candidates)"
         )
     best, design = finals[0]
@@ -175,8 +167,8 @@ def search_excitation(
         plan=dataclasses.replace(plan, predicted=predicted),
         prediction=best,
         references={name: judge.predict(make) for name, make in (references or {}).items()},
-        tried=count.tried,
-        tripped=count.tripped,
+        tried=tried,
+        tripped=tripped,
         trace=tuple(trace),
     )
 

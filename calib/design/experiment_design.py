@@ -122,7 +122,6 @@ def information(
     trial: Trial,
     theta: FloatArray,
     latency_s: float,
-    *,
     window_s: float = SETTINGS.window_s,
     threads: int | None = None,
 ) -> FloatArray:
@@ -186,11 +185,9 @@ class Experiment:
         self._order = list(range(draws))
         self._rest = rest
         drawn = _draw(robot.description, known, rng, draws, settings)
-        self.scenario = self._runnable(drawn, draws, rest)
+        self.scenario = drawn.part(range(draws)) if rest is None else self._runnable(drawn, draws, rest)
 
-    def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour | None) -> Scenario:
-        if rest is None:
-            return drawn.part(range(draws))
+    def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour) -> Scenario:
         trials = self._on(drawn).run([rest() for _ in range(len(drawn))])
         kept = [n for n, trial in enumerate(trials) if not trial.tripped][:draws]
         if len(kept) < draws:
@@ -213,11 +210,7 @@ class Experiment:
 
     def assume(self, covariance: FloatArray) -> None:
         """Take this covariance, (K, K), as what is known before, instead of the distribution's."""
-        self.prior = Prior.of(
-            ParameterDistribution(
-                space=self.space, mean=self.known.mean, covariance=covariance, latency_s=self.known.latency_s
-            )
-        )
+        self.prior = Prior.of(dataclasses.replace(self.known, covariance=covariance))
 
     def predict(self, make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
         """Predict what a behaviour tells.
@@ -240,8 +233,12 @@ class Experiment:
         covariances = np.zeros((D, K, K))
         found = nothing
         for n in self._order:
+            theta, latency_s = self.scenario.theta[n], float(self.scenario.latency_s[n])
             try:
-                covariances[n] = self.prior.posterior(self.information(trials[n], n))
+                hessian = information(
+                    self.robot, self.space, trials[n], theta, latency_s, self.settings.window_s, self.threads
+                )
+                covariances[n] = self.prior.posterior(hessian)
             except InsufficientDataError as err:
                 return dataclasses.replace(nothing, tripped=str(err))
             if not np.isfinite(covariances[n]).all():
@@ -255,19 +252,6 @@ class Experiment:
         dark = np.einsum("nkk,kk->n", covariances, self.prior.information[:K, :K])
         self._order = np.argsort(-dark).tolist()
         return found
-
-    def information(self, trial: Trial, n: int) -> FloatArray:
-        """Return the information of member ``n``'s trial, (K + 1, K + 1)."""
-        theta, latency_s = self.scenario.theta[n], float(self.scenario.latency_s[n])
-        return information(
-            self.robot,
-            self.space,
-            trial,
-            theta,
-            latency_s,
-            window_s=self.settings.window_s,
-            threads=self.threads,
-        )
 
 
 def default_knowledge(

@@ -52,7 +52,7 @@ class TargetRecording:
 
     Attributes:
         episode: What the sensors saw.
-        position: True positions at the samples, in the episode's charts, (T, C).
+        position: True positions at the samples, in the episode's tangent coordinates, (T, C).
         velocity: True velocities at the samples, (T, C).
     """
 
@@ -151,7 +151,7 @@ class _Sensor:
     def report(
         self, true_x: FloatArray, true_v: FloatArray, target: FloatArray, rest: FloatArray, stride: int
     ) -> TargetRecording:
-        """Return the recording of a true trajectory, (T, C), in the identity's chart."""
+        """Return the recording of a true trajectory, (T, C), in tangent coordinates of the identity."""
         robot, T = self._robot, len(true_x)
         C = true_x.shape[1]
         orientation = None
