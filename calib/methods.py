@@ -19,8 +19,8 @@ METHODS: dict[str, str] = {
     "deal-paper-fn": "deal_hw.calib.deal_paper.algorithm1:without_noise_adaptation",
     "deal-paper-pn": "deal_hw.calib.deal_paper.algorithm1:without_normalisation",
     "deal-paper-flat": "deal_hw.calib.deal_paper.algorithm1:flat",
-    "open-loop": "deal_hw.calib.open_loop:OpenLoop",
-    "near": "deal_hw.calib.open_loop:near",
+    "open-loop": "deal_hw.calib.output_error_fits:open_loop",
+    "near": "deal_hw.calib.output_error_fits:near",
     "easi": "deal_hw.calib.baselines.easi:Easi",
     "bo": "deal_hw.calib.baselines.bayesian:BayesianOptimisation",
     "cma": "deal_hw.calib.baselines.cma_es:Cma",
@@ -67,7 +67,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
     search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
     if not polish or name in NULL_METHODS | WHOLE_METHODS:
         return search
-    from deal_hw.calib.pipeline import PolishedMethod
+    from deal_hw.calib.pipeline import Calibration
     from deal_hw.calib.search.eki import Eki
     from deal_hw.calib.validation.checks import Validation
 
@@ -76,4 +76,4 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
             search, settings=dataclasses.replace(search.settings, before_polish=True)
         )
     # Who names a search wants it run, also where the model's own values could be refined without one.
-    return PolishedMethod(search, name, Validation(local_first=name == "default"))
+    return Calibration(search, name, Validation(local_first=name == "default"))

@@ -1,8 +1,9 @@
 """The whole calibration: checks, a local fit, a search where that is not the answer, uncertainty, validation.
 
-Two ways go on where the local fit does not explain the recordings. :class:`PolishedMethod` searches and
-refines down to the sensors' noise; :mod:`deal_hw.calib.open_loop` fits predictions of a robot that no model
-explains. Both end in an :class:`Outcome`, from which the result is made here.
+Simulated or real, fixed or floating base: the same :class:`Calibration`. How it goes on where the local fit
+does not explain the recordings is a strategy, :class:`Fits`. :class:`Refinement` searches and refines down to
+the sensors' noise; :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits predictions of a robot that
+no model explains.
 """
 
 from __future__ import annotations
@@ -44,18 +45,17 @@ class RestartSettings:
     """When a search is run again from other draws.
 
     Attributes:
+        explained: Searched no more once chi2 is below this: noise explains the recordings.
         restarts: Most searches after the first.
         same: Two searches whose unexplained chi2 differ by a smaller share say that the model is wrong, not
             the search.
         fewest_generations: With fewer left in the budget another search would not get anywhere.
     """
 
+    explained: float = MISMATCH_CHI2
     restarts: int = 2
     same: float = 0.2
     fewest_generations: int = 15
-
-
-RESTARTS = RestartSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,9 +68,7 @@ class Outcome:
         latency_s: Its latency [s].
         chi2: Mean squared residual over the noise's.
         known: What is known there.
-        null_directions: Combinations that the data cannot tell, in words.
         facts: What else the provenance says: plain JSON values.
-        other_steps: Physics steps that were simulated for it by other problems than the given one.
     """
 
     searched: CalibrationResult
@@ -78,9 +76,52 @@ class Outcome:
     latency_s: float
     chi2: float
     known: Uncertainty
-    null_directions: tuple[str, ...]
     facts: Mapping[str, Any] = field(default_factory=dict)
-    other_steps: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationRun:
+    """What the stages of one calibration work with.
+
+    Attributes:
+        problem: Recordings and simulator.
+        budget: What the searches may use.
+        rng: The only source of randomness.
+        search: The search.
+        attempts: Runs it on all recordings, and keeps what it found.
+        settings: Which checks.
+        local: The local fit, where there is one.
+        progress: Called now and then.
+    """
+
+    problem: Problem
+    budget: Budget
+    rng: np.random.Generator
+    search: CalibrationMethod[Problem]
+    attempts: Restarts
+    settings: Validation
+    local: Polished | None = None
+    progress: ProgressCallback | None = None
+
+    def say(self, stage: str, message: str) -> None:
+        """Report what is being done."""
+        if self.progress is not None:
+            self.progress(Progress(stage, 0, 1, message))
+
+    def offer(self, stage: str, found: Polished | CalibrationResult) -> None:
+        """Report what could be the answer, and the stage that found it."""
+        theta = found.theta if isinstance(found, Polished) else found.estimate
+        if self.progress is not None:
+            values = {"chi2": found.chi2}
+            self.progress(Progress(stage, 1, 1, estimate=theta, latency_s=found.latency_s, values=values))
+
+
+class Fits(abc.ABC):
+    """A way to go on where the local fit is not the answer: searches, candidate fits, and the choice."""
+
+    @abc.abstractmethod
+    def best(self, run: CalibrationRun) -> Outcome:
+        """Search, fit, choose, and say what is known."""
 
 
 class Calibration(CalibrationMethod[Problem]):
@@ -88,8 +129,9 @@ class Calibration(CalibrationMethod[Problem]):
 
     Args:
         search: The search.
-        name: Name of the whole.
+        name: Name of the whole; the search's by default.
         settings: What is checked, and whether the local fit comes first.
+        fits: How to go on where the local fit is not the answer; :class:`Refinement` by default.
     """
 
     def __init__(
@@ -97,10 +139,12 @@ class Calibration(CalibrationMethod[Problem]):
         search: CalibrationMethod[Problem],
         name: str | None = None,
         settings: Validation | None = None,
+        *,
+        fits: Fits | None = None,
     ) -> None:
-        self.search = search
+        self.search, self.name = search, name or search.name
         self.settings = settings or Validation()
-        self.name = name or search.name
+        self.fits = fits or Refinement()
 
     def run(
         self,
@@ -117,21 +161,26 @@ class Calibration(CalibrationMethod[Problem]):
         """
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
+        attempts = Restarts(self.search, rng, checkpoint)
         local = local_fit(problem, progress) if self.settings.local_first else None
+        run = CalibrationRun(
+            problem=problem,
+            budget=budget,
+            rng=rng,
+            search=self.search,
+            attempts=attempts,
+            settings=self.settings,
+            progress=progress,
+        )
         if local is not None:
-            offer("local fit", local.theta, local.latency_s, local.chi2, progress)
-        earlier_steps, earlier_seconds = 0, 0.0
+            run.offer("local fit", local)
         if local is not None and conclusive(problem, local):
-            found = to_the_noise(
-                problem, without_search(problem, budget, local), local, self.settings, progress
-            )
+            found = to_the_noise(run, without_search(problem, budget, local), local)
         else:
             if local is not None and progress is not None:
                 local = with_rows(local)
                 foretell(problem, local, progress)
-            attempts = Restarts(self.search, rng, checkpoint)
-            found = self.fitted(problem, budget, rng, attempts, local, progress)
-            earlier_steps, earlier_seconds = attempts.earlier_steps, attempts.earlier_seconds
+            found = self.fits.best(dataclasses.replace(run, local=local))
         searched, known = found.searched, found.known
         # What the search says of its own interval does not hold for these.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
@@ -148,122 +197,116 @@ class Calibration(CalibrationMethod[Problem]):
             interval=known.interval,
             covariance=known.covariance,
             verdicts=known.verdicts,
-            null_directions=found.null_directions,
+            null_directions=known.null_directions,
             latency_s=found.latency_s,
             latency_interval_s=known.latency_interval_s,
             chi2=found.chi2,
             alarms=known.alarms,
-            steps=problem.steps - steps + found.other_steps + earlier_steps,
-            seconds=time.perf_counter() - began + earlier_seconds,
+            steps=problem.steps - steps + attempts.earlier_steps,
+            seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
         )
 
-    @abc.abstractmethod
-    def fitted(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        attempts: Restarts,
-        local: Polished | None,
-        progress: ProgressCallback | None,
-    ) -> Outcome:
-        """Search and fit where the local fit is not the answer.
 
-        Args:
-            problem: Recordings and simulator.
-            budget: What the searches may use.
-            rng: The only source of randomness.
-            attempts: Runs the searches.
-            local: The local fit, where there is one.
-            progress: Called now and then.
-        """
+class Refinement(Fits):
+    """A search and its refinement; searched again from other draws while the residual is unexplained.
 
+    Args:
+        restarts: When.
+    """
 
-class PolishedMethod(Calibration):
-    """A search followed by the polish; searched again from other draws while the residual is unexplained."""
+    def __init__(self, restarts: RestartSettings | None = None) -> None:
+        self._restarts = restarts or RestartSettings()
 
-    def fitted(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        attempts: Restarts,
-        local: Polished | None,
-        progress: ProgressCallback | None,
-    ) -> Outcome:
-        """Search, polish, let inner folds say whether the polish helps. See :meth:`Calibration.fitted`."""
-        searched, polished, restarts = _until_explained(attempts, problem, budget, progress)
-        choice = self._choose(problem, budget, rng, searched, polished, progress)
-        return to_the_noise(problem, searched, polished, self.settings, progress, choice, restarts)
+    def best(self, run: CalibrationRun) -> Outcome:
+        """Search, refine, let cross-validation say whether the refinement helps. See :meth:`Fits.best`."""
+        settings, left = self._restarts, run.budget.generations
+        best: tuple[CalibrationResult, Polished] | None = None
+        attempt = 0
+        for attempt in range(1 + settings.restarts):
+            budget = dataclasses.replace(run.budget, generations=left)
+            searched = run.attempts.run(run.problem, attempt, budget, run.progress)
+            run.offer("search", searched)
+            left -= len(searched.trace)
+            refined = refine(run, searched)
+            run.offer("refinement", refined)
+            previous = best[1].chi2 if best is not None else np.inf
+            if best is None or self._better(refined, best[1]):
+                best = (searched, refined)
+            # Two searches that end at the same unexplained residual say that the model is wrong, not the
+            # search.
+            same = abs(refined.chi2 - previous) < settings.same * previous
+            if best[1].chi2 < settings.explained or same or left < settings.fewest_generations:
+                break
+        if best is None:
+            raise RuntimeError("unreachable: at least one search is run")
+        return to_the_noise(run, *best, self._choose(run, *best), attempt)
 
-    def _choose(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        searched: CalibrationResult,
-        polished: Polished,
-        progress: ProgressCallback | None,
-    ) -> Choice | None:
-        """Return what inner folds say of the polish; None where it explains the recording to its noise."""
-        # A fold is a search and a polish; with contacts these take a minute each.
-        if not self.settings.folds or problem.robot.base is not None or conclusive(problem, polished):
+    def _better(self, a: Polished, b: Polished) -> bool:
+        """Say whether ``a`` explains more: a longer window only counts where both are explained."""
+        if (
+            all(fit.chi2 < self._restarts.explained for fit in (a, b))
+            and a.shooting.length != b.shooting.length
+        ):
+            return a.shooting.length > b.shooting.length
+        return a.chi2 < b.chi2
+
+    def _choose(self, run: CalibrationRun, searched: CalibrationResult, refined: Polished) -> Choice | None:
+        """Return what cross-validation says of the refinement; None where it explains all but the noise."""
+        # A fold is a search and a refinement; with contacts these take a minute each.
+        floating = run.problem.robot.base is not None
+        if not run.settings.folds or floating or conclusive(run.problem, refined):
             return None
-        if progress is not None:
-            progress(Progress("folds", 0, 1, "does the polish help on what it has not seen?"))
-        robust = self.settings.robust and kurtosis(polished.normal.residual) > HEAVY_TAILS
+        run.say("cross-validation", "does the refinement help on what it has not seen?")
+        robust = run.settings.robust and kurtosis(refined.normal.residual) > HEAVY_TAILS
         # Drawn after all searches, so that a resumed run draws the same.
-        seed = int(rng.integers(2**32))
-        length = polished.shooting.length
+        seed = int(run.rng.integers(2**32))
         # A fold needs no more generations than the whole did.
-        less = dataclasses.replace(budget, generations=max(len(searched.trace), RESTARTS.fewest_generations))
-        return choose(problem, self.search, less, seed, length, searched.steps, robust)
+        generations = max(len(searched.trace), self._restarts.fewest_generations)
+        less = dataclasses.replace(run.budget, generations=generations)
+        return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
 
 
 def to_the_noise(
-    problem: Problem,
+    run: CalibrationRun,
     searched: CalibrationResult,
-    polished: Polished,
-    settings: Validation,
-    progress: ProgressCallback | None,
+    refined: Polished,
     choice: Choice | None = None,
     restarts: int = 0,
 ) -> Outcome:
     """Scan the latency, say what is known, check it.
 
     Args:
-        problem: Recordings and simulator.
+        run: The calibration.
         searched: What the search found, or what stands for it.
-        polished: Where the fit ended.
-        settings: Which checks.
-        progress: Called while the latency is scanned.
+        refined: Where the refinement ended.
         choice: What cross-validation said.
         restarts: Searches after the first.
     """
+    problem = run.problem
     scan = None
     if choice is not None and choice.chosen == "search":
-        length, states = polished.shooting.length, polished.shooting.states(polished.point)
-        polished = at_parameters(problem, searched.estimate, searched.latency_s, length, states)
+        length, states = refined.shooting.length, refined.shooting.states(refined.point)
+        refined = at_parameters(problem, searched.estimate, searched.latency_s, length, states)
     elif problem.fixed_latency_s is None:
-        scan = scan_latency(problem, polished, progress)
-    whole = scan is not None and scan.decides(polished)
+        scan = scan_latency(problem, refined, run.progress)
+    whole = scan is not None and scan.decides(refined)
     if scan is not None and whole:
-        polished = scan.polished[scan.best]
+        refined = scan.polished[scan.best]
     decided = whole or problem.fixed_latency_s is not None
     if choice is not None and choice.chosen == "robust polish":
-        polished = polish_robust(polished, decided)
-    polished = with_rows(polished)
-    known = statement(problem, polished, fixed_latency=decided)
+        refined = polish_robust(refined, decided)
+    refined = with_rows(refined)
+    known = statement(problem, refined, fixed_latency=decided)
     if scan is not None and whole:
         known = averaged(problem, scan, known)
-    known, checked = judge(problem, polished, known, settings)
+    known, checked = judge(problem, refined, known, run.settings)
     facts: dict[str, Any] = {
         "restarts": restarts,
-        "window_s": polished.shooting.length * problem.episodes[0].period_s,
+        "window_s": refined.shooting.length * problem.episodes[0].period_s,
         "noise_std": problem.noise.position_std.tolist(),
         "timing_std_s": problem.noise.timing_std_s,
-        "polish_iterations": polished.iterations,
+        "polish_iterations": refined.iterations,
         **checked,
     }
     if choice is not None:
@@ -276,29 +319,12 @@ def to_the_noise(
         }
     return Outcome(
         searched=searched,
-        theta=polished.theta,
-        latency_s=polished.latency_s,
-        chi2=polished.chi2,
+        theta=refined.theta,
+        latency_s=refined.latency_s,
+        chi2=refined.chi2,
         known=known,
-        null_directions=known.null_directions,
         facts=facts,
     )
-
-
-def offer(
-    stage: str, theta: FloatArray, latency_s: float, chi2: float, progress: ProgressCallback | None
-) -> None:
-    """Report a fit that could be the answer.
-
-    Args:
-        stage: What found it.
-        theta: Physical parameters, (K,).
-        latency_s: Total latency [s].
-        chi2: Mean squared residual over the noise's.
-        progress: Who is told.
-    """
-    if progress is not None:
-        progress(Progress(stage, 1, 1, estimate=theta, latency_s=latency_s, values={"chi2": chi2}))
 
 
 def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> None:
@@ -320,13 +346,13 @@ def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> N
         progress(Progress(BEFORE_SEARCH, 1, 1, "; ".join(words)))
 
 
-def conclusive(problem: Problem, polished: Polished) -> bool:
+def conclusive(problem: Problem, fit: Polished) -> bool:
     """Return whether a fit needs no other judge: what it leaves has the size of the sensors' noise.
 
     A residual that was chosen explains itself: only what no fit has seen can judge then.
     """
     chosen = problem.known_std is not None and problem.robot.base is None
-    return not chosen and not unexplained(polished)
+    return not chosen and not unexplained(fit)
 
 
 def without_search(problem: Problem, budget: Budget, local: Polished) -> CalibrationResult:
@@ -343,43 +369,13 @@ def without_search(problem: Problem, budget: Budget, local: Polished) -> Calibra
     )
 
 
-def _until_explained(
-    attempts: Restarts, problem: Problem, budget: Budget, progress: ProgressCallback | None
-) -> tuple[CalibrationResult, Polished, int]:
-    best: tuple[CalibrationResult, Polished] | None = None
-    attempt, left = 0, budget.generations
-    for attempt in range(1 + RESTARTS.restarts):
-        searched = attempts.run(problem, attempt, dataclasses.replace(budget, generations=left), progress)
-        offer("search", searched.estimate, searched.latency_s, searched.chi2, progress)
-        left -= len(searched.trace)
-        polished = polish_from(problem, searched, progress)
-        offer("refinement", polished.theta, polished.latency_s, polished.chi2, progress)
-        previous = best[1].chi2 if best is not None else np.inf
-        if best is None or _better(polished, best[1]):
-            best = (searched, polished)
-        # Two searches that end at the same unexplained residual say that the model is wrong, not the search.
-        same = abs(polished.chi2 - previous) < RESTARTS.same * previous
-        if best[1].chi2 < MISMATCH_CHI2 or same or left < RESTARTS.fewest_generations:
-            break
-    if best is None:
-        raise RuntimeError("unreachable: at least one search is run")
-    return (*best, attempt)
-
-
-def _better(a: Polished, b: Polished) -> bool:
-    """Say whether ``a`` explains more: a longer window only counts where both are explained."""
-    if a.chi2 < MISMATCH_CHI2 and b.chi2 < MISMATCH_CHI2 and a.shooting.length != b.shooting.length:
-        return a.shooting.length > b.shooting.length
-    return a.chi2 < b.chi2
-
-
-def polish_from(problem: Problem, searched: CalibrationResult, progress: ProgressCallback | None) -> Polished:
-    """Polish a search's estimate."""
-    fixed = problem.fixed_latency_s is not None
-    latency = searched.latency_s if problem.fixed_latency_s is None else problem.fixed_latency_s
+def refine(run: CalibrationRun, searched: CalibrationResult) -> Polished:
+    """Refine a search's estimate."""
+    given = run.problem.fixed_latency_s
 
     def notify(done: int, chi2: float) -> None:
-        if progress is not None:
-            progress(Progress("polish", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
+        if run.progress is not None:
+            run.progress(Progress("refinement", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
 
-    return polish(problem, searched.estimate, latency, fixed_latency=fixed, notify=notify)
+    latency_s = searched.latency_s if given is None else given
+    return polish(run.problem, searched.estimate, latency_s, fixed_latency=given is not None, notify=notify)

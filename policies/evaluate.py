@@ -108,9 +108,7 @@ def evaluate_batch(
         N results.
     """
     spec, count = policy.spec, len(theta)
-    loop = ServoLoop(
-        description, space, count, longest_latency_s=float(np.max(latency_s)), sensor=sensor, threads=threads
-    )
+    loop = ServoLoop(description, space, count, sensor=sensor, threads=threads)
     home = np.repeat(np.array(description.default_position)[None], count, axis=0)
     start = home if start_position is None else start_position
     loop.restart(np.ones(count, dtype=bool), theta, latency_s, start, np.zeros_like(home), rng)

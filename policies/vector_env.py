@@ -83,10 +83,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, count)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, count)
-        longest = distribution.latency_s[1] + host_delay_s[1]
-        self.loop = ServoLoop(
-            description, distribution.space, count, longest_latency_s=longest, sensor=sensor, threads=threads
-        )
+        self.loop = ServoLoop(description, distribution.space, count, sensor=sensor, threads=threads)
         self._builder = ObservationBuilder(layout, (count,))
         self._elapsed = np.zeros(count, dtype=np.int64)
         self._scale = np.array(layout.action_scale)

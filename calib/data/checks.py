@@ -9,10 +9,6 @@ from deal_hw.calibration import SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.engine.batch import COMMAND_DELAY
 
-LEAST_NOISE_RATIO = 20.0
-LEAST_CHOSEN_RATIO = 5.0
-"""The same where the noise was chosen: allowing for what the model lacks, it is far above the sensor's."""
-
 
 def check_delays(problem: Problem) -> None:
     """Check that command delays can be told from the latency, which is searched beside the parameters.
@@ -50,7 +46,8 @@ def check_excitation(problem: Problem) -> None:
         # What a recording happens to show may be less than its sensor's noise, down to none at all: a joint
         # that never left its friction is still no motion to calibrate from.
         noises = np.maximum(noises, problem.robot.description.sensor.position_std)
-    least = LEAST_NOISE_RATIO if problem.known_std is None else LEAST_CHOSEN_RATIO
+    settings = problem.settings
+    least = settings.least_motion if problem.known_std is None else settings.least_chosen_motion
     still = [
         f"{name} moved {span:.2g} (noise {noise:.2g})"
         for name, span, noise in zip(names, spans, noises, strict=True)
@@ -61,7 +58,8 @@ def check_excitation(problem: Problem) -> None:
     changes = sum(
         int(np.count_nonzero(np.any(np.diff(e.target, axis=0) != 0, axis=1))) for e in problem.episodes
     )
-    if changes < 5:
+    if changes < settings.fewest_changes:
         raise InsufficientDataError(
-            f"the position target changed {changes} times, at least 5 are needed; {advice}"
+            f"the position target changed {changes} times, at least {settings.fewest_changes} are needed; "
+            f"{advice}"
         )

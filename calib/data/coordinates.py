@@ -9,11 +9,6 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.types import FloatArray
 
-LATENCY_MARGIN_S = 0.004
-"""The latency's coordinate reaches so far beyond its range, or a latency of zero would sit at infinity."""
-
-_EDGE = 1e-9
-
 
 @dataclass(frozen=True, slots=True)
 class Members:
@@ -35,14 +30,16 @@ class Coordinates:
 
     Args:
         problem: Gives the space and the range of the latency, or the latency.
+        margin_s: The latency's coordinate reaches so far beyond its range, or a latency of zero would sit at
+            infinity [s]; less than :func:`~deal_hw.calib.data.innovations.early_setpoints` can undo.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, margin_s: float = 0.004) -> None:
         self.space = problem.space
         self.fixed_latency_s = problem.fixed_latency_s
         self._range = problem.latency_range_s
-        self._low = self._range[0] - LATENCY_MARGIN_S
-        self._width = self._range[1] - self._range[0] + 2 * LATENCY_MARGIN_S
+        self._low = self._range[0] - margin_s
+        self._width = self._range[1] - self._range[0] + 2 * margin_s
 
     @property
     def count(self) -> int:
@@ -82,9 +79,9 @@ class Coordinates:
         return float(np.clip(latency_s, *self._range))
 
 
-def logit(unit: FloatArray) -> FloatArray:
-    """Map the open unit interval to the real line: unbounded steps then stay inside the range."""
-    inside = np.clip(unit, _EDGE, 1 - _EDGE)
+def logit(unit: FloatArray, edge: float = 1e-9) -> FloatArray:
+    """Map the unit interval, but for its edges, to the real line: unbounded steps then stay inside."""
+    inside = np.clip(unit, edge, 1 - edge)
     return np.asarray(np.log(inside) - np.log1p(-inside))
 
 

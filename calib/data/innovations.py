@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.problem import NOISE_FREE_STD, SMOOTHING_S, Prediction, Problem, WindowData
+from deal_hw.calib.data.problem import Prediction, Problem, WindowData
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
-
-ADVANCE_S = 0.008
-"""Set-points are computed late by so much and moved back: latencies down to minus this are possible."""
 
 
 def is_noisy(problem: Problem) -> bool:
     """Return whether what was measured carries sensor noise."""
-    return not problem.exact and bool(np.any(problem.noise_std[problem.channels] >= NOISE_FREE_STD))
+    std = problem.noise_std[problem.channels]
+    return not problem.exact and bool(np.any(std >= problem.settings.noise_free_std))
 
 
 def samples_per_tick(problem: Problem) -> int:
@@ -42,8 +42,25 @@ def cut(problem: Problem, ticks: int) -> list[WindowData]:
     per_tick = samples_per_tick(problem)
     if not is_noisy(problem):
         return problem.windows(ticks * per_tick)
-    margin = round(0.5 * SMOOTHING_S * problem.robot.description.state_rate_hz)
+    margin = round(0.5 * problem.settings.smoothing_s * problem.robot.description.state_rate_hz)
     return problem.windows(ticks * per_tick, offset=margin)
+
+
+def early_setpoints(
+    batch: ServoBatch, episode: Episode, latency_s: FloatArray, advance_s: float = 0.008
+) -> FloatArray:
+    """Return set-points like :func:`setpoints`, but for latencies that may be slightly negative.
+
+    Args:
+        batch: The members.
+        episode: The episode.
+        latency_s: Total latency of each member, (N,) [s].
+        advance_s: Set-points are computed late by so much and moved back [s]: latencies down to minus this
+            are possible.
+    """
+    ahead = round(advance_s / episode.step_s)
+    late = setpoints(batch, episode, latency_s + ahead * episode.step_s)
+    return np.concatenate([late[:, ahead:], np.repeat(late[:, -1:], ahead, axis=1)], axis=1)
 
 
 def predict(
@@ -54,12 +71,9 @@ def predict(
     velocity: FloatArray | None = None,
 ) -> Prediction:
     """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative."""
-    episode = problem.episodes[data.episode]
     batch = problem.batch(len(members.theta))
     batch.set_parameters(members.theta)
-    ahead = round(ADVANCE_S / episode.step_s)
-    path = setpoints(batch, episode, members.latency_s + ahead * episode.step_s)
-    path = np.concatenate([path[:, ahead:], np.repeat(path[:, -1:], ahead, axis=1)], axis=1)
+    path = early_setpoints(batch, problem.episodes[data.episode], members.latency_s)
     return problem.predict_along(batch, path, data, position, velocity)
 
 
@@ -103,16 +117,18 @@ class Whitening:
         moved = self.offset * self.std
         return data.start_position + moved[:, :C], data.start_velocity + moved[:, C:]
 
-    def next_offset(self, measured: FloatArray) -> FloatArray:
-        """Return the most probable start states under the linearisation's simulator: the next ``offset``."""
+    def next_offset(self, measured: FloatArray, limit: float = 3.0) -> FloatArray:
+        """Return the most probable start states under the linearisation's simulator: the next ``offset``.
+
+        Args:
+            measured: (W, H, M).
+            limit: They move by so many standard deviations at most, or a wrong simulator would explain
+                itself.
+        """
         whitened = self.innovation(measured, self.reference[None])[0]
         response = np.einsum("wij,wjs->wis", self.factor, self.root)
         found = np.einsum("wis,wi->ws", response, whitened)
-        return np.asarray(np.clip(found, -OFFSET_LIMIT, OFFSET_LIMIT))
-
-
-OFFSET_LIMIT = 3.0
-"""Start states move by so many standard deviations at most, or a wrong simulator would explain itself."""
+        return np.asarray(np.clip(found, -limit, limit))
 
 
 def linearise(

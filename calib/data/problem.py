@@ -1,8 +1,8 @@
 """A calibration problem: recordings on the device's time grid, a batched simulator, and what is searched.
 
 Every method sees the data through this class, so that all of them use the same simulator, the same start
-states and the same count of simulated steps. States have C chart coordinates and as many velocities; what was
-measured of them are the M channels that predictions are compared with.
+states and the same count of simulated steps. States have C tangent coordinates and as many velocities; what
+was measured of them are the M channels that predictions are compared with.
 """
 
 from __future__ import annotations
@@ -15,8 +15,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.noise import NoiseModel, noise_model, white_noise_std
-from deal_hw.calib.data.smoothing import NOISE_FREE_STD, SMOOTHING_S, StartStates, smooth_states
+from deal_hw.calib.data.noise import (
+    SETTINGS,
+    DataSettings,
+    NoiseModel,
+    StartStates,
+    noise_model,
+    smooth_states,
+    white_noise_std,
+)
 from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
@@ -26,26 +33,6 @@ from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.recordings.episode import Episode, fill_gaps
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray
-
-__all__ = [
-    "LATENCY_RANGE_S", "NOISE_FREE_STD", "SMOOTHING_S", "Prediction", "Problem", "StartStates", "WindowData",
-    "smooth_states",
-]  # fmt: skip
-
-WIRE_RESOLUTION = 1e-6
-"""Positions travel as whole micrometres and microradians."""
-
-VELOCITY_PRIOR_STD = {"m": 3.0, "rad": 30.0}
-"""Weak prior on start velocities, in m/s and rad/s: keeps windows of few samples solvable."""
-
-EXACT_STD = 1e-5
-"""What residuals are measured by where nothing is noisy [m or rad]: far above rounding, far below sensors."""
-
-SLOWEST_JITTER_S = 0.01
-"""Sampling periods above this are too long to tell a jitter of the samples' time [s]."""
-
-UNSEEN_STD = 1e-6
-"""Prior on a base's place on the floor where nobody measured it: no trajectory depends on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +69,7 @@ class Prediction:
 
     Attributes:
         observed: The measured channels, (N, W, H, M).
-        position: Chart coordinates, (N, W, H, C).
+        position: Tangent coordinates, (N, W, H, C).
         velocity: (N, W, H, C).
     """
 
@@ -106,6 +93,7 @@ class Problem:
         fixed_latency_s: A latency that is given; None to search it.
         known_std: Standard deviation of every entry of (position, velocity), (2 C,), where it is known or
             chosen; None to estimate it from the recordings.
+        settings: What is taken to be so of recordings.
         channels: Indices of the measured channels into (position, velocity), (M,).
         noise_std: Noise of (position, velocity) over all speeds, (2 C,); only measured entries mean anything.
         noise: Noise at rest and jitter of the samples' time.
@@ -119,6 +107,7 @@ class Problem:
     latency_range_s: tuple[float, float] = LATENCY_RANGE_S
     fixed_latency_s: float | None = None
     known_std: FloatArray | None = None
+    settings: DataSettings = SETTINGS
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
@@ -142,13 +131,13 @@ class Problem:
         self.channels = self.episodes[0].channels
         if any(not np.array_equal(e.channels, self.channels) for e in self.episodes):
             raise ConfigurationError("the recordings measure different channels; calibrate them one by one")
-        floor = float(WIRE_RESOLUTION / np.sqrt(12.0))
-        self.noise_std = self._white_noise(floor)
+        self.noise_std = self._white_noise()
         rotation = self.robot.rotation
-        self.starts = [smooth_states(e, self.noise_std, rotation) for e in self.episodes]
-        self.noise = self._noise_model(floor)
+        self.starts = [smooth_states(e, self.noise_std, rotation, self.settings) for e in self.episodes]
+        self.noise = self._noise_model()
 
-    def _white_noise(self, floor: float) -> FloatArray:
+    def _white_noise(self) -> FloatArray:
+        floor = self.settings.floor
         if self.known_std is not None:
             if self.known_std.shape != (2 * self.coordinates,):
                 raise ConfigurationError(
@@ -157,16 +146,15 @@ class Problem:
                 )
             return np.maximum(self.known_std, floor)
         if self.exact:
-            return np.full(2 * self.coordinates, EXACT_STD)
+            return np.full(2 * self.coordinates, self.settings.noise_free_residual)
         found = np.full(2 * self.coordinates, floor)
         for e in self.episodes:
             values = np.concatenate([e.position, e.velocity], axis=1)[:, self.channels]
-            found[self.channels] = np.maximum(found[self.channels], white_noise_std(values, floor))
+            found[self.channels] = np.maximum(found[self.channels], white_noise_std(values, self.settings))
         return self._with_given_noise(found, np.arange(2 * self.coordinates))
 
-    def _noise_model(self, floor: float) -> NoiseModel:
-        # At a low sample rate what is left of the motion itself grows with speed like a jitter's noise does.
-        slow = self.episodes[0].period_s > SLOWEST_JITTER_S
+    def _noise_model(self) -> NoiseModel:
+        slow = self.episodes[0].period_s > self.settings.slowest_jitter_s
         if self.known_std is not None or self.exact or slow:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
@@ -174,7 +162,7 @@ class Problem:
         timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
         columns = self.channels[timed]
         positions = [e.position[:, columns] for e in self.episodes]
-        moved = noise_model(positions, [s.velocity[:, columns] for s in self.starts], floor)
+        moved = noise_model(positions, [s.velocity[:, columns] for s in self.starts], self.settings)
         std = self.noise_std[self.channels]
         std[timed] = moved.position_std
         return NoiseModel(self._with_given_noise(std, self.channels), moved.timing_std_s)
@@ -211,6 +199,17 @@ class Problem:
         ]
         return other
 
+    def on(self, episodes: Sequence[Episode], known_std: FloatArray | None) -> Problem:
+        """Return the problem of other recordings; noise is estimated anew, simulators are shared.
+
+        Args:
+            episodes: The recordings.
+            known_std: See :class:`Problem`.
+        """
+        other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
+        other._batches = self._batches
+        return other
+
     def with_robot(self, robot: RobotModel) -> Problem:
         """Return the problem with another model of the same robot; all else is shared."""
         other = copy.copy(self)
@@ -230,7 +229,7 @@ class Problem:
 
     @property
     def coordinates(self) -> int:
-        """Chart coordinates C of a state."""
+        """Tangent coordinates C of a state."""
         return int(self.episodes[0].position.shape[1])
 
     @property
@@ -301,10 +300,11 @@ class Problem:
         """Return what is known of each state without prediction: mean and std, (T, 2 C), and what counts."""
         episode, C = self.episodes[index], self.coordinates
         T = len(episode.sample)
-        weak = np.array([VELOCITY_PRIOR_STD[unit] for unit in self.robot.coordinate_units])
+        weak = np.array([self.settings.velocity_prior_std[unit] for unit in self.robot.coordinate_units])
         # The weak prior on velocities is centred on zero; it only guards the inverse.
         mean = np.concatenate([episode.position, np.zeros((T, C))], axis=1)
-        spread = np.concatenate([np.full((T, C), UNSEEN_STD), np.repeat(weak[None], T, axis=0)], axis=1)
+        unseen = np.full((T, C), self.settings.unseen_std)
+        spread = np.concatenate([unseen, np.repeat(weak[None], T, axis=0)], axis=1)
         counts = np.concatenate([np.ones(C, dtype=bool), np.zeros(C, dtype=bool)])
         if episode.estimate_std is not None:
             estimate = np.broadcast_to(episode.estimate_std, (T, 2 * C))

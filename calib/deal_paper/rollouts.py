@@ -9,14 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import ADVANCE_S
+from deal_hw.calib.data.innovations import early_setpoints
 from deal_hw.calib.data.problem import Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.recordings.episode import Episode
-from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray, IntArray
 
 PopulationPolicy = Callable[[FloatArray, FloatArray, int], FloatArray]
@@ -124,28 +123,17 @@ def rollout_population(
     return _closed_loop(batch, episode, members, ticks, policy)
 
 
-def _physics_steps(batch: ServoBatch, episode: Episode, path: FloatArray) -> FloatArray:
-    # A physics step may be several device periods (the paper's 5 ms) or a part of one; the set-point is
-    # sampled.
-    ratio = batch.robot.step_s / episode.step_s
-    if ratio >= 1:
-        return path[:, :: round(ratio)]
-    return np.repeat(path, round(1 / ratio), axis=1)
-
-
 def _replay(
     batch: ServoBatch, episode: Episode, members: Members, ticks: Ticks
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    ahead = round(ADVANCE_S / episode.step_s)
-    late = setpoints(batch, episode, members.latency_s + ahead * episode.step_s)
-    path = np.concatenate([late[:, ahead:], np.repeat(late[:, -1:], ahead, axis=1)], axis=1)
+    path = early_setpoints(batch, episode, members.latency_s)
     N, T, J = batch.count, len(ticks), episode.position.shape[1]
     position, velocity = np.empty((N, T + 1, J)), np.empty((N, T + 1, J))
     position[:, 0], velocity[:, 0] = batch.position, batch.velocity
     every = round((ticks.start[1] - ticks.start[0]) * episode.step_s / batch.robot.step_s)
     for begin, end in zip(ticks.changes, (*ticks.changes[1:], T), strict=True):
         _send(batch, episode, int(ticks.start[begin]))
-        control = _physics_steps(batch, episode, path[:, ticks.start[begin] : ticks.start[end]])
+        control = on_physics_steps(batch, path[:, ticks.start[begin] : ticks.start[end]], episode.step_s)
         moved = batch.advance(control, every)
         position[:, begin + 1 : end + 1], velocity[:, begin + 1 : end + 1] = moved
         # `advance` sees a divergence only in the stretch in which it happens.
@@ -164,27 +152,16 @@ def _closed_loop(
     action = np.empty((N, T, A))
     position[:, 0], velocity[:, 0] = batch.position, batch.velocity
     period = int(ticks.start[1] - ticks.start[0])
-    begin_setpoint = np.repeat(episode.start_setpoint[None], N, axis=0)
-    now = begin_setpoint
-    # The undelayed set-point of every device period; a latency then looks back into it.
-    path = np.empty((N, T * period, A))
-    rate = batch.servo_factor("servo_speed_limit") * episode.step_s
-    # A causal simulator cannot act before it is commanded.
-    lag = np.maximum(batch.lag_s(members.latency_s), 0.0) / episode.step_s
-    reach = int(np.ceil(lag.max())) + 1
+    loop = ClosedLoop(batch, period, episode.step_s)
+    loop.restart(np.repeat(episode.start_setpoint[None], N, axis=0), members.latency_s)
+    speed = batch.servo_factor("servo_speed_limit") * episode.step_s
     for t in range(T):
         at = int(ticks.start[t])
         if t in ticks.changes:
             _send(batch, episode, at)
         action[:, t] = policy(position[:, t], velocity[:, t], t)
-        span = slice(t * period, (t + 1) * period)
-        target = np.repeat(action[:, t, None], period, axis=1)
-        path[:, span] = slew(now, target, rate[:, None] * episode.speed_limit[None, at : at + period])
-        now = path[:, span.stop - 1]
-        since = max(span.start - reach, 0)
-        before = begin_setpoint if since == 0 else path[:, since - 1]
-        late = delay(path[:, since : span.stop], lag, before)[:, span.start - since :]
-        moved = batch.advance(_physics_steps(batch, episode, late))
+        rate = speed[:, None] * episode.speed_limit[None, at : at + period]
+        moved = loop.advance(action[:, t], rate)
         position[:, t + 1], velocity[:, t + 1] = moved[0][:, 0], moved[1][:, 0]
         bad = ~np.isfinite(position[:, t]).all(axis=1)
         position[bad, t + 1], velocity[bad, t + 1] = np.nan, np.nan
@@ -244,7 +221,7 @@ def transitions(position: FloatArray, velocity: FloatArray, action: FloatArray) 
 def demonstration(problem: Problem, index: int, ticks: Ticks) -> npt.NDArray[np.float32]:
     """Return the recording's own transitions D_T, (T, inputs), not yet standardised.
 
-    Noisy positions are smoothed first (:func:`deal_hw.calib.data.smoothing.smooth_states`), which helps the
+    Noisy positions are smoothed first (:func:`deal_hw.calib.data.noise.smooth_states`), which helps the
     paper's method.
     """
     starts, episode = problem.starts[index], problem.episodes[index]

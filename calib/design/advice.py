@@ -1,4 +1,4 @@
-"""What to record next: which excitation tells most about what a recording left open.
+"""What to record next: which excitation is most informative about what a recording left open.
 
 All figures are computed: each excitation of a menu is simulated at the estimate, and its Fisher information
 is added to what the calibration knows already.
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.design.experiment_design import Experiment, MakeBehaviour, Prediction
 from deal_hw.calib.uncertainty.intervals import IDENTIFIABLE_STD, WEAK_SHARE
 from deal_hw.calibration import CalibrationResult
@@ -26,17 +27,43 @@ from deal_hw.control.excitation_plan import (
     make_plan,
     words,
 )
-from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError
+from deal_hw.description import RobotDescription, SensorModel
+from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
-WORTH = 0.7
-"""An excitation is worth naming where it takes a standard deviation to this share or less."""
 
-LOW_EFFORT = 0.15
-BALANCE_S = 0.6
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdviceSettings:
+    """Which excitations are tried, and when one is advised.
+
+    Attributes:
+        worth: An excitation is worth naming where it takes a standard deviation to this share or less.
+        seconds: Length of an excitation [s].
+        balance_s: So long the robot is balanced first, at most a quarter of the whole [s].
+        amplitudes: Shares of the joints' ranges.
+        low_effort: A low effort limit, as a share of the usual one: it shows what an effort is worth.
+        high_speed: A high speed limit, as a multiple of the usual one.
+        beyond: A joint of a robot without limits may leave its recorded range by this share of it on either
+            side.
+        faster: It may be so many times as fast as in the recordings; what is asked of it is half of that.
+        seed: Fixes what is random in excitations.
+    """
+
+    worth: float = 0.7
+    seconds: float = 4.0
+    balance_s: float = 0.6
+    amplitudes: tuple[float, ...] = (1.0, 0.4)
+    low_effort: float = 0.15
+    high_speed: float = 2.5
+    beyond: float = 0.25
+    faster: float = 5.0
+    seed: int = 1
+
+
+SETTINGS = AdviceSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,35 +98,26 @@ class Advice:
         }
 
 
-def excitation_menu(
-    description: RobotDescription, seconds: float = 4.0, *, balances: bool = False, seed: int = 1
-) -> dict[str, ExcitationPlan]:
-    """Return excitations that a robot can be recorded with, by what they are in words."""
-    found = menu_designs(description, seconds, balances=balances, seed=seed)
-    return {in_words: make_plan(description, design) for in_words, design in found.items()}
-
-
 def menu_designs(
-    description: RobotDescription, seconds: float = 4.0, *, balances: bool = False, seed: int = 1
+    description: RobotDescription, balances: bool = False, settings: AdviceSettings = SETTINGS
 ) -> dict[str, ExcitationDesign]:
-    """Return what the menu's excitations are made from, by what they are in words.
+    """Return excitations that a robot can be recorded with, by what they are in words.
 
     Args:
         description: The robot.
-        seconds: Length of each.
         balances: Whether they begin with a balancing policy.
-        seed: Fixes what is random in them.
+        settings: Which.
     """
-    balance_s = min(BALANCE_S, 0.25 * seconds) if balances else 0.0
+    balance_s = min(settings.balance_s, 0.25 * settings.seconds) if balances else 0.0
     top = min(5.0, description.control_rate_hz / 6)
     designs = [
         ExcitationDesign(
-            family=family, seconds=seconds, balance_s=balance_s, amplitude=amplitude, high_hz=top, split=1.0,
-            effort=effort, speed=speed, seed=seed,
+            family=family, seconds=settings.seconds, balance_s=balance_s, amplitude=amplitude, high_hz=top,
+            split=1.0, effort=effort, speed=speed, seed=settings.seed,
         )
         for family in ("multisine", "chirp", "steps")
-        for amplitude in (1.0, 0.4)
-        for effort, speed in _variants(description)
+        for amplitude in settings.amplitudes
+        for effort, speed in _variants(description, settings)
     ]  # fmt: skip
     return {words(design): design for design in designs}
 
@@ -114,15 +132,17 @@ def options(design: ExcitationDesign) -> str:
     )
 
 
-def _variants(description: RobotDescription) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+def _variants(
+    description: RobotDescription, settings: AdviceSettings
+) -> list[tuple[tuple[float, float], tuple[float, float]]]:
     """Return factors on effort and speed limit that are worth trying: as it is, low effort, high speed."""
     one = (1.0, 1.0)
     found = [(one, one)]
     fast = 1.0
     if np.isfinite(description.speed_limit).all():
-        fast = min(2.5, largest_factor(description.speed_limit, description.limits.speed))
+        fast = min(settings.high_speed, largest_factor(description.speed_limit, description.limits.speed))
     if description.actuation == "position" and np.isfinite(description.effort_limit).all():
-        found.append(((LOW_EFFORT, 1.0), (fast, 1.0)))
+        found.append(((settings.low_effort, 1.0), (fast, 1.0)))
     if fast > 1.0:
         found.append((one, (fast, 1.0)))
     return found
@@ -131,10 +151,9 @@ def _variants(description: RobotDescription) -> list[tuple[tuple[float, float], 
 def advise(
     robot: RobotModel,
     result: CalibrationResult,
-    menu: Mapping[str, ExcitationPlan] | None = None,
     *,
     balance: Callable[[], Behaviour] | None = None,
-    seconds: float = 4.0,
+    settings: AdviceSettings = SETTINGS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
     """Say for each weak or unidentified parameter of a result what to record next.
@@ -142,9 +161,8 @@ def advise(
     Args:
         robot: The nominal model, with a fixed base.
         result: What the calibration found.
-        menu: Excitations that can be recorded; :func:`excitation_menu` by default.
         balance: Makes the policy that balances; None for robots that stand by themselves.
-        seconds: Length of the excitations of the default menu.
+        settings: Which excitations are tried.
         threads: Simulation threads.
     """
     space, K = result.space, len(result.space)
@@ -155,28 +173,18 @@ def advise(
     open_ = [k for k in range(K) if not _told(space, k, float(before[k])) or _said_weak(result, k)]
     if not open_:
         return ()
-    plans = (
-        menu
-        if menu is not None
-        else excitation_menu(robot.description, seconds, balances=balance is not None)
-    )
-    predictions = predict_menu(robot, known, before, plans, balance=balance, threads=threads)
-    usable = {name: found for name, found in predictions.items() if found.usable}
-    designs = menu_designs(robot.description, seconds, balances=balance is not None)
+    designs = menu_designs(robot.description, balance is not None, settings)
+    menu = {name: make_plan(robot.description, design) for name, design in designs.items()}
+    predictions = predict_menu(robot, known, before, menu, balance=balance, threads=threads)
     # What the model lacks will be in the next recording, too: it widens that interval like this one.
     widened = result.provenance.get("clustered", {}).get("widened", {})
-    found = [
-        _advice(
-            space, k, float(before[k]), usable, len(predictions), max(widened.get(space.names[k], 1.0), 1.0)
-        )
-        for k in open_
-    ]
-    return tuple(
-        dataclasses.replace(one, command=options(designs[one.excitation]))
-        if one.excitation in designs
-        else one
-        for one in found
-    )
+    found = []
+    for k in open_:
+        wider = max(widened.get(space.names[k], 1.0), 1.0)
+        one = _advice(space, k, float(before[k]), predictions, wider, settings.worth)
+        command = options(designs[one.excitation]) if one.excitation else ""
+        found.append(dataclasses.replace(one, command=command))
+    return tuple(found)
 
 
 def predict_menu(
@@ -228,18 +236,24 @@ def _told(space: ParameterSpace, k: int, std: float) -> bool:
 
 
 def _advice(
-    space: ParameterSpace, k: int, before: float, usable: Mapping[str, Prediction], tried: int, widened: float
+    space: ParameterSpace,
+    k: int,
+    before: float,
+    predictions: Mapping[str, Prediction],
+    widened: float,
+    worth: float,
 ) -> Advice:
     name, prior = space.names[k], float(space.width[k] / np.sqrt(12.0))
+    usable = {name: found for name, found in predictions.items() if found.usable}
     if not usable:
         sentence = (
-            f"{name} is open at {_amount(space, k, before)}: none of {tried} excitations keeps the limits in "
-            "the simulation with the values found, so no advice can be computed"
+            f"{name} is open at {_amount(space, k, before)}: none of {len(predictions)} excitations keeps "
+            "the limits in the simulation with the values found, so no advice can be computed"
         )
         return Advice(name, before, before, "", sentence)
     best = min(usable, key=lambda name: float(usable[name].std[k]))
     after = min(widened * float(usable[best].std[k]), before)
-    if after > WORTH * before:
+    if after > worth * before:
         how = (
             "measure it by other means (scale, ruler, stall torque), or give what it is bound to as known"
             if before > WEAK_SHARE * prior
@@ -262,6 +276,98 @@ def _amount(space: ParameterSpace, k: int, std: float) -> str:
     if space.log_scale[k]:
         return f"{100 * std:.2g} %"
     return f"{std:.2g} {space.free[k].unit}"
+
+
+def next_recordings(
+    robot: RobotModel,
+    result: CalibrationResult,
+    episodes: Sequence[Episode],
+    *,
+    balance: Callable[[], Behaviour] | None = None,
+    settings: AdviceSettings = SETTINGS,
+    threads: int | None = None,
+) -> tuple[Advice, ...]:
+    """Say for each weak or unidentified parameter what to record next.
+
+    A robot whose description knows no limits is kept to what its recordings covered; the noise that is
+    reckoned with is what the calibration found to be left.
+
+    Args:
+        robot: The nominal model.
+        result: What the calibration found.
+        episodes: The fitted recordings.
+        balance: Makes the policy that balances; None for robots that stand by themselves.
+        settings: Which excitations are tried.
+        threads: Simulation threads.
+    """
+    open_ = [n for n, v in zip(result.space.names, result.verdicts, strict=False) if v != "identifiable"]
+    if not open_:
+        return ()
+    if robot.base is not None:
+        return _without(open_, "motions are planned for a fixed base only; record it held by its trunk")
+    try:
+        described = _described(robot, result, episodes, settings, threads)
+        known = dataclasses.replace(robot, description=described)
+        found = advise(known, result, balance=balance, settings=settings, threads=threads)
+    except DealHwError as err:
+        return _without(open_, str(err))
+    # A parameter that the verdict holds for identifiable needs no recording, wide as it may be.
+    return tuple(one for one in found if one.parameter in open_)
+
+
+def _without(names: Sequence[str], why: str) -> tuple[Advice, ...]:
+    return tuple(
+        Advice(name, float("nan"), float("nan"), "", f"{name} is open, and no advice was computed: {why}")
+        for name in names
+    )
+
+
+def _described(
+    robot: RobotModel,
+    result: CalibrationResult,
+    episodes: Sequence[Episode],
+    settings: AdviceSettings,
+    threads: int | None,
+) -> RobotDescription:
+    """Return the robot with the noise that is left, and with its recordings' limits where it has none."""
+    description = robot.description
+    problem = Problem(robot, result.space, episodes, threads=threads)
+    noise = _noise(problem, result)
+    sensor = SensorModel(
+        noise=tuple(map(float, noise)), resolution=(0.0,) * len(noise), velocity_window_s=0.0
+    )
+    description = dataclasses.replace(description, sensor=sensor)
+    if np.isfinite(np.array(description.limits.target)).all():
+        return description
+    targets = np.concatenate([e.target for e in episodes])
+    positions = np.concatenate([e.position[e.usable] for e in episodes])
+    low, high = np.nanmin(targets, axis=0), np.nanmax(targets, axis=0)
+    least, most = np.nanmin(positions, axis=0), np.nanmax(positions, axis=0)
+    spare = settings.beyond * (most - least)
+    fastest = np.max([np.abs(s.velocity).max(axis=0) for s in problem.starts], axis=0)
+    home = 0.5 * (least + most)
+    if description.actuation == "position":
+        home[list(description.actuated_index)] = 0.5 * (low + high)
+    limits = dataclasses.replace(
+        description.limits,
+        target=_pairs(low, high),
+        trip_position=_pairs(least - spare, most + spare),
+        trip_velocity=tuple(map(float, settings.faster * fastest)),
+    )
+    return dataclasses.replace(description, limits=limits, default_position=tuple(map(float, home)))
+
+
+def _noise(problem: Problem, result: CalibrationResult) -> FloatArray:
+    """Return what a position may be off, (J,): noise of the sensor, and what the model leaves unexplained."""
+    joints = len(problem.robot.description.joint_names)
+    used = result.provenance.get("noise_std", ())
+    noise = np.array(used) if len(used) == joints else problem.noise_std[:joints]
+    left = result.chi2 if np.isfinite(result.chi2) else 1.0
+    return np.asarray(noise * np.sqrt(max(left, 1.0)))
+
+
+def _pairs(low: FloatArray, high: FloatArray) -> tuple[tuple[float, float], ...]:
+    return tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
 
 
 def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]:

@@ -19,13 +19,10 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import ClosedLoop
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
-
-TRIP_SHARE = 0.85
-"""Share of the ranges that trip which a trial may use. A few dozen simulated robots are not all there are: a
-design that used the whole range on 48 of them tripped on one of the first three emulated ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +72,9 @@ class TrialRunner:
         scenario: The members.
         seconds: Length of a run [s].
         threads: Simulation threads; None for all CPUs.
+        trip_share: Share of the ranges that trip which a trial may use. A few dozen simulated robots are not
+            all there are: a design that used the whole range on 48 of them tripped on one of the first three
+            emulated ones.
 
     Raises:
         ConfigurationError: The robot's base floats, or its rates do not divide.
@@ -87,6 +87,7 @@ class TrialRunner:
         scenario: Scenario,
         seconds: float,
         threads: int | None = None,
+        trip_share: float = 0.85,
     ) -> None:
         description = robot.description
         if robot.base is not None:
@@ -94,9 +95,8 @@ class TrialRunner:
                 f"robot {description.name!r} has a floating base; excitations are designed for robots on a "
                 "stand (such as go2_suspended), where falling over is no matter"
             )
-        self._robot, self._scenario = robot, scenario
+        self._robot, self._scenario, self._trip_share = robot, scenario, trip_share
         self._device_s = 1.0 / description.device_rate_hz
-        self._repeat = max(round(self._device_s / robot.step_s), 1)
         self._period = description.steps_per_control
         self._stride = round(description.device_rate_hz / description.state_rate_hz)
         if self._period % self._stride:
@@ -122,15 +122,19 @@ class TrialRunner:
             behaviour.reset()
         self._batch.set_parameters(scenario.theta)
         self._batch.set_state(scenario.position, np.zeros_like(scenario.position))
-        loop = _Loop(description, scenario.position)
+        loop = _Loop(description, scenario.position, self._trip_share)
         positions, velocities = [self._batch.position[:, None]], [self._batch.velocity[:, None]]
-        path = _Path(self._batch, scenario, self._ticks * self._period, self._device_s)
+        path = ClosedLoop(self._batch, self._period, self._device_s)
+        start = scenario.position[:, list(description.actuated_index)]
+        motor = description.actuation == "motor"
+        path.restart(np.zeros_like(start) if motor else start, scenario.latency_s)
+        speed = self._batch.servo_factor("servo_speed_limit")
         for tick in range(self._ticks):
             sent = loop.command(behaviours, positions[-1][:, -1], velocities[-1][:, -1], tick)
             lead = sent[next((n for n, why in enumerate(loop.tripped) if not why), 0)]
             self._batch.set_sent(lead.stiffness, lead.damping, lead.effort_limit)
-            control = path.extend(np.stack([c.position_target for c in sent]), lead.speed_limit, self._period)
-            x, v = self._batch.advance(np.repeat(control, self._repeat, axis=1), self._stride * self._repeat)
+            rate = None if motor else speed * lead.speed_limit * self._device_s
+            x, v = path.advance(np.stack([c.position_target for c in sent]), rate, self._stride)
             positions.append(x)
             velocities.append(v)
             loop.watch(x, v)
@@ -160,47 +164,11 @@ class TrialRunner:
         return Trial(episode, loop.tripped[n], loop.clipped[n])
 
 
-class _Path:
-    """The set-points of all members so far: slewed at their own speed limits, then late by their latency."""
-
-    def __init__(self, batch: ServoBatch, scenario: Scenario, steps: int, step_s: float) -> None:
-        description = batch.robot.description
-        self._motor = description.actuation == "motor"
-        self._step_s = step_s
-        self._factor = batch.servo_factor("servo_speed_limit")
-        start = scenario.position[:, list(description.actuated_index)]
-        self._now = np.zeros_like(start) if self._motor else start.copy()
-        late = batch.lag_s(scenario.latency_s) / step_s
-        # (N, 1, 1), or (N, 1, A) where actuators have delays of their own.
-        late = late.reshape(len(late), 1, -1)
-        self._whole = np.floor(late).astype(int)
-        self._part = late - self._whole
-        self._margin = int(self._whole.max()) + 1
-        self._done = self._margin
-        self._path = np.repeat(self._now[:, None], self._margin + steps, axis=1)
-
-    def extend(self, target: FloatArray, speed_limit: FloatArray, steps: int) -> FloatArray:
-        """Return the late set-points of the next steps, (N, steps, A), for targets (N, A)."""
-        ahead = np.repeat(target[:, None], steps, axis=1)
-        if not self._motor:
-            gap = (target - self._now)[:, None]
-            rate = (self._factor * speed_limit)[:, None] * self._step_s
-            reach = rate * np.arange(1, steps + 1)[:, None]
-            ahead = self._now[:, None] + np.clip(gap, -reach, reach)
-        self._path[:, self._done : self._done + steps] = ahead
-        self._now = ahead[:, -1]
-        index = self._done + np.arange(steps)[:, None] - self._whole
-        self._done += steps
-        late = np.take_along_axis(self._path, index, axis=1)
-        later = np.take_along_axis(self._path, index - 1, axis=1)
-        return np.asarray((1 - self._part) * late + self._part * later)
-
-
 class _Loop:
     """Behaviours behind the safety filter, and what the safety module would have said."""
 
-    def __init__(self, description: RobotDescription, position: FloatArray) -> None:
-        self._description = description
+    def __init__(self, description: RobotDescription, position: FloatArray, trip_share: float) -> None:
+        self._description, self._trip_share = description, trip_share
         self._index = list(description.actuated_index)
         self._filters = [SafetyFilter(description) for _ in position]
         self._start = position[:, self._index]
@@ -220,9 +188,10 @@ class _Loop:
                 # What a robot would do after a trip is of no interest: its trial is not used.
                 sent.append(self.sent[-1][n])
                 continue
-            wanted = behaviour.command(_state(position[n], velocity[n], tick), time_s)
-            measured, moving = position[n][self._index], velocity[n][self._index]
-            sent.append(self._filtered(n, wanted, measured, moving, time_s))
+            x, v = position[n], velocity[n]
+            state = RobotState(x, v, np.zeros_like(x), 0, 0, tick, -1, -1, Status.ARMED)
+            wanted = behaviour.command(state, time_s)
+            sent.append(self._filtered(n, wanted, x[self._index], v[self._index], time_s))
         running = [command for command, why in zip(sent, self.tripped, strict=True) if not why]
         if any(not _same_limits(running[0], other) for other in running):
             raise ConfigurationError("behaviours that run side by side must send the same gains and limits")
@@ -232,7 +201,8 @@ class _Loop:
     def _filtered(
         self, n: int, wanted: JointCommand, measured: FloatArray, velocity: FloatArray, time_s: float
     ) -> JointCommand:
-        if not is_finite_target(wanted):
+        # The speed limit need not be finite, without a set-point generator.
+        if not is_finite(dataclasses.replace(wanted, speed_limit=np.zeros_like(wanted.speed_limit))):
             self.tripped[n] = "the behaviour asked for a command that is not finite"
             return dataclasses.replace(wanted, position_target=self._previous[n])
         share = 1.0
@@ -254,9 +224,9 @@ class _Loop:
         low, high = np.array(limits.trip_position).T
         bounded = np.isfinite(low) & np.isfinite(high)
         width = np.subtract(high, low, out=np.zeros_like(low), where=bounded)
-        spare = 0.5 * (1 - TRIP_SHARE) * width
+        spare = 0.5 * (1 - self._trip_share) * width
         low, high = low + spare, high - spare
-        fast = TRIP_SHARE * np.array(limits.trip_velocity)
+        fast = self._trip_share * np.array(limits.trip_velocity)
         for n in range(len(position)):
             if self.tripped[n]:
                 continue
@@ -271,17 +241,8 @@ class _Loop:
                 self.tripped[n] = f"{names[int(np.argmax(over))]} moved nearly too fast"
 
 
-def is_finite_target(command: JointCommand) -> bool:
-    """Return whether a command is finite; its speed limit need not be, without a set-point generator."""
-    return is_finite(dataclasses.replace(command, speed_limit=np.zeros_like(command.speed_limit)))
-
-
 def _same_limits(a: JointCommand, b: JointCommand) -> bool:
     return all(
         np.array_equal(getattr(a, name), getattr(b, name))
         for name in ("stiffness", "damping", "effort_limit", "speed_limit")
     )
-
-
-def _state(position: FloatArray, velocity: FloatArray, tick: int) -> RobotState:
-    return RobotState(position, velocity, np.zeros_like(position), 0, 0, tick, -1, -1, Status.ARMED)

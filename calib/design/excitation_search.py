@@ -1,10 +1,11 @@
-"""The most telling excitation inside the limits: random designs, then one coordinate at a time."""
+"""The most informative excitation inside the limits: random designs, then one coordinate at a time."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -24,12 +25,6 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, ConfigurationError
 
 Criterion = Literal["determinant", "mean"]
-LOWEST_EFFORT = 0.08
-"""Least factor on the effort limit that is tried: below it joints hardly move against their friction."""
-
-TOP_HZ = 8.0
-TICKS_A_CYCLE = 6.0
-"""The greatest frequency has at least so many commands a cycle."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +41,12 @@ class SearchSettings:
     """Designs that are tried again on the members of the confirmation, where there is one."""
     criterion: Criterion = "determinant"
     """determinant: most information in all (D-optimal); mean: least mean standard deviation (A-optimal)."""
+    lowest_effort: float = 0.08
+    """Least factor on the effort limit that is tried: below it joints hardly move against their friction."""
+    top_hz: float = 8.0
+    """Greatest frequency that is tried [Hz]."""
+    ticks_a_cycle: float = 6.0
+    """The greatest frequency has at least so many commands a cycle."""
 
     def __post_init__(self) -> None:
         if self.candidates < 1 or self.finalists < 1 or self.rounds < 0 or self.confirmed < 1:
@@ -75,17 +76,6 @@ class Optimum:
     trace: tuple[float, ...]
 
 
-@dataclass(slots=True)
-class _Count:
-    tried: int = 0
-    tripped: dict[str, int] = field(default_factory=dict)
-
-    def note(self, prediction: Prediction) -> None:
-        self.tried += 1
-        if prediction.tripped:
-            self.tripped[prediction.tripped] = self.tripped.get(prediction.tripped, 0) + 1
-
-
 def search_excitation(
     experiment: Experiment,
     rng: np.random.Generator,
@@ -96,7 +86,7 @@ def search_excitation(
     confirmation: Experiment | None = None,
     notify: Callable[[int, int, str], None] | None = None,
 ) -> Optimum:
-    """Search the most telling excitation that keeps every member inside the limits.
+    """Search the most informative excitation that keeps every member inside the limits.
 
     Args:
         experiment: Predicts what a candidate tells.
@@ -114,23 +104,23 @@ def search_excitation(
     """
     wanted = settings or SearchSettings()
     description = experiment.robot.description
-    count = _Count()
-    designs = usual_designs(description, experiment.seconds, balance is not None)
-    designs += [
-        _draw(description, experiment.seconds, balance is not None, rng) for _ in range(wanted.candidates)
-    ]
+    tried, tripped = 0, Counter[str]()
+    designer = _Designer(description, experiment.seconds, balance is not None, wanted)
+    designs = designer.usual() + [designer.draw(rng) for _ in range(wanted.candidates)]
     total = len(designs) + wanted.rounds + (wanted.confirmed if confirmation is not None else 0)
 
     def predict(design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment) -> Prediction:
+        nonlocal tried
         plan = make_plan(description, design)
         found = on.predict(
             lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None),
             lambda bound: score(bound, wanted) > bar,
         )
-        count.note(found)
+        tried += 1
+        tripped.update(filter(None, [found.tripped]))
         if notify is not None:
             outcome = "less than others" if found.beaten else found.tripped or f"{found.gain:.1f} nats"
-            notify(count.tried, total, f"{design.family}: {outcome}")
+            notify(tried, total, f"{design.family}: {outcome}")
         return found
 
     finals: list[tuple[Prediction, ExcitationDesign]] = []
@@ -141,16 +131,16 @@ def search_excitation(
             finals = sorted([*finals, (found, design)], key=lambda pair: -score(pair[0], wanted))
             finals = finals[: wanted.finalists]
     if not finals:
-        reasons = ", ".join(f"{n} x {why}" for why, n in count.tripped.items())
+        reasons = ", ".join(f"{n} x {why}" for why, n in tripped.items())
         raise CalibrationError(
-            f"none of {count.tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
+            f"none of {tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
             "draw from narrower ranges (--xi, --calibration), or try more (--candidates)"
         )
     best, design = finals[0]
     trace = [score(best, wanted)]
     steps = [(best, design)]
     for k in range(wanted.rounds):
-        moved = _moved(description, design, k, balance is not None, rng)
+        moved = designer.moved(design, k, rng)
         found = predict(moved, score(best, wanted))
         if score(found, wanted) > score(best, wanted):
             best, design = found, moved
@@ -177,8 +167,8 @@ def search_excitation(
         plan=dataclasses.replace(plan, predicted=predicted),
         prediction=best,
         references={name: judge.predict(make) for name, make in (references or {}).items()},
-        tried=count.tried,
-        tripped=count.tripped,
+        tried=tried,
+        tripped=tripped,
         trace=tuple(trace),
     )
 
@@ -190,87 +180,78 @@ def score(prediction: Prediction, settings: SearchSettings) -> float:
     return prediction.gain if settings.criterion == "determinant" else -float(np.mean(prediction.std))
 
 
-def usual_designs(description: RobotDescription, seconds: float, balances: bool) -> list[ExcitationDesign]:
-    """Return designs that are known to be fair, such as the profile `rich`: the search starts from these."""
-    effort, speed = _factor_ranges(description)
-    low, fast = max(0.15, effort[0]), min(2.5, speed[1])
-    top = _top_hz(description)
-    fair: tuple[tuple[Family, float], ...] = (("steps", 0.5), ("multisine", 1.0), ("chirp", 1.0))
-    return [
-        ExcitationDesign(
-            family=family, seconds=seconds, amplitude=amplitude, high_hz=min(4.0, top), low_hz=0.3,
-            balance_s=min(0.6, 0.25 * seconds) if balances else 0.0, effort=(1.0, low), speed=(1.0, fast),
+class _Designer:
+    """Makes candidates inside a robot's limits."""
+
+    def __init__(
+        self, description: RobotDescription, seconds: float, balances: bool, settings: SearchSettings
+    ) -> None:
+        self._seconds, self._balances = seconds, balances
+        self._top_hz = min(settings.top_hz, description.control_rate_hz / settings.ticks_a_cycle)
+        # Factors on effort and speed limits; 1 to 1 where there is no such limit.
+        self._effort, self._speed = (settings.lowest_effort, 1.0), (1.0, 1.0)
+        if description.actuation != "position" or not np.isfinite(description.effort_limit).all():
+            self._effort = (1.0, 1.0)
+        if np.isfinite(description.speed_limit).all():
+            self._speed = (0.4, largest_factor(description.speed_limit, description.limits.speed))
+
+    def usual(self) -> list[ExcitationDesign]:
+        """Return designs that are known to be fair, such as the profile `rich`: the search starts here."""
+        low, fast = max(0.15, self._effort[0]), min(2.5, self._speed[1])
+        fair: tuple[tuple[Family, float], ...] = (("steps", 0.5), ("multisine", 1.0), ("chirp", 1.0))
+        balance_s = min(0.6, 0.25 * self._seconds) if self._balances else 0.0
+        return [
+            ExcitationDesign(
+                family=family, seconds=self._seconds, amplitude=amplitude, high_hz=min(4.0, self._top_hz),
+                low_hz=0.3, balance_s=balance_s, effort=(1.0, low), speed=(1.0, fast),
+            )
+            for family, amplitude in fair
+        ]  # fmt: skip
+
+    def draw(self, rng: np.random.Generator) -> ExcitationDesign:
+        """Return a random design."""
+        shortest = _log_uniform(rng, 0.06, 0.25)
+        top = self._top_hz
+        return ExcitationDesign(
+            family=FAMILIES[int(rng.integers(len(FAMILIES)))],
+            seconds=self._seconds,
+            amplitude=float(rng.uniform(0.25, 1.0)),
+            low_hz=_log_uniform(rng, 0.2, 1.0),
+            high_hz=_log_uniform(rng, 0.25 * top, top),
+            tilt=float(rng.choice((0.0, 0.5, 1.0))),
+            law="log" if rng.random() < 0.5 else "linear",
+            arrangement="staggered" if rng.random() < 0.5 else "one-by-one",
+            hold_s=(shortest, shortest * float(rng.uniform(1.2, 4.0))),
+            balance_s=float(rng.choice((0.2, 0.4, 0.6))) if self._balances else 0.0,
+            split=float(rng.choice((0.35, 0.5, 0.65))),
+            effort=(1.0, _log_uniform(rng, *self._effort) if rng.random() < 0.75 else 1.0),
+            speed=(1.0, _log_uniform(rng, *self._speed) if rng.random() < 0.75 else 1.0),
+            seed=int(rng.integers(2**31)),
         )
-        for family, amplitude in fair
-    ]  # fmt: skip
 
-
-def _top_hz(description: RobotDescription) -> float:
-    return min(TOP_HZ, description.control_rate_hz / TICKS_A_CYCLE)
+    def moved(self, design: ExcitationDesign, k: int, rng: np.random.Generator) -> ExcitationDesign:
+        """Return the design with one coordinate changed: the k-th, round and round."""
+        factor = float(np.exp(rng.choice((-1.0, 1.0)) * rng.uniform(0.15, 0.6)))
+        high = float(np.clip(design.high_hz * factor, 0.5, self._top_hz))
+        low = float(np.clip(design.low_hz * factor, 0.1, 0.8 * design.high_hz))
+        other = self.draw(rng)
+        own: dict[str, list[dict[str, object]]] = {
+            "steps": [{"hold_s": tuple(s * factor for s in design.hold_s)}, {"hold_s": other.hold_s}],
+            "chirp": [{"high_hz": high}, {"low_hz": low}, {"law": other.law}],
+            "multisine": [{"high_hz": high}, {"low_hz": low}, {"tilt": other.tilt}],
+        }
+        moves: list[dict[str, object]] = [
+            {"amplitude": float(np.clip(design.amplitude * factor, 0.05, 1.0))},
+            {"seed": other.seed},
+            {"effort": (1.0, float(np.clip(design.effort[1] * factor, *self._effort)))},
+            own[design.family][int(rng.integers(len(own[design.family])))],
+            {"speed": (1.0, float(np.clip(design.speed[1] * factor, *self._speed)))},
+            {"split": float(np.clip(design.split + rng.uniform(-0.2, 0.2), 0.2, 0.8))},
+            {"seed": other.seed},
+            {"balance_s": other.balance_s},
+        ]
+        return dataclasses.replace(design, **moves[k % len(moves)])  # type: ignore[arg-type]
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(max(high, low)))))
-
-
-def _draw(
-    description: RobotDescription, seconds: float, balances: bool, rng: np.random.Generator
-) -> ExcitationDesign:
-    shortest = _log_uniform(rng, 0.06, 0.25)
-    top = _top_hz(description)
-    effort, speed = _factor_ranges(description)
-    return ExcitationDesign(
-        family=FAMILIES[int(rng.integers(len(FAMILIES)))],
-        seconds=seconds,
-        amplitude=float(rng.uniform(0.25, 1.0)),
-        low_hz=_log_uniform(rng, 0.2, 1.0),
-        high_hz=_log_uniform(rng, 0.25 * top, top),
-        tilt=float(rng.choice((0.0, 0.5, 1.0))),
-        law="log" if rng.random() < 0.5 else "linear",
-        arrangement="staggered" if rng.random() < 0.5 else "one-by-one",
-        hold_s=(shortest, shortest * float(rng.uniform(1.2, 4.0))),
-        balance_s=float(rng.choice((0.2, 0.4, 0.6))) if balances else 0.0,
-        split=float(rng.choice((0.35, 0.5, 0.65))),
-        effort=(1.0, _log_uniform(rng, *effort) if rng.random() < 0.75 else 1.0),
-        speed=(1.0, _log_uniform(rng, *speed) if rng.random() < 0.75 else 1.0),
-        seed=int(rng.integers(2**31)),
-    )
-
-
-def _factor_ranges(description: RobotDescription) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ranges of factors on effort and speed limits; 1 to 1 where there is no such limit."""
-    limits = description.limits
-    effort, speed = (LOWEST_EFFORT, 1.0), (1.0, 1.0)
-    if description.actuation != "position" or not np.isfinite(description.effort_limit).all():
-        effort = (1.0, 1.0)
-    if np.isfinite(description.speed_limit).all():
-        speed = (0.4, largest_factor(description.speed_limit, limits.speed))
-    return effort, speed
-
-
-def _moved(
-    description: RobotDescription, design: ExcitationDesign, k: int, balances: bool, rng: np.random.Generator
-) -> ExcitationDesign:
-    """Return the design with one coordinate changed: the k-th, round and round."""
-    top = _top_hz(description)
-    factor = float(np.exp(rng.choice((-1.0, 1.0)) * rng.uniform(0.15, 0.6)))
-    effort, speed = _factor_ranges(description)
-    high = float(np.clip(design.high_hz * factor, 0.5, top))
-    other = _draw(description, design.seconds, balances, rng)
-    band = {"high_hz": high, "low_hz": float(np.clip(design.low_hz * factor, 0.1, 0.8 * design.high_hz))}
-    own: dict[str, list[dict[str, object]]] = {
-        "steps": [{"hold_s": tuple(s * factor for s in design.hold_s)}, {"hold_s": other.hold_s}],
-        "chirp": [{"high_hz": high}, {"low_hz": band["low_hz"]}, {"law": other.law}],
-        "multisine": [{"high_hz": high}, {"low_hz": band["low_hz"]}, {"tilt": other.tilt}],
-    }
-    moves: list[dict[str, object]] = [
-        {"amplitude": float(np.clip(design.amplitude * factor, 0.05, 1.0))},
-        {"seed": other.seed},
-        {"effort": (1.0, float(np.clip(design.effort[1] * factor, *effort)))},
-        own[design.family][int(rng.integers(len(own[design.family])))],
-        {"speed": (1.0, float(np.clip(design.speed[1] * factor, *speed)))},
-        {"split": float(np.clip(design.split + rng.uniform(-0.2, 0.2), 0.2, 0.8))},
-        {"seed": other.seed},
-        {"balance_s": other.balance_s},
-    ]
-    return dataclasses.replace(design, **moves[k % len(moves)])  # type: ignore[arg-type]

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import LATENCY_RANGE_S, Problem, samples_in
+from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.design.closed_loop import Scenario, Trial, TrialRunner
 from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -26,17 +27,26 @@ from deal_hw.types import FloatArray
 MakeBehaviour = Callable[[], Behaviour]
 """Makes one behaviour; every member has its own."""
 
-WINDOW_S = 0.8
-"""Window length of the information: the longest that the polish uses."""
 
-START_STD = 5.0
-"""Start positions vary by so many standard deviations of the sensor."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExperimentSettings:
+    """How excitations are tried.
 
-INNER = (0.1, 0.9)
-"""Without a calibration members are drawn from this part of each range: its corners are no real robots."""
+    Attributes:
+        window_s: Window length of the information: the longest that the refinement uses [s].
+        start_std: Start positions vary by so many standard deviations of the sensor.
+        inner: Without a calibration members are drawn from this part of each range: its corners are no real
+            robots.
+        draws_per_member: So many draws are tried for each member that can be run at all.
+    """
 
-DRAWS_PER_MEMBER = 8
-"""So many draws are tried for each member that can be run at all."""
+    window_s: float = 0.8
+    start_std: float = 5.0
+    inner: tuple[float, float] = (0.1, 0.9)
+    draws_per_member: int = 8
+
+
+SETTINGS = ExperimentSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +122,7 @@ def information(
     trial: Trial,
     theta: FloatArray,
     latency_s: float,
-    *,
-    window_s: float = WINDOW_S,
+    window_s: float = SETTINGS.window_s,
     threads: int | None = None,
 ) -> FloatArray:
     """Return the Fisher information of a recording with the nominal sensor's noise, start states eliminated.
@@ -150,6 +159,7 @@ class Experiment:
         rest: Behaviour that hardly moves the robot; members that it cannot keep inside the limits are drawn
             again, for no excitation could. None to take the first draws.
         threads: Simulation threads.
+        settings: How members are drawn and tried.
 
     Raises:
         CalibrationError: Hardly any draw can be run.
@@ -164,8 +174,9 @@ class Experiment:
         rng: np.random.Generator,
         rest: MakeBehaviour | None = None,
         threads: int | None = None,
+        settings: ExperimentSettings = SETTINGS,
     ) -> None:
-        self.robot, self.space, self.known = robot, known.space, known
+        self.robot, self.space, self.known, self.settings = robot, known.space, known, settings
         self.seconds, self.threads = seconds, threads
         self.prior = Prior.of(known)
         self.refused = 0
@@ -173,15 +184,11 @@ class Experiment:
         self._runner: TrialRunner | None = None
         self._order = list(range(draws))
         self._rest = rest
-        drawn = _draw(robot.description, known, rng, draws)
-        self.scenario = self._runnable(drawn, draws, rest)
+        drawn = _draw(robot.description, known, rng, draws, settings)
+        self.scenario = drawn.part(range(draws)) if rest is None else self._runnable(drawn, draws, rest)
 
-    def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour | None) -> Scenario:
-        if rest is None:
-            return drawn.part(range(draws))
-        trials = TrialRunner(self.robot, self.space, drawn, self.seconds, self.threads).run(
-            [rest() for _ in range(len(drawn))]
-        )
+    def _runnable(self, drawn: Scenario, draws: int, rest: MakeBehaviour) -> Scenario:
+        trials = self._on(drawn).run([rest() for _ in range(len(drawn))])
         kept = [n for n, trial in enumerate(trials) if not trial.tripped][:draws]
         if len(kept) < draws:
             raise CalibrationError(
@@ -192,17 +199,18 @@ class Experiment:
         self.refused = (kept[-1] + 1) - draws
         return drawn.part(kept)
 
+    def _on(self, scenario: Scenario) -> TrialRunner:
+        return TrialRunner(self.robot, self.space, scenario, self.seconds, self.threads)
+
     def afresh(self, draws: int, rng: np.random.Generator) -> Experiment:
         """Return the same experiment on other members: what was chosen on some is judged on others."""
-        return Experiment(self.robot, self.known, self.seconds, draws, rng, self._rest, self.threads)
+        return Experiment(
+            self.robot, self.known, self.seconds, draws, rng, self._rest, self.threads, self.settings
+        )
 
     def assume(self, covariance: FloatArray) -> None:
         """Take this covariance, (K, K), as what is known before, instead of the distribution's."""
-        self.prior = Prior.of(
-            ParameterDistribution(
-                space=self.space, mean=self.known.mean, covariance=covariance, latency_s=self.known.latency_s
-            )
-        )
+        self.prior = Prior.of(dataclasses.replace(self.known, covariance=covariance))
 
     def predict(self, make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
         """Predict what a behaviour tells.
@@ -215,7 +223,7 @@ class Experiment:
         """
         D, K = len(self.scenario), len(self.space)
         if self._runner is None:
-            self._runner = TrialRunner(self.robot, self.space, self.scenario, self.seconds, self.threads)
+            self._runner = self._on(self.scenario)
         trials = self._runner.run([make() for _ in range(D)], until_trip=True)
         clipped = sum(trial.clipped for trial in trials)
         nothing = Prediction(np.full(K, np.nan), -np.inf, clipped=clipped)
@@ -225,8 +233,12 @@ class Experiment:
         covariances = np.zeros((D, K, K))
         found = nothing
         for n in self._order:
+            theta, latency_s = self.scenario.theta[n], float(self.scenario.latency_s[n])
             try:
-                covariances[n] = self.prior.posterior(self.information(trials[n], n))
+                hessian = information(
+                    self.robot, self.space, trials[n], theta, latency_s, self.settings.window_s, self.threads
+                )
+                covariances[n] = self.prior.posterior(hessian)
             except InsufficientDataError as err:
                 return dataclasses.replace(nothing, tripped=str(err))
             if not np.isfinite(covariances[n]).all():
@@ -241,11 +253,6 @@ class Experiment:
         self._order = np.argsort(-dark).tolist()
         return found
 
-    def information(self, trial: Trial, n: int) -> FloatArray:
-        """Return the information of member ``n``'s trial, (K + 1, K + 1)."""
-        theta, latency_s = self.scenario.theta[n], float(self.scenario.latency_s[n])
-        return information(self.robot, self.space, trial, theta, latency_s, threads=self.threads)
-
 
 def default_knowledge(
     space: ParameterSpace, latency_s: tuple[float, float] = LATENCY_RANGE_S
@@ -255,21 +262,26 @@ def default_knowledge(
 
 
 def _draw(
-    description: RobotDescription, known: ParameterDistribution, rng: np.random.Generator, draws: int
+    description: RobotDescription,
+    known: ParameterDistribution,
+    rng: np.random.Generator,
+    draws: int,
+    settings: ExperimentSettings,
 ) -> Scenario:
-    count = draws * DRAWS_PER_MEMBER
+    cubes_of_draws, (least, most) = settings.draws_per_member, settings.inner
+    count = draws * cubes_of_draws
     if known.covariance is None:
         # Latin hypercubes: each parameter is at its low and at its high end on some member, for it is at the
         # ends that something leaves no trace, as a high effort limit does.
         K = len(known.space)
-        cubes = [rng.permuted(np.tile(np.arange(draws), (K, 1)), axis=1).T for _ in range(DRAWS_PER_MEMBER)]
+        cubes = [rng.permuted(np.tile(np.arange(draws), (K, 1)), axis=1).T for _ in range(cubes_of_draws)]
         unit = (np.concatenate(cubes) + rng.random((count, K))) / draws
-        theta = known.space.unnormalize(INNER[0] + (INNER[1] - INNER[0]) * unit)
+        theta = known.space.unnormalize(least + (most - least) * unit)
     else:
         theta = known.sample(rng, count)
     low, high = known.latency_s
     # Half of the searched range: hardly any robot has a delay at its end.
     latency = rng.uniform(low, 0.5 * (low + high) if known.covariance is None else high, count)
     default = np.array(description.default_position)
-    spread = START_STD * description.sensor.position_std
+    spread = settings.start_std * description.sensor.position_std
     return Scenario(theta, latency, default + rng.standard_normal((count, len(default))) * spread)

@@ -151,12 +151,14 @@ def require_visible_parameters(
 ) -> None:
     """Check before any search that the recordings are long enough, move, and show every parameter."""
     from deal_hw.calib.data.checks import check_excitation
-    from deal_hw.calib.data.problem import SMOOTHING_S, Problem, samples_in
+    from deal_hw.calib.data.problem import Problem, samples_in
     from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
     # Raises where not even one window of that length fits.
-    problem.windows(samples_in(problem, window_s), offset=round(SMOOTHING_S / 2 / episodes[0].period_s))
+    problem.windows(
+        samples_in(problem, window_s), offset=round(problem.settings.smoothing_s / 2 / episodes[0].period_s)
+    )
     try:
         check_excitation(problem)
     except InsufficientDataError as err:

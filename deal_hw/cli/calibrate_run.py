@@ -345,7 +345,7 @@ def _judged(
 ) -> tuple[CalibrationResult, ReportInputs | None]:
     """Return the result with advice and provenance, and what its report shows."""
     if advise:
-        from deal_hw.calib.design.next_recording import next_recordings
+        from deal_hw.calib.design.advice import next_recordings
 
         found = next_recordings(work.robot, result, work.episodes, balance=work.balance, threads=threads)
         result = dataclasses.replace(result, advice=tuple(one.to_json() for one in found))

@@ -12,7 +12,7 @@ import pytest
 from numpy.linalg import inv
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.design.advice import advise, excitation_menu, next_step, predict_menu
+from deal_hw.calib.design.advice import AdviceSettings, advise, menu_designs, next_step, predict_menu
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.design.excitation_search import SearchSettings, score, search_excitation
 from deal_hw.calib.design.experiment_design import (
@@ -288,9 +288,11 @@ def result(parameters: ParameterSpace, std: FloatArray) -> CalibrationResult:
 def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:
     """An effort limit that was never reached needs a recording that reaches it; nothing else is advised."""
     parameters = space("mass", "damping", "effort_limit")
-    menu = excitation_menu(servo.description, 1.6)
+    settings = AdviceSettings(seconds=1.6)
+    designs = menu_designs(servo.description, settings=settings)
+    menu = {name: make_plan(servo.description, design) for name, design in designs.items()}
     found = result(parameters, np.array([0.02, 0.05, 0.6]))
-    (advice,) = advise(servo, found, menu, threads=1)
+    (advice,) = advise(servo, found, settings=settings, threads=1)
     assert advice.parameter == "slide.effort_limit"
     assert advice.after < 0.1 * advice.before
     said = f"record {advice.excitation}: slide.effort_limit goes from 60 % to {100 * advice.after:.2g} %"
@@ -306,7 +308,7 @@ def test_advice_says_where_no_excitation_helps(servo: RobotModel) -> None:
     """Mass and armature of one slide cannot be told apart by any motion; a calibrated robot needs nothing."""
     parameters = space("mass", "armature")
     open_ = result(parameters, np.array([0.6, 0.7]))
-    advice = {a.parameter: a for a in advise(servo, open_, seconds=1.6, threads=1)}
+    advice = {a.parameter: a for a in advise(servo, open_, settings=AdviceSettings(seconds=1.6), threads=1)}
     assert advice["slide.armature"].excitation == ""
     assert "measure it by other means" in advice["slide.armature"].sentence
     rows = [one.to_json() for one in advice.values()]

@@ -12,7 +12,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust, polish_windows
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.robust import huber_weights, kurtosis
-from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.validation.checks import Validation, unexplained
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
@@ -113,7 +113,7 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> 
     wrong = case.latency_s + 0.01
     problem = Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=wrong)
     search = At(case.theta, wrong)
-    result = PolishedMethod(search, settings=Validation(halves=False)).run(
+    result = Calibration(search, settings=Validation(halves=False)).run(
         problem, Budget(generations=16), np.random.default_rng(0)
     )
     assert search.runs >= 3
@@ -130,7 +130,7 @@ def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(case: Case) 
         case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s, known_std=chosen
     )
     search = At(case.theta * 1.05, case.latency_s)
-    result = PolishedMethod(search, settings=Validation(halves=False, diagnosis=False)).run(
+    result = Calibration(search, settings=Validation(halves=False, diagnosis=False)).run(
         problem, Budget(generations=15), np.random.default_rng(0)
     )
     assert result.chi2 < 0.5

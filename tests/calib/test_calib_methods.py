@@ -11,8 +11,8 @@ import pytest
 from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.methods import METHODS, NULL_METHODS, WHOLE_METHODS, check_method, make_method
-from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.methods import METHODS, NULL_METHODS, check_method, make_method
+from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Checkpoint
@@ -148,9 +148,9 @@ def test_every_name_in_the_table_makes_a_method(name: str) -> None:
     """Each row imports, and names its result after itself; the default is one of the others."""
     method = make_method(name)
     assert method.name == name or name == "default"
-    polished = make_method(name, polish=True)
-    assert isinstance(polished, PolishedMethod) == (name not in NULL_METHODS | WHOLE_METHODS)
-    assert polished.name == name
+    whole = make_method(name, polish=True)
+    assert isinstance(whole, Calibration) == (name not in NULL_METHODS | {"mujoco-sysid"})
+    assert whole.name == name
 
 
 def test_unknown_method_lists_the_names() -> None:

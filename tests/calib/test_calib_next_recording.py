@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.calib.design.advice import menu_designs, next_step, options
-from deal_hw.calib.design.next_recording import next_recordings
+from deal_hw.calib.design.advice import menu_designs, next_recordings, next_step, options
 from deal_hw.calib.report.inputs import ReportInputs
 from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult

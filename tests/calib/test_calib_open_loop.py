@@ -14,9 +14,12 @@ import pytest
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_horizon, prediction_rmse
-from deal_hw.calib.open_loop import OpenLoop
+from deal_hw.calib.output_error_fits import OutputErrorFits, open_loop
+from deal_hw.calib.pipeline import Calibration
+from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calib.uncertainty.correlated import confounded
+from deal_hw.calib.validation.checks import Validation
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.cli.calibrate_model import Recordings, prepare_model
@@ -121,15 +124,20 @@ def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
     assert problem.noise_std[0] <= std[0] < 5e-3
 
 
+def searching(folds: bool = True) -> Calibration:
+    """Return the method without a local fit before its search."""
+    return Calibration(Eki(), "open-loop", Validation(local_first=False, folds=folds), fits=OutputErrorFits())
+
+
 @pytest.fixture(scope="module")
 def result(problem: Problem) -> CalibrationResult:
     """Return what the whole method finds."""
-    return OpenLoop(local_first=False).run(problem, BUDGET, np.random.default_rng(0))
+    return searching().run(problem, BUDGET, np.random.default_rng(0))
 
 
 def test_a_right_model_needs_no_search(problem: Problem) -> None:
     """The refined nominal values explain the recordings: no search, no alarm, the truth in the intervals."""
-    found = OpenLoop().run(problem, BUDGET, np.random.default_rng(0))
+    found = open_loop().run(problem, BUDGET, np.random.default_rng(0))
     assert found.provenance["search"] == "local fit" and "folds" not in found.provenance
     assert found.alarms == () and 0.5 < found.chi2 < 1.3
     assert np.all(found.interval[:, 0] <= TRUTH) and np.all(found.interval[:, 1] >= TRUTH)
@@ -163,7 +171,7 @@ class StoppedError(Exception):
 
 def test_a_stopped_run_is_resumed_to_the_same_numbers(problem: Problem, tmp_path: Path) -> None:
     """Stopped in the search, the checkpoint holds its generations; the rest is done again."""
-    method = OpenLoop(folds=False, local_first=False)
+    method = searching(folds=False)
 
     def stop(progress: Progress) -> None:
         if progress.stage == "search" and progress.done == 4:

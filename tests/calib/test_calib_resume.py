@@ -11,7 +11,7 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
-from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.pipeline import Calibration, Refinement, RestartSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki, EkiSettings
 from deal_hw.calib.search.resume import Checkpoint, run_identity
@@ -91,15 +91,12 @@ def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> Non
     check_same(run(method, make_problem(1e-3), budget, Checkpoint(path, "a"), 0), whole)
 
 
-def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stopped in the second search and in the polish: no search runs twice, the numbers are the same."""
-    from deal_hw.calib import pipeline
-
+def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
+    """Stopped in the second search and in the refinement: no search runs twice, the numbers are the same."""
     # Nothing is ever explained and no two searches agree: all three attempts are made.
-    monkeypatch.setattr(pipeline, "MISMATCH_CHI2", 0.0)
-    monkeypatch.setattr(pipeline, "RESTARTS", pipeline.RestartSettings(same=0.0, fewest_generations=1))
+    fits = Refinement(RestartSettings(explained=0.0, same=0.0, fewest_generations=1))
     search = Eki(EkiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
-    method = PolishedMethod(search, settings=Validation(local_first=False))
+    method = Calibration(search, settings=Validation(local_first=False), fits=fits)
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
     stages: list[str] = []
 
@@ -108,16 +105,16 @@ def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: py
 
     whole = method.run(make_problem(), budget, np.random.default_rng(4), note)
     assert whole.provenance["restarts"] == 2
-    # Callbacks up to the first polish's first iteration; and, as the first search's result is offered again
-    # and the polish is repeated, up to the second generation of the second search.
-    in_polish = stages.index("polish") + 1
-    polishes = stages[in_polish:].index("search") + 1
+    # Callbacks up to the first refinement's first stage; and, as the first search's result is offered again
+    # and the refinement is repeated, up to the second generation of the second search.
+    refining = stages.index("refinement") + 1
+    searching = stages[refining:].index("search") + 1
     with pytest.raises(StoppedError):
-        run(method, make_problem(), budget, Checkpoint(path, "a"), in_polish)
+        run(method, make_problem(), budget, Checkpoint(path, "a"), refining)
     saved = Checkpoint(path, "a").load()
     assert saved is not None and len(saved["searches"]) == 1
     with pytest.raises(StoppedError):
-        run(method, make_problem(), budget, Checkpoint(path, "a"), polishes + 3)
+        run(method, make_problem(), budget, Checkpoint(path, "a"), searching + 3)
     saved = Checkpoint(path, "a").load()
     assert saved is not None and len(saved["searches"]) == 2
     resumed = run(method, make_problem(), budget, Checkpoint(path, "a"), 0)
@@ -160,8 +157,8 @@ def test_identity_changes_with_all_that_decides_the_numbers() -> None:
         identity(other(space=problem.space.with_ratio(3.0))),
         identity(method=Deal()),
         identity(method=Eki(EkiSettings(widen=0.6))),
-        identity(method=PolishedMethod(Eki())),
-        identity(method=PolishedMethod(Eki(EkiSettings(widen=0.6)))),
+        identity(method=Calibration(Eki())),
+        identity(method=Calibration(Eki(EkiSettings(widen=0.6)))),
         identity(budget=Budget(population=99)),
         identity(seed=1),
         run_identity(

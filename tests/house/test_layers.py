@@ -35,7 +35,7 @@ ROOMS = {
         {"deal_paper", "uncertainty"},
         {"validation", "design", "baselines"},
         {"pipeline"},
-        {"open_loop"},
+        {"output_error_fits"},
         {"methods", "report"},
     ),
     "drivers.go2": (

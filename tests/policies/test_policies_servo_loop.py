@@ -6,13 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from deal_hw.description import SensorModel
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
-from deal_hw.policies.servo_loop import EXACT_SENSOR, ServoLoop, delayed_setpoints
+from deal_hw.policies.servo_loop import EXACT_SENSOR, ServoLoop
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.engine.servo import slew
@@ -22,50 +20,12 @@ ALL = np.ones(1, dtype=bool)
 REST = np.zeros((1, 2))
 
 
-def make_loop(count: int = 1, latency_s: float = 0.045, sensor: SensorModel = EXACT_SENSOR) -> ServoLoop:
-    return ServoLoop(DESCRIPTION, SPACE, count, longest_latency_s=latency_s, sensor=sensor)
+def make_loop(count: int = 1, sensor: SensorModel = EXACT_SENSOR) -> ServoLoop:
+    return ServoLoop(DESCRIPTION, SPACE, count, sensor=sensor)
 
 
 def nominal(count: int = 1) -> np.ndarray:
     return np.repeat(SPACE.nominal[None], count, axis=0)
-
-
-def test_setpoint_follows_the_older_target_and_then_the_newer_one() -> None:
-    """3 steps at 0.01 towards 1, then 2 steps back towards 0, as computed by hand."""
-    got = delayed_setpoints(
-        np.array([[0.0]]), np.array([[1.0]]), np.array([[0.0]]), np.array([3]), np.array([[0.01]]), 5
-    )
-    np.testing.assert_allclose(got[0, :, 0], [0.01, 0.02, 0.03, 0.02, 0.01], atol=1e-15)
-
-
-def test_setpoint_stops_at_a_near_target() -> None:
-    """A target closer than the limit is reached exactly; the limit of one member is not another's."""
-    got = delayed_setpoints(
-        np.zeros((2, 1)), np.full((2, 1), 0.025), np.full((2, 1), 0.025), np.array([0, 4]),
-        np.array([[0.01], [0.1]]), 4,
-    )  # fmt: skip
-    np.testing.assert_allclose(got[0, :, 0], [0.01, 0.02, 0.025, 0.025], atol=1e-15)
-    np.testing.assert_allclose(got[1, :, 0], 0.025, atol=1e-15)
-
-
-numbers = st.floats(-0.4, 0.4)
-
-
-@given(
-    st.lists(
-        st.tuples(numbers, numbers, numbers, st.integers(0, 19), st.floats(1e-4, 5e-3)),
-        min_size=1,
-        max_size=4,
-    )
-)
-def test_closed_form_equals_the_reference(members: list[tuple[float, float, float, int, float]]) -> None:
-    """The closed form gives what stepping the reference through the same targets gives."""
-    start, older, newer = (np.array([[m[i]] for m in members]) for i in range(3))
-    switch, rate = np.array([m[3] for m in members]), np.array([[m[4]] for m in members])
-    targets = np.where((np.arange(20)[None] < switch[:, None])[..., None], older[:, None], newer[:, None])
-    np.testing.assert_allclose(
-        delayed_setpoints(start, older, newer, switch, rate, 20), slew(start, targets, rate), atol=1e-12
-    )
 
 
 @pytest.mark.parametrize("latency_ticks", [0, 7, 20, 33, 45])
@@ -140,13 +100,6 @@ def test_noise_has_its_standard_deviation() -> None:
         np.random.default_rng(1),
     )
     np.testing.assert_allclose(loop.reported_position.std(axis=0), [1e-3, 5e-3], rtol=5 / math.sqrt(8000))
-
-
-def test_a_latency_that_the_loop_was_not_made_for_is_refused() -> None:
-    """The message gives the range that would do."""
-    loop = make_loop(latency_s=0.02)
-    with pytest.raises(ConfigurationError, match=r"latencies must lie in \[0, 0.04\) s, got 0.1"):
-        loop.restart(ALL, nominal(), np.array([0.1]), REST, REST, np.random.default_rng(0))
 
 
 def test_a_velocity_window_between_control_periods_is_refused() -> None:

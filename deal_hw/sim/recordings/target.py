@@ -16,8 +16,8 @@ import numpy as np
 from deal_hw.errors import CalibrationError, ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import ClosedLoop, reported
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.engine.servo import delay
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.sim.recordings.imu_base import base_states
@@ -52,7 +52,7 @@ class TargetRecording:
 
     Attributes:
         episode: What the sensors saw.
-        position: True positions at the samples, in the episode's charts, (T, C).
+        position: True positions at the samples, in the episode's tangent coordinates, (T, C).
         velocity: True velocities at the samples, (T, C).
     """
 
@@ -101,20 +101,17 @@ def record_target(
         )
     batch = ServoBatch(robot, space, 1, threads=1)
     batch.set_parameters(np.asarray(theta, dtype=float)[None])
-    lag = np.rint(batch.lag_s(np.array([latency_s])) / step_s)
-    reach = int(lag.max())
     rest = _settle(robot, batch, start, settle_s)
     ticks = math.ceil(seconds * description.control_rate_hz)
     sensor = _Sensor(robot, sensing or Sensing(), rng)
     samples = [batch.position[0]], [batch.velocity[0]]
-    sent = np.repeat(rest[None], reach, axis=0)
+    loop = ClosedLoop(batch, period, whole=True)
+    loop.restart(rest[None], np.array([latency_s]))
     targets = np.empty((ticks, len(rest)))
     for tick in range(ticks):
         seen = sensor.joints(samples[0][-1])
         targets[tick] = behaviour(seen, samples[1][-1], tick / description.control_rate_hz)
-        sent = np.concatenate([sent, np.repeat(targets[tick : tick + 1], period, axis=0)])[-reach - period :]
-        late = delay(sent[None], lag, rest[None])[:, -period:]
-        position, velocity = batch.advance(late, stride)
+        position, velocity = loop.advance(targets[tick : tick + 1], every=stride)
         if not np.isfinite(position).all():
             raise CalibrationError(
                 f"the target {description.name} diverged after {tick / description.control_rate_hz:.2f} s"
@@ -144,22 +141,17 @@ class _Sensor:
 
     def joints(self, position: FloatArray) -> FloatArray:
         """Return a state as its joints are reported, (C,)."""
-        if self._sensing.joint_std is None:
+        noise, joints = self._sensing.joint_std, self._robot.joints
+        if noise is None:
             return position
         seen = position.copy()
-        seen[..., self._robot.joints] = self._noisy(position[..., self._robot.joints])
+        seen[..., joints] = reported(position[..., joints], noise, self._sensing.joint_resolution, self._rng)
         return seen
-
-    def _noisy(self, joints: FloatArray) -> FloatArray:
-        noisy = joints + self._rng.standard_normal(joints.shape) * np.array(self._sensing.joint_std)
-        if self._sensing.joint_resolution:
-            noisy = np.round(noisy / self._sensing.joint_resolution) * self._sensing.joint_resolution
-        return np.asarray(noisy)
 
     def report(
         self, true_x: FloatArray, true_v: FloatArray, target: FloatArray, rest: FloatArray, stride: int
     ) -> TargetRecording:
-        """Return the recording of a true trajectory, (T, C), in the identity's chart."""
+        """Return the recording of a true trajectory, (T, C), in tangent coordinates of the identity."""
         robot, T = self._robot, len(true_x)
         C = true_x.shape[1]
         orientation = None

@@ -1,0 +1,328 @@
+"""Output-error fits for recordings of a real robot, which no simulator explains to the noise.
+
+Three questions have no answer there that holds for every robot: how far a prediction may be off, whether a
+search that stops early or a fit that goes on predicts other motion better, and over which horizon to fit. So
+
+1. a fit from the model's own values over short windows says what residuals to expect;
+2. the search is run with these;
+3. by cross-validation on the recordings that are fitted, motion by motion, the search's estimate, fits over
+   short and long horizons (robust or not, with a latency or none, held to the model's own values or hardly)
+   and the mean of fits over all horizons predict what they have not seen;
+4. what predicts best is fitted to all, two halves of the data are compared, and what goes with what is said.
+
+Recordings that are held out take no part in any of this.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.baselines.simple import Nominal
+from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
+from deal_hw.calib.fit.refinement import at_parameters
+from deal_hw.calib.pipeline import Calibration, CalibrationRun, Fits, Outcome
+from deal_hw.calib.search.eki import Eki
+from deal_hw.calib.uncertainty.at_fit import with_rows
+from deal_hw.calib.uncertainty.correlated import confounded
+from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, ended_at_bound, uncertainty
+from deal_hw.calib.validation.checks import Validation, with_causes, with_step
+from deal_hw.calib.validation.cross_validation import (
+    Choice,
+    Member,
+    fold_masks,
+    motion_numbers,
+    on_folds,
+    time_masks,
+)
+from deal_hw.calib.validation.split_half import Halves, agreement, heed
+from deal_hw.calibration import CalibrationMethod, CalibrationResult
+from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.recordings.parts import joined, spread, stretches
+from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputErrorSettings:
+    """Settings of :class:`OutputErrorFits`.
+
+    Attributes:
+        horizons_s: Windows of the fits, one from where the one before ended [s]. What the model lacks pulls
+            each horizon's fit elsewhere; their mean may be nearer than any of them.
+        priors: How far the model's own values hold, as a share of the range: as far as the range itself, or
+            hardly. By what a candidate's name ends with.
+        search_s: The search is to find the neighbourhood: so much of the recordings, evenly spread, says
+            where it is [s].
+        stretch_s: Recordings are divided into stretches of this length for it [s].
+        folds: Motions are left out in so many turns, a single motion third by third.
+        compared_s: Starts are compared in windows of this length: even a far one does not diverge [s].
+        half_iterations: Most steps of the fit of each half.
+        mismatch_s: Windows in which the model is held against the sensors' noise: start states are fitted, so
+            even a residual that needs longer to build up shows as far as it matters to a controller [s].
+    """
+
+    horizons_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
+    priors: Mapping[str, float] = field(default_factory=lambda: {"": Recipe().prior_std, ", wide prior": 1.0})
+    search_s: float = 12.0
+    stretch_s: float = 2.5
+    folds: int = 3
+    compared_s: float = 0.4
+    half_iterations: int = 5
+    mismatch_s: float = 0.4
+
+    @property
+    def long_s(self) -> float:
+        """The longest horizon [s]."""
+        return self.horizons_s[-1]
+
+    @property
+    def variants(self) -> Mapping[str, Recipe]:
+        """Fits over the longest horizon in other ways, by name."""
+        return {
+            "long, robust": Recipe(seconds=self.long_s, robust=True),
+            "long, no latency": Recipe(seconds=self.long_s, latency=False),
+        }
+
+    def recipe(self, name: str) -> Recipe:
+        """Return how a candidate's residuals are weighed, for intervals and the split-half check."""
+        long = Recipe(seconds=self.long_s, prior_std=self.priors[self.prior_of(name)])
+        return self.variants.get(name, long)
+
+    def prior_of(self, name: str) -> str:
+        """Return which of the priors a candidate's name ends with."""
+        return next((words for words in self.priors if words and name.endswith(words)), "")
+
+
+class OutputErrorFits(Fits):
+    """Searches, fits predictions, and takes what cross-validation says predicts best.
+
+    Args:
+        settings: How.
+    """
+
+    def __init__(self, settings: OutputErrorSettings | None = None) -> None:
+        self._settings = settings or OutputErrorSettings()
+
+    def best(self, run: CalibrationRun) -> Outcome:
+        """Search, fit all candidates, take the one that predicts best. See :meth:`Fits.best`."""
+        settings, problem = self._settings, run.problem
+        if run.settings.folds:
+            problem = _whole(problem)
+        run.say("residual", "fits short windows from the model's own values")
+        first = fit_horizon(problem, problem.space.nominal, problem.first_latency_s, SHORT)
+        searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
+        run.offer("search", searched)
+        # Drawn after the search, so that a resumed run draws the same.
+        seed = int(run.rng.integers(2**32))
+        choice = Choice("long", {}, settings.long_s, note="without folds")
+        if run.settings.folds:
+            choice = self._choose(run, problem, seed)
+        run.say("fit", f"{choice.chosen} on all recordings")
+        members = self._members(run, problem, _member(first), searched, choice.chosen)
+        theta, latency_s = members[choice.chosen]
+        recipe = settings.recipe(choice.chosen)
+        told = dataclasses.replace(recipe, latency=True)
+        fit = fit_horizon(problem, theta, latency_s, told, iterations=0, central=True)
+        known = _known(problem, fit)
+        halves = self._halves(problem, fit, recipe, known)
+        known = heed(problem, known, theta, halves)
+        facts: dict[str, Any] = {}
+        if run.local is not None:
+            # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
+            local = with_rows(run.local)
+            known, facts["physics_step"] = with_step(run.problem, local, known, theta)
+            known, facts["diagnosis"] = with_causes(run.problem, local, known)
+        left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s)).normal
+        chi2 = left.cost / max(left.count, 1)
+        found = confounded(problem, fit.hessian / known.inflation)
+        names = problem.channel_names
+        facts |= {
+            "folds": choice.to_json(),
+            "residual_std": dict(zip(names, map(float, first.scale), strict=True)),
+            "prediction_rmse": dict(zip(names, map(float, fit.scale), strict=True)),
+            "window_s": recipe.seconds,
+            "noise_std": problem.noise_std[problem.channels].tolist(),
+            "inflation": known.inflation,
+            "at_bound": [
+                problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
+            ],
+            "halves": halves.to_json(),
+            "confounded": [pair.to_json() for pair in found],
+        }
+        known = dataclasses.replace(
+            known,
+            alarms=(*known.alarms, *self._unexplained(chi2)),
+            null_directions=tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))),
+        )
+        return Outcome(
+            searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
+        )
+
+    def _reduced(self, problem: Problem, first: HorizonFit) -> Problem:
+        """Return the search's problem: part of the recordings, and residuals as large as a first fit's."""
+        parts = [p for e in problem.episodes for p in stretches(e, self._settings.stretch_s)]
+        std = problem.known_std
+        if std is None:
+            std = problem.noise_std.copy()
+            std[problem.channels] = np.maximum(std[problem.channels], first.scale)
+        return problem.on(spread([p for p in parts if p.usable.any()], self._settings.search_s), std)
+
+    def _choose(self, run: CalibrationRun, problem: Problem, seed: int) -> Choice:
+        """Fit every candidate to the data without each fold and compare what they predict of it."""
+        settings, before = self._settings, problem.steps
+        motions = motion_numbers(problem.episodes)[-1] + 1
+        masks = (
+            time_masks(problem, settings.folds)
+            if motions == 1
+            else fold_masks(problem, min(motions, settings.folds))
+        )
+
+        def fits(train: Problem, fold: int) -> dict[str, Member]:
+            question = f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?"
+            run.say("cross-validation", question)
+            first = fit_horizon(train, problem.space.nominal, problem.first_latency_s, SHORT)
+            rng = np.random.default_rng([seed, fold])
+            searched = run.search.run(self._reduced(train, first), run.budget, rng)
+            return self._members(run, train, _member(first), searched)
+
+        def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
+            rmse = prediction_rmse(test, members, settings.long_s)
+            return np.array([_error(problem, of_channels) for of_channels in rmse])
+
+        found = on_folds(problem, masks, fits, errors, "long", settings.long_s)
+        return dataclasses.replace(found, steps=problem.steps - before)
+
+    def _members(
+        self,
+        run: CalibrationRun,
+        problem: Problem,
+        short: Member,
+        searched: CalibrationResult,
+        only: str | None = None,
+    ) -> dict[str, Member]:
+        """Return what each candidate makes of a problem.
+
+        Args:
+            run: The calibration.
+            problem: All data, or those of a fold.
+            short: The fit over short windows.
+            searched: The search's result.
+            only: Name of the one candidate that is wanted; None for all.
+        """
+        settings = self._settings
+        horizons_s = settings.horizons_s if run.settings.folds else (settings.long_s,)
+        found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
+        rmse = prediction_rmse(problem, [found["search"], short], settings.compared_s)
+        start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
+        for words, prior_std in settings.priors.items():
+            if only is not None and words != settings.prior_of(only):
+                continue
+            horizons = [start]
+            for seconds in horizons_s:
+                recipe = Recipe(seconds=seconds, prior_std=prior_std)
+                horizons.append(_member(fit_horizon(problem, *horizons[-1], recipe)))
+            for seconds, member in zip(horizons_s[:-1], horizons[1:], strict=False):
+                found[f"{seconds:g} s{words}"] = member
+            found["long" + words] = horizons[-1]
+            found["mean of horizons" + words] = _mean(problem, horizons[1:])
+        for name, recipe in settings.variants.items():
+            if only in (None, name):
+                theta, latency_s = found["long"]
+                latency_s = latency_s if recipe.latency else problem.first_latency_s
+                found[name] = _member(fit_horizon(problem, theta, latency_s, recipe))
+        return found
+
+    def _halves(self, problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertainty) -> Halves:
+        """Fit two halves of the recordings, motion by motion, from the whole's estimate and compare."""
+        space, before = problem.space, problem.steps
+        estimates, stds, intervals = [], [], []
+        for mask in fold_masks(problem, 2):
+            try:
+                half = fit_horizon(
+                    problem.part(mask),
+                    fit.theta,
+                    fit.latency_s,
+                    recipe,
+                    iterations=self._settings.half_iterations,
+                    central=True,
+                )
+            except InsufficientDataError as err:
+                return Halves((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
+            told = _known(problem, half)
+            estimates.append(half.theta)
+            stds.append(np.sqrt(np.diag(told.covariance)))
+            intervals.append(told.interval)
+        return agreement(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)
+
+    def _unexplained(self, chi2: float) -> tuple[str, ...]:
+        if chi2 <= MISMATCH_CHI2:
+            return ()
+        return (
+            f"the model does not explain the recordings to their noise: over {self._settings.mismatch_s:g} "
+            f"s, from fitted start states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's "
+            "noise; the intervals count all of it as noise",
+        )
+
+
+def open_loop(search: CalibrationMethod[Problem] | None = None) -> Calibration:
+    """Return `open-loop`: output-error fits by cross-validation, after the local fit and a search.
+
+    Args:
+        search: The search; `weki` by default.
+    """
+    return Calibration(search or Eki(), "open-loop", fits=OutputErrorFits())
+
+
+def near() -> Calibration:
+    """Return `near`: the fits over short and then long horizons alone, from the model's own values.
+
+    For a robot whose model is near (within a factor two or so) and in which motion is damped: it costs a
+    twentieth of a search. What its residual does not explain it says like `open-loop`.
+    """
+    return Calibration(Nominal(), "near", Validation(folds=False), fits=OutputErrorFits())
+
+
+def _whole(problem: Problem) -> Problem:
+    """Return the problem with stretches that follow each other in one piece, so that long windows fit."""
+    episodes = joined(problem.episodes)
+    return problem.on(episodes, problem.known_std) if len(episodes) < len(problem.episodes) else problem
+
+
+def _error(problem: Problem, rmse: FloatArray) -> float:
+    """Return the mean error of channels, (M,); the geometric one where their units differ."""
+    C, units = problem.coordinates, problem.robot.coordinate_units
+    if len({units[c % C] + "/s" * int(c >= C) for c in problem.channels}) == 1:
+        return float(np.mean(rmse))
+    return float(np.exp(np.mean(np.log(rmse))))
+
+
+def _member(fit: HorizonFit) -> Member:
+    return fit.theta, fit.latency_s
+
+
+def _mean(problem: Problem, members: Sequence[Member]) -> Member:
+    """Return the mean of estimates, parameters in their own scale."""
+    scaled = [problem.space.to_scale(theta) for theta, _ in members]
+    theta = problem.space.from_scale(np.mean(scaled, axis=0))
+    return theta, float(np.mean([latency_s for _, latency_s in members]))
+
+
+def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
+    return uncertainty(
+        problem.space,
+        fit.theta,
+        fit.latency_s,
+        fit.hessian,
+        1.0,
+        fit.residual,
+        problem.latency_range_s,
+        fixed_latency=problem.fixed_latency_s is not None,
+        gradient=fit.gradient,
+        prior=fit.prior,
+        rows=fit.rows,
+    )
