@@ -31,7 +31,13 @@ from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.at_fit import with_rows
 from deal_hw.calib.uncertainty.correlated import confounded
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, ended_at_bound, uncertainty
+from deal_hw.calib.uncertainty.intervals import (
+    MISMATCH_CHI2,
+    Uncertainty,
+    ended_at_bound,
+    mismatch,
+    uncertainty,
+)
 from deal_hw.calib.validation.checks import Validation, with_causes, with_step
 from deal_hw.calib.validation.cross_validation import (
     Choice,
@@ -43,6 +49,7 @@ from deal_hw.calib.validation.cross_validation import (
 )
 from deal_hw.calib.validation.split_half import Halves, agreement, heed
 from deal_hw.calibration import (
+    Alarm,
     Budget,
     CalibrationMethod,
     CalibrationResult,
@@ -358,14 +365,10 @@ def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
     )
 
 
-def _unexplained(chi2: float) -> tuple[str, ...]:
+def _unexplained(chi2: float) -> tuple[Alarm, ...]:
     if chi2 <= MISMATCH_CHI2:
         return ()
-    return (
-        f"the model does not explain the recordings to their noise: over {SETTINGS.mismatch_s:g} s, from "
-        f"fitted start states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's noise; the "
-        "intervals count all of it as noise",
-    )
+    return (mismatch(chi2, f" over {SETTINGS.mismatch_s:g} s from fitted start states"),)
 
 
 def _halves(problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertainty) -> Halves:

@@ -27,7 +27,7 @@ from deal_hw.calib.fit.residual import (
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.calib.uncertainty.intervals import Z90, intervals
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 
 
@@ -261,8 +261,11 @@ class _Passes(Stepper):
         alarms = []
         if not self._misfit < DIVERGED:
             alarms.append(
-                f"the filter's innovations are {self._misfit:.1f} times their own variance: it diverged, and "
-                "its covariance means nothing"
+                Alarm(
+                    f"The filter's innovations are {self._misfit:.1f} times their own variance.",
+                    "The filter diverged: its covariance means nothing.",
+                    "Use another method, or narrower ranges (--range NAME LOW HIGH).",
+                )
             )
         spread = Z90 * math.sqrt(max(self._covariance[K, K], 0.0)) if self._free_latency else 0.0
         plain = self._run.result(

@@ -28,7 +28,7 @@ from deal_hw.calib.fit.residual import PARAMETER_STEP
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.calib.uncertainty.intervals import intervals
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import spread, stretches
@@ -103,7 +103,7 @@ class Found:
     iterations: int
     message: str
     steps: int = 0
-    alarms: tuple[str, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
     interval: FloatArray | None = None
 
 
@@ -171,7 +171,8 @@ class OneShot(Stepper):
     def load(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state."""
         saved = state["found"]
-        self._found = None if saved is None else Found(**{**saved, "alarms": tuple(saved["alarms"])})
+        if saved is not None:
+            self._found = Found(**{**saved, "alarms": tuple(Alarm(**alarm) for alarm in saved["alarms"])})
 
 
 def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
@@ -207,7 +208,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, tolerance: float
         latency_s=latency_s,
         iterations=int(solution.nfev),
         message=str(solution.message),
-        alarms=() if solution.status else (f"not converged after {solution.nfev} iterations",),
+        alarms=() if solution.status else (_unfinished(solution.nfev),),
     )
 
 
@@ -361,7 +362,15 @@ def _solve_starts(
         iterations=sum(fit.iterations for fit in (*rough, *fits)),
         message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
         steps=part.steps,
-        alarms=() if best.iterations < iterations else (f"not converged after {iterations} iterations",),
+        alarms=() if best.iterations < iterations else (_unfinished(iterations),),
+    )
+
+
+def _unfinished(iterations: int) -> Alarm:
+    return Alarm(
+        f"The fit had not converged after {iterations} iterations.",
+        "Its values may still be far from those that fit best.",
+        "Allow more (--generations).",
     )
 
 

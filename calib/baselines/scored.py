@@ -12,6 +12,7 @@ from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Stepper
 from deal_hw.calib.search.log import Run
+from deal_hw.calibration import Alarm
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})
@@ -70,13 +71,16 @@ class ScoredStepper(Stepper):
         """Return the mean squared whitened residual of one member."""
         return explained(self.run.problem, centre, self._ticks)
 
-    def alarms(self) -> list[str]:
+    def alarms(self) -> list[Alarm]:
         """Return reasons to distrust the result: too many members that had no score."""
         scored = sum(row["scored"] for row in self.run.trace if "scored" in row)
         lost = sum(row["diverged"] for row in self.run.trace if "diverged" in row)
         if scored and lost > 0.5 * scored:
             return [
-                f"{lost:.0f} of {scored:.0f} members diverged and had no score; narrow the ranges or shorten "
-                "the physics step"
+                Alarm(
+                    f"{lost:.0f} of {scored:.0f} members diverged and had no score.",
+                    "Simulations explode over much of the search range, and nothing was searched there.",
+                    "Narrow the ranges (--range NAME LOW HIGH), or shorten the physics step.",
+                )
             ]
         return []

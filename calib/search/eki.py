@@ -119,11 +119,7 @@ class _Weki(KalmanStepper):
         chi2, z = self._best or (float("nan"), self.kalman.ask())
         alarms = []
         if not chi2 <= self._settings.restart_chi2 and not self._brief:
-            alarms.append(
-                f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(self.run.trace)} generations; "
-                "allow more generations, widen the ranges, or suspect the model"
-            )
+            alarms.append(self.run.unexplained(chi2))
         members, centre = self.population(z)
         return self.run.result(
             self.coordinates,

@@ -14,7 +14,7 @@ from scipy.stats import truncnorm
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calibration import Verdict
+from deal_hw.calibration import Alarm, Verdict, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -63,7 +63,7 @@ class Uncertainty:
         latency_interval_s: 90 % interval of the latency [s].
         verdicts: One a parameter.
         null_directions: Combinations that the data cannot see, in words.
-        alarms: Signs that the model is wrong, in words.
+        alarms: Signs that the model is wrong.
         inflation: Factor on the variance for what the model does not explain.
         shape: What the intervals keep whatever the covariance is.
         clustered: Variances clustered by blocks of time over those of independent residuals; None where it
@@ -76,7 +76,7 @@ class Uncertainty:
     latency_interval_s: tuple[float, float]
     verdicts: tuple[Verdict, ...]
     null_directions: tuple[str, ...]
-    alarms: tuple[str, ...]
+    alarms: tuple[Alarm, ...]
     inflation: float
     shape: Shape
     clustered: Clustered | None
@@ -309,32 +309,62 @@ def _alarms(
     tau: float,
     timing_std_s: float,
     pressed: npt.NDArray[np.bool_],
-) -> tuple[str, ...]:
+) -> tuple[Alarm, ...]:
     alarms = []
     if timing_std_s > 0:
         alarms.append(
-            f"the state samples' time jitters by {1e3 * timing_std_s:.1f} ms: the model's delay is "
-            "constant, so where commands jitter too the intervals are too narrow"
+            Alarm(
+                f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
+                "The model's delay is constant: if commands jitter too, the intervals are too narrow.",
+                "Record over a link with less jitter, or with the device's own time stamps.",
+            )
         )
     if chi2 > MISMATCH_CHI2:
-        alarms.append(
-            f"the model does not explain the recording: residuals are {np.sqrt(chi2):.1f} times the "
-            "sensor noise (friction law, backlash, jittering delay, or a range that is too narrow)"
-        )
+        alarms.append(mismatch(chi2))
     if chi2 > NEGLIGIBLE_CHI2 and tau > MISMATCH_TIME:
         alarms.append(
-            f"residuals hang together over {tau:.1f} samples where noise would not: something moves that "
-            "the model does not have (friction law, backlash or a varying delay)"
+            Alarm(
+                f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
+                "Something moves that the model does not have: a friction law, backlash or a varying delay.",
+                "Free a parameter for it or mend the hardware; trust predictions more than values.",
+            )
         )
-    for k in np.flatnonzero(ended_at_bound(space, theta)):
-        fixed = (
-            "it was fixed there for the others' intervals" if pressed[k] else "the data do not press it there"
-        )
-        alarms.append(
-            f"{space.names[k]} ended at the bound of its range, {theta[k]:.4g} {space.free[k].unit}: "
-            f"{fixed}; widen the range, or doubt the model"
-        )
+    ended = ended_at_bound(space, theta)
+    for which, means in (
+        (pressed, "The data ask for a value outside the range, or the model is wrong. The intervals of the "
+         "other parameters hold for this value."),
+        (~pressed, "The search ended there, but the data do not press the value to that end."),
+    ):  # fmt: skip
+        names = [
+            f"{space.names[k]} ({theta[k]:.4g} {space.free[k].unit})" for k in np.flatnonzero(ended & which)
+        ]
+        if names:
+            alarms.append(
+                Alarm(
+                    f"Ended at the bound of the search range: {listed(names)}.",
+                    means,
+                    "Widen the range (--range NAME LOW HIGH) if such a value is possible, or doubt the "
+                    "model.",
+                )
+            )
     return tuple(alarms)
+
+
+def mismatch(chi2: float, window: str = "") -> Alarm:
+    """Return the alarm of residuals above the sensors' noise.
+
+    Args:
+        chi2: Mean squared residual over the noise's.
+        window: Over how long, in words.
+    """
+    return Alarm(
+        f"Residuals are {np.sqrt(chi2):.1f} times the sensor's noise{window}.",
+        "The model does not explain the recording: it lacks something that the robot has (a friction law, "
+        "backlash, a delay that varies), or a range is too narrow. The intervals count all of it as noise.",
+        "Mend the causes that other alarms name, or widen ranges, and calibrate again. Judge this model by "
+        "its "
+        "held-out error.",
+    )
 
 
 def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.bool_]:

@@ -21,6 +21,7 @@ from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.uncertainty.at_fit import widened_to
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
+from deal_hw.calibration import Alarm, listed
 from deal_hw.types import FloatArray
 
 CLEARLY = 4.0
@@ -118,8 +119,8 @@ def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: Step
     return dataclasses.replace(known, latency_interval_s=(max(low - more, first), min(high + more, last)))
 
 
-def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> str:
-    """Return the alarm of a step that is too coarse, or "".
+def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
+    """Return the alarm of a step that is too coarse; none where it is fine.
 
     Args:
         problem: Says the parameters' names.
@@ -127,16 +128,20 @@ def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> str:
         found: What half the step says.
     """
     if found.note or not found.preferred:
-        return ""
+        return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
     moved = np.abs(found.bias[:-1]) > half_width
     names = [n for n, m, b in zip(problem.space.names, moved, known.shape.blind, strict=True) if m and not b]
     if not names:
-        return ""
+        return ()
     return (
-        f"the physics step of {1e3 * found.step_s:g} ms is too coarse: with half of it the recordings are "
-        f"explained better and {', '.join(names)} would move by more than the interval; calibrate with "
-        f"--physics-step {found.step_s / 2:g} or less, and train with that step"
+        Alarm(
+            f"With half the physics step ({500 * found.step_s:g} ms) the recordings are explained better "
+            "(chi-square "
+            f"{found.gain:.3g} lower), and these would leave their intervals: {listed(names)}.",
+            f"A step of {1e3 * found.step_s:g} ms is too coarse: its error went into these values.",
+            f"Calibrate with --physics-step {found.step_s / 2:g} or less, and train with that step.",
+        ),
     )
 
 

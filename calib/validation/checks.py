@@ -21,6 +21,7 @@ from deal_hw.calib.uncertainty.intervals import (
 from deal_hw.calib.uncertainty.physics_step import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import Finding, diagnose, motions
 from deal_hw.calib.validation.split_half import compare_halves, heed
+from deal_hw.calibration import Alarm
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
 
@@ -53,7 +54,7 @@ class Validation:
     """Say what an unexplained residual looks like."""
 
 
-def latency_alarms(problem: Problem, latency_s: float) -> tuple[str, ...]:
+def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
     """Return an alarm where a latency that was searched ended at the end of its range.
 
     The lower end counts where it is above zero.
@@ -73,9 +74,12 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[str, ...]:
     else:
         return ()
     return (
-        f"the latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "
-        f"{1e3 * high:g} ms): the robot may act {side} than that, and the other parameters make up for it; "
-        f"calibrate again with --latency-range {wider[0]:g} {wider[1]:g}",
+        Alarm(
+            f"The latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "
+            f"{1e3 * high:g} ms).",
+            f"The robot may act {side} than that; then other parameters make up for it.",
+            f"Calibrate again with --latency-range {wider[0]:g} {wider[1]:g}.",
+        ),
     )
 
 
@@ -131,7 +135,7 @@ def with_step(
         theta: The estimate that is about, (K,).
     """
     step = check_step(problem, polished)
-    alarms = filter(None, [step_alarm(problem, known, step)])
+    alarms = step_alarm(problem, known, step)
     known = counted(problem, known, theta, step)
     return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), step.to_json()
 
@@ -141,7 +145,7 @@ def with_causes(
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Return what is known, alarmed by what the residual looks like, and all causes as plain JSON values."""
     found = diagnosed(problem, polished, known)
-    alarms = (_words(f) for f in found[:MOST_CAUSES])
+    alarms = (f.alarm for f in found[:MOST_CAUSES])
     return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
 
 
@@ -155,7 +159,3 @@ def diagnosed(problem: Problem, polished: Polished, known: Uncertainty) -> tuple
         problem.robot.description.joint_names,
         correlation_time(polished.normal.residual),
     )
-
-
-def _words(found: Finding) -> str:
-    return f"what is unexplained looks like this ({100 * found.share:.0f} % of it): {found.words}"

@@ -9,7 +9,7 @@ is the share of the residual's excess over noise that it explains beyond what as
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,6 +21,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
+from deal_hw.calibration import Alarm
 from deal_hw.types import FloatArray
 
 Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "contact"]
@@ -52,17 +53,44 @@ CERTAIN = 4.0
 STILL = 1e-3
 """Part of the rms speed below which a velocity has no direction."""
 
-ADVICE: dict[Cause, str] = {
-    "friction": "friction depends on speed (Stribeck), or creeps where it should hold: free "
-    "dof_friction_creep, dof_frictionloss and dof_damping of",
-    "backlash": "the residual follows reversals: play in the gear of",
-    "delay": "the timing varies: command or sensing delay jitters, so mend the link or measure its law; "
-    "seen in",
-    "damping": "a force grows with speed: free dof_damping or servo_damping of",
-    "inertia": "a force follows acceleration: free dof_armature, body_mass or the actuator's gain of",
-    "load": "a constant force is missing: free encoder_bias, body_mass or body_ipos of",
-    "contact": "the residual comes in bursts, as contacts make that the model does not have: leave out",
+LOOKS: Mapping[Cause, tuple[str, str, str]] = {
+    "friction": (
+        "a force against slow motion",
+        "Friction depends on speed (Stribeck), or creeps where it should hold.",
+        "Free dof_friction_creep, dof_frictionloss and dof_damping of {}.",
+    ),
+    "backlash": (
+        "an offset at each reversal",
+        "There is play in the gear.",
+        "Mend the gear of {}, or accept an error of that size.",
+    ),
+    "delay": (
+        "a timing error that changes",
+        "The delay of commands or sensors varies; the model's is constant.",
+        "Mend the link, or measure the law of its delay; look at {} first.",
+    ),
+    "damping": (
+        "a force that grows with speed",
+        "Damping was not free, or follows another law (the square of speed).",
+        "Free dof_damping or servo_damping of {}; if they are free, doubt the law.",
+    ),
+    "inertia": (
+        "a force in proportion to acceleration",
+        "An inertia or a gain was not free, or its range is too narrow.",
+        "Free dof_armature, body_mass or the actuator's gain of {}.",
+    ),
+    "load": (
+        "a constant force",
+        "A mass, its centre or an encoder's zero was not free.",
+        "Free encoder_bias, body_mass or body_ipos of {}.",
+    ),
+    "contact": (
+        "bursts",
+        "The robot touches something that the model does not have.",
+        "Leave out {}.",
+    ),
 }
+"""What each cause looks like, what it means, and what to do about it, {} being where."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +101,19 @@ class Finding:
         cause: Which.
         share: Share of the residual's excess over noise that it explains.
         joints: Joints that show it most, most first.
-        words: What to do, for people.
+        alarm: For people.
     """
 
     cause: Cause
     share: float
     joints: tuple[str, ...]
-    words: str
+    alarm: Alarm
+
+
+def _named(cause: Cause, share: float, joints: tuple[str, ...], where: str) -> Finding:
+    looks, means, do = LOOKS[cause]
+    seen = f"{100 * share:.0f} % of what is unexplained looks like {looks}: {cause}."
+    return Finding(cause, share, joints, Alarm(seen, means, do.replace("{}", where)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +204,7 @@ def diagnose(
     results.append(_finding("delay", explained, used, chance, excess, scale, joint_names))
     bursts = _bursts(found)
     if bursts:
-        results.append(Finding("contact", bursts[0], (), f"{ADVICE['contact']} {bursts[1]}"))
+        results.append(_named("contact", bursts[0], (), bursts[1]))
     told = [f for f in results if f.share >= NOTICED]
     return tuple(sorted(told, key=lambda f: -f.share))
 
@@ -196,7 +230,7 @@ def _finding(
         share = 0.0
     order = np.argsort(-each)
     chosen = tuple(names[j] for j in order[:4] if each[j] >= 0.25 * each[order[0]])
-    return Finding(cause, float(share), chosen, f"{ADVICE[cause]} {', '.join(chosen)}")
+    return _named(cause, float(share), chosen, ", ".join(chosen))
 
 
 @dataclass(frozen=True, slots=True)

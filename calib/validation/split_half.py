@@ -20,6 +20,7 @@ from deal_hw.calib.fit.refinement import Polished, polish_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.uncertainty.at_fit import statement, widened_to, with_rows
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
+from deal_hw.calibration import Alarm, listed
 from deal_hw.sim.recordings.windows import Windows
 from deal_hw.types import FloatArray
 
@@ -86,13 +87,19 @@ class Halves:
         }
 
     @property
-    def alarm(self) -> str:
-        """In words; empty where nothing is flagged."""
+    def alarms(self) -> tuple[Alarm, ...]:
+        """One that names all that is flagged; none where nothing is."""
         if not self.flagged:
-            return ""
+            return ()
+        both = {r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g})" for r in self.rows}
         return (
-            f"two halves of the data disagree about {', '.join(self.flagged)}: the value depends on what is "
-            "fitted, so the model lacks something; their intervals were widened to hold both"
+            Alarm(
+                "Two halves of the data disagree about "
+                f"{listed([name + both.get(name, '') for name in self.flagged])}.",
+                "A value that depends on what is fitted means that the model lacks something. The intervals "
+                "were widened to hold both.",
+                "Find what the model lacks (see the other alarms), or fit only motion like that of the task.",
+            ),
         )
 
 
@@ -186,7 +193,7 @@ def heed(problem: Problem, known: Uncertainty, theta: FloatArray, halves: Halves
         return known
     flagged = np.array([name in halves.flagged for name in problem.space.names])
     wider = widened_to(problem, known, theta, np.where(flagged, halves.reach / Z90, 0.0))
-    return dataclasses.replace(wider, alarms=(*wider.alarms, halves.alarm))
+    return dataclasses.replace(wider, alarms=(*wider.alarms, *halves.alarms))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:

@@ -22,56 +22,76 @@ class Trust:
 
     Attributes:
         colour: Green: use it. Amber: it has a known weakness. Red: do not use it.
-        sentence: What was seen, what it means, what to do.
+        seen: What was seen.
+        means: What it means.
+        do: What to do.
     """
 
     colour: Colour
-    sentence: str
+    seen: str
+    means: str
+    do: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it in one line."""
+        return f"{self.seen} {self.means} {self.do}"
 
 
 def trust(result: CalibrationResult) -> Trust:
     """Return whether a result can be used."""
-    errors = result.heldout_nrmse
-    nominal, calibrated = errors.get("nominal"), errors.get("calibrated")
-    judged = nominal is not None and calibrated is not None
-    gain = ""
-    if nominal is not None and calibrated is not None:
-        if not calibrated <= WORSE * nominal:
-            return Trust(
-                "red",
-                f"On held-out motion the calibrated model errs by {100 * calibrated:.2g} % of the signal's "
-                f"range, your own model by {100 * nominal:.2g} %: it is worse. Do not use it; check units, "
-                "signs and joint order of the recordings, then the alarms.",
-            )
-        gain = f"On held-out motion the error is {nominal / max(calibrated, 1e-300):.1f} times smaller than "
-        gain += "your own model's."
+    nominal, calibrated = (result.heldout_nrmse.get(name) for name in ("nominal", "calibrated"))
+    noise = (
+        f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise." if result.chi2 >= 0 else ""
+    )
     mismatch = result.chi2 > MISMATCH_CHI2
-    if mismatch and not judged:
+    if nominal is None or calibrated is None:
+        record = "Record one more motion and name it with --holdout."
+        if mismatch:
+            means = "The model does not explain them, and no held-out recording says whether it is better."
+            return Trust("red", noise, means, f"Do not use it. {record}")
+        gain = "There is no held-out recording."
+    elif not calibrated <= WORSE * nominal:
         return Trust(
             "red",
-            f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise and no held-out recording "
-            "says whether the model is better all the same. Record one (--holdout) and calibrate again.",
+            f"On held-out motion the calibrated model errs by {100 * calibrated:.2g} % of the signal's "
+            "range, your "
+            f"own model by {100 * nominal:.2g} %.",
+            "The calibrated model is worse.",
+            "Do not use it. Check units, signs and joint order of the recordings, then the alarms.",
         )
+    else:
+        record = ""
+        smaller = nominal / max(calibrated, 1e-300)
+        gain = f"On held-out motion the error is {smaller:.1f} times smaller than your own model's."
     if mismatch:
         return Trust(
             "amber",
-            f"{gain} Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise: the model lacks "
-            "something that the robot has. Use it, but trust predictions more than single parameters.",
+            f"{gain} {noise}",
+            "The model is better than yours, and lacks something that the robot has.",
+            "Use it, but trust predictions more than single values.",
         )
     if result.alarms:
-        return Trust("amber", f"{gain} There are alarms: read them before you use it.".strip())
+        count = f"There {'is 1 alarm' if len(result.alarms) == 1 else f'are {len(result.alarms)} alarms'}."
+        return Trust(
+            "amber", f"{gain} {count}", "The result has a known weakness.", "Read them before you use it."
+        )
     if math.isnan(result.chi2):
-        return Trust("amber", f"{gain} No test was made of whether the model explains the recording.".strip())
-    if result.null_directions or "not identifiable" in result.verdicts:
+        return Trust(
+            "amber", gain, "No test was made of whether the model explains the recordings.",
+            f"Compare the held-out error with what your task can bear. {record}".strip(),
+        )  # fmt: skip
+    untold = result.verdicts.count("not identifiable")
+    if result.null_directions or untold:
         return Trust(
             "amber",
-            f"{gain} The model explains the recordings, but they do not tell all parameters: those without a "
-            "value keep their whole range in training.".strip(),
+            f"{gain} {noise}"
+            + (f" {untold} of {len(result.space)} parameters have no value." if untold else ""),
+            "The model explains the recordings, but they do not tell all parameters.",
+            "Use it: training keeps the whole range of those. Or record what is advised below.",
         )
-    if not judged:
+    if record:
         return Trust(
-            "amber",
-            "The model explains the recordings, but no held-out recording says whether it holds on other "
-            "motion. Record one (--holdout).",
+            "amber", f"{gain} {noise}", "Nothing says whether the model holds on other motion.", record
         )
-    return Trust("green", f"{gain} What is left has the size of the sensor's noise.")
+    return Trust("green", f"{gain} {noise}", "What is left is the sensor's noise.", "Use it.")

@@ -76,7 +76,7 @@ def calibration_row(
         "seconds": result.seconds,
         "flagged": bool(result.alarms) or bool(untold),
         "chi2": result.chi2,
-        "alarms": list(result.alarms),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "untold": untold,
         "null_directions": list(result.null_directions),
         "per_parameter": {

@@ -71,8 +71,8 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
     return row | {
         "causes": causes,
         "colour": trust(result).colour,
-        "named": names(fault, causes, [*result.alarms, *work.telemetry]),
-        "alarms": list(result.alarms),
+        "named": names(fault, causes, [*map(str, result.alarms), *work.telemetry]),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "search": result.provenance.get("search", ""),
         "chi2": result.chi2,
         "seconds": result.seconds,

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import (
+    Alarm,
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+)
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
@@ -110,7 +117,14 @@ class BestSoFar:
             heldout_nrmse={
                 "nominal": errors["nominal"], "calibrated": errors["so far"], "null": errors["null"]
             } if errors else {},
-            alarms=("interrupted: no interval was computed; ranges are those that were searched",),
+            alarms=(
+                Alarm(
+                    f"The calibration was interrupted after {progress.stage}, "
+                    f"{time.monotonic() - self._began:.0f} s.",
+                    "No interval was computed; those given are the search ranges.",
+                    "Calibrate again; --resume goes on where it stopped.",
+                ),
+            ),
         )  # fmt: skip
         if not self._quiet:
             print(

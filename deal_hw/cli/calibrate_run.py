@@ -414,6 +414,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         name: Name under which `deal-hw collect` records this robot; "" where it does not.
     """
     from rich.console import Console
+    from rich.markup import escape
+    from rich.padding import Padding
     from rich.table import Table
 
     from deal_hw.calib.design.advice import next_step
@@ -449,8 +451,9 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for number, line in enumerate(next_step(result.advice, name)):
         # A command is to be copied: not wrapped.
         console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
-    for words in result.alarms:
-        console.print(f"[bold]alarm:[/bold] {words}")
+    for alarm in result.alarms:
+        console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
+        console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
     if not result.heldout_nrmse:
         console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
         return

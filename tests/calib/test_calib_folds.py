@@ -120,7 +120,7 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> 
     folds = result.provenance["folds"]
     assert folds["chosen"] in ("search", "polish") and set(folds["errors"]) == {"search", "polish"}
     assert "diagnosis" in result.provenance
-    assert any("does not explain" in words for words in result.alarms)
+    assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
 def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(case: Case) -> None:

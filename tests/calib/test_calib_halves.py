@@ -53,7 +53,7 @@ def test_halves_of_a_right_model_agree(problem: Problem, polished: Polished) -> 
     """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
     known = statement(problem, polished, fixed_latency=True)
     halves = compare_halves(problem, polished, known)
-    assert halves.flagged == () and halves.alarm == "" and halves.steps > 0
+    assert halves.flagged == () and halves.alarms == () and halves.steps > 0
     assert [r.name for r in halves.rows] == list(problem.space.names)
     assert all(r.first[1] <= r.first[0] <= r.first[2] for r in halves.rows)
     assert halves_rows({"halves": halves.to_json()}) == halves.rows
@@ -74,7 +74,7 @@ def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
     wide = heed(problem, known, polished.theta, Halves((), ("servo.stiffness",), reach))
     assert wide.interval[k, 1] == pytest.approx(far)
     assert wide.interval[0] == pytest.approx(known.interval[0])
-    assert any("disagree about servo.stiffness" in words for words in wide.alarms)
+    assert any("disagree about servo.stiffness" in alarm.seen for alarm in wide.alarms)
 
 
 def test_too_few_windows_are_not_halved(case: Case, problem: Problem, polished: Polished) -> None:

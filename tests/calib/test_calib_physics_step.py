@@ -80,9 +80,9 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
     wider = counted(problem, known, theta, found).interval
     assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
     assert found.preferred
-    alarm = step_alarm(problem, known, found)
-    assert "2.5 ms is too coarse" in alarm and "--physics-step 0.00125" in alarm
-    assert "hinge.armature" in alarm or "hinge.damping" in alarm
+    (alarm,) = step_alarm(problem, known, found)
+    assert "2.5 ms is too coarse" in alarm.means and "--physics-step 0.00125" in alarm.do
+    assert "hinge.armature" in alarm.seen or "hinge.damping" in alarm.seen
     # Half the error is removed by half the step: corrected, the estimate is nearer the truth.
     corrected = problem.space.from_scale(problem.space.to_scale(theta) + found.bias[:-1])
     off, was = (np.abs(np.log(value / TRUTH)).max() for value in (corrected, theta))
@@ -92,7 +92,7 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
     """The finer step explains them worse: nothing is said, no interval is widened."""
     problem, theta, known, found = checked(tmp_path, STEP_S)
-    assert found.rejected and step_alarm(problem, known, found) == ""
+    assert found.rejected and step_alarm(problem, known, found) == ()
     assert counted(problem, known, theta, found) is known
     assert np.all(known.interval[:, 0] <= TRUTH) and np.all(known.interval[:, 1] >= TRUTH)
 
@@ -104,7 +104,7 @@ def test_a_check_that_would_take_too_long_says_so(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(physics_step, "MOST_STEPS", 10.0)
     problem, theta, known, found = checked(tmp_path, STEP_S)
     assert "it would take" in found.to_json()["note"]
-    assert counted(problem, known, theta, found) is known and step_alarm(problem, known, found) == ""
+    assert counted(problem, known, theta, found) is known and step_alarm(problem, known, found) == ()
 
 
 def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal:
     search = Near(ideal.theta, 0.02)
     result = PolishedMethod(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.runs >= 2
-    assert any("does not explain" in words for words in result.alarms)
+    assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
 def test_white_noise_is_measured_under_motion() -> None:
@@ -208,7 +208,7 @@ def test_a_parameter_at_its_bound_is_reported() -> None:
         space, np.array([1.0, 5.0]), 0.01, np.diag([1e4, 1e4, 1e8]), 1.0,
         (np.random.default_rng(0).normal(size=(4, 50, 2)),), (0.0, 0.04),
     )  # fmt: skip
-    assert any(words.startswith("b ended at the bound") for words in told.alarms)
+    assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
     assert told.verdicts == ("identifiable", "identifiable")
 
 
