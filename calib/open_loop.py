@@ -29,16 +29,15 @@ from deal_hw.calib.fit.refinement import Polished, at_parameters
 from deal_hw.calib.pipeline import Calibration, Outcome, offer
 from deal_hw.calib.search.eki import Weki
 from deal_hw.calib.search.restarts import Attempts
-from deal_hw.calib.uncertainty.at_fit import with_rows
-from deal_hw.calib.uncertainty.correlated import confounded
 from deal_hw.calib.uncertainty.intervals import (
-    MISMATCH_CHI2,
+    MISMATCH,
     Uncertainty,
     ended_at_bound,
     mismatch,
     uncertainty,
+    with_rows,
 )
-from deal_hw.calib.validation.checks import Validation, with_causes, with_step
+from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import (
     Choice,
     Member,
@@ -48,6 +47,7 @@ from deal_hw.calib.validation.cross_validation import (
     time_masks,
 )
 from deal_hw.calib.validation.split_half import Halves, agreement, heed
+from deal_hw.calib.validation.verdict import Validation, with_causes, with_step
 from deal_hw.calibration import (
     Alarm,
     Budget,
@@ -366,7 +366,7 @@ def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
 
 
 def _unexplained(chi2: float) -> tuple[Alarm, ...]:
-    if chi2 <= MISMATCH_CHI2:
+    if chi2 <= MISMATCH.chi2:
         return ()
     return (mismatch(chi2, f" over {SETTINGS.mismatch_s:g} s from fitted start states"),)
 

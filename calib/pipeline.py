@@ -22,11 +22,10 @@ from deal_hw.calib.fit.local import local_fit
 from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust
 from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis
 from deal_hw.calib.search.restarts import Attempts
-from deal_hw.calib.uncertainty.at_fit import statement, with_rows
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty
-from deal_hw.calib.uncertainty.latency_scan import averaged, scan_latency
-from deal_hw.calib.validation.checks import Validation, judge, unexplained
+from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, statement, with_rows
+from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
 from deal_hw.calib.validation.cross_validation import Choice, choose
+from deal_hw.calib.validation.verdict import Validation, judge, unexplained
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     Budget,
@@ -48,11 +47,13 @@ class RestartSettings:
         same: Two searches whose unexplained chi2 differ by a smaller share say that the model is wrong, not
             the search.
         fewest_generations: With fewer left in the budget another search would not get anywhere.
+        explained: Below this chi2 no other search is run.
     """
 
     restarts: int = 2
     same: float = 0.2
     fewest_generations: int = 15
+    explained: float = MISMATCH.chi2
 
 
 RESTARTS = RestartSettings()
@@ -181,7 +182,24 @@ class Calibration(CalibrationMethod[Problem]):
 
 
 class PolishedMethod(Calibration):
-    """A search followed by the polish; searched again from other draws while the residual is unexplained."""
+    """A search followed by the polish; searched again from other draws while the residual is unexplained.
+
+    Args:
+        search: The search.
+        name: Name of the whole.
+        settings: What is checked, and whether the local fit comes first.
+        restarts: When it is searched again.
+    """
+
+    def __init__(
+        self,
+        search: CalibrationMethod[Problem],
+        name: str | None = None,
+        settings: Validation | None = None,
+        restarts: RestartSettings = RESTARTS,
+    ) -> None:
+        super().__init__(search, name, settings)
+        self.restarts = restarts
 
     def fitted(
         self,
@@ -193,7 +211,7 @@ class PolishedMethod(Calibration):
         progress: ProgressCallback | None,
     ) -> Outcome:
         """Search, polish, let inner folds say whether the polish helps. See :meth:`Calibration.fitted`."""
-        searched, polished, restarts = _until_explained(attempts, problem, budget, progress)
+        searched, polished, restarts = _until_explained(attempts, problem, budget, self.restarts, progress)
         choice = self._choose(problem, budget, rng, searched, polished, progress)
         return to_the_noise(problem, searched, polished, self.settings, progress, choice, restarts)
 
@@ -217,7 +235,9 @@ class PolishedMethod(Calibration):
         seed = int(rng.integers(2**32))
         length = polished.shooting.length
         # A fold needs no more generations than the whole did.
-        less = dataclasses.replace(budget, generations=max(len(searched.trace), RESTARTS.fewest_generations))
+        less = dataclasses.replace(
+            budget, generations=max(len(searched.trace), self.restarts.fewest_generations)
+        )
         return choose(problem, self.search, less, seed, length, searched.steps, robust)
 
 
@@ -344,11 +364,15 @@ def without_search(problem: Problem, budget: Budget, local: Polished) -> Calibra
 
 
 def _until_explained(
-    attempts: Attempts, problem: Problem, budget: Budget, progress: ProgressCallback | None
+    attempts: Attempts,
+    problem: Problem,
+    budget: Budget,
+    settings: RestartSettings,
+    progress: ProgressCallback | None,
 ) -> tuple[CalibrationResult, Polished, int]:
     best: tuple[CalibrationResult, Polished] | None = None
     attempt, left = 0, budget.generations
-    for attempt in range(1 + RESTARTS.restarts):
+    for attempt in range(1 + settings.restarts):
         searched = attempts.run(problem, attempt, dataclasses.replace(budget, generations=left), progress)
         offer("search", searched.estimate, searched.latency_s, searched.chi2, progress)
         left -= len(searched.trace)
@@ -358,8 +382,8 @@ def _until_explained(
         if best is None or _better(polished, best[1]):
             best = (searched, polished)
         # Two searches that end at the same unexplained residual say that the model is wrong, not the search.
-        same = abs(polished.chi2 - previous) < RESTARTS.same * previous
-        if best[1].chi2 < MISMATCH_CHI2 or same or left < RESTARTS.fewest_generations:
+        same = abs(polished.chi2 - previous) < settings.same * previous
+        if best[1].chi2 < settings.explained or same or left < settings.fewest_generations:
             break
     if best is None:
         raise RuntimeError("unreachable: at least one search is run")
@@ -368,7 +392,7 @@ def _until_explained(
 
 def _better(a: Polished, b: Polished) -> bool:
     """Say whether ``a`` explains more: a longer window only counts where both are explained."""
-    if a.chi2 < MISMATCH_CHI2 and b.chi2 < MISMATCH_CHI2 and a.shooting.length != b.shooting.length:
+    if a.chi2 < MISMATCH.chi2 and b.chi2 < MISMATCH.chi2 and a.shooting.length != b.shooting.length:
         return a.shooting.length > b.shooting.length
     return a.chi2 < b.chi2
 

@@ -1,4 +1,4 @@
-"""The page itself: words and numbers for the template, and the file."""
+"""What a calibration writes: the report's page, and the result folder with numbers, trace and model."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 
-from deal_hw.calib.report import charts
-from deal_hw.calib.report.inputs import ReportInputs
+from deal_hw.calib.report.gather import ReportInputs
+from deal_hw.calib.uncertainty.intervals import ended_at_bound
 from deal_hw.calib.validation.verdict import trust
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import RESULT_FILE, CalibrationResult
+from deal_hw.data.files import published_together, write_json
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 
+DISTRIBUTION = "distribution.json"
+MODEL = "calibrated.xml"
+TRACE = "trace.npz"
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
-AT_BOUND = 1e-6
-"""A parameter so near an end of its range, as a share of the range, ended there."""
 
 _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "halves")
 """Provenance with a place of its own on the page."""
@@ -83,6 +87,11 @@ def write_report(path: Path, inputs: ReportInputs) -> None:
 
 def render(inputs: ReportInputs) -> str:
     """Return the page; all that comes from the user is escaped."""
+    # Only here: matplotlib takes half a second to load.
+    from jinja2 import Environment, StrictUndefined
+
+    from deal_hw.calib.report import charts
+
     # StrictUndefined: a name that the template has and this module lacks is an error, not a gap.
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -91,7 +100,7 @@ def render(inputs: ReportInputs) -> str:
     result = inputs.result
     provenance = dict(result.provenance)
     scan = _mapping(provenance.get("latency_scan"))
-    panels = sum(min(len(shown.names), charts.PANELS) for shown in inputs.overlays)
+    panels = sum(min(len(shown.names), charts.SETTINGS.panels) for shown in inputs.overlays)
     heldout = _mapping(provenance.get("heldout_rmse"))
     names, joints = heldout_rows(heldout)
     drawn = [(shown, *charts.residuals(shown)) for shown in inputs.residuals]
@@ -108,7 +117,7 @@ def render(inputs: ReportInputs) -> str:
         ],
         weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
-        panels_each=charts.PANELS,
+        panels_each=charts.SETTINGS.panels,
         heldout_window_s=float(heldout.get("window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
@@ -137,10 +146,10 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         100 * np.clip(space.normalize(values), 0, 1)
         for values in (result.interval[:, 0], result.interval[:, 1], space.nominal, result.estimate)
     ]
-    unit = space.normalize(result.estimate)
+    ended = ended_at_bound(space, result.estimate)
     rows = []
     for k, p in enumerate(space):
-        bound = "lower" if unit[k] < AT_BOUND else "upper" if unit[k] > 1 - AT_BOUND else ""
+        bound = ("upper" if at[3][k] > 50 else "lower") if ended[k] else ""
         prior = ""
         if p.prior_mean is not None and p.prior_std is not None:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
@@ -225,3 +234,57 @@ def _plain(value: Any) -> str:
     if isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def write_result(
+    folder: Path, robot: RobotModel, result: CalibrationResult, report: ReportInputs | None = None
+) -> dict[str, Path]:
+    """Write everything a calibration found; all of it appears, or none.
+
+    Args:
+        folder: Where to write; made if need be.
+        robot: The nominal model.
+        result: What was found.
+        report: What the report shows; None to write none.
+
+    Returns:
+        The files by name; included files of the model that changed are among them.
+
+    Raises:
+        DatasetError: The folder cannot be written.
+        ConfigurationError: A calibrated value cannot be written into the model; all other files are there.
+        KeyboardInterrupt: Ctrl-C; nothing was changed, or all files are there.
+    """
+    unwritable: ConfigurationError | None = None
+    try:
+        with published_together(folder) as waiting:
+            names = [RESULT_FILE, DISTRIBUTION, TRACE]
+            write_json(waiting / RESULT_FILE, result.to_json())
+            write_json(waiting / DISTRIBUTION, result.distribution().to_json())
+            np.savez(waiting / TRACE, **_trace(result))
+            if report is not None:
+                write_report(waiting / REPORT, report)
+                names.append(REPORT)
+            source = f"method {result.method}, distribution {result.distribution().digest()}"
+            try:
+                require_other(folder / MODEL, robot.description.mjcf)
+                written = write_calibrated_mjcf(
+                    robot, result.space, result.estimate, waiting / MODEL, result.latency_s, source
+                )
+                names += [file.name for file in written]
+            except ConfigurationError as err:
+                # A model that cannot be written must not cost the numbers.
+                unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
+    except OSError as err:
+        raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
+    if unwritable is not None:
+        raise unwritable
+    return {name: folder / name for name in names}
+
+
+def _trace(result: CalibrationResult) -> dict[str, Any]:
+    keys = sorted({key for row in result.trace for key in row})
+    columns: dict[str, Any] = {key: np.array([row.get(key, np.nan) for row in result.trace]) for key in keys}
+    if result.population is not None:
+        columns["population"] = result.population
+    return columns

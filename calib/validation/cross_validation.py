@@ -23,14 +23,23 @@ from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
-FOLDS = 2
-"""Each costs a search and a polish."""
 
-BLOCKS = 2
-"""Stretches of each recording that a fold leaves out."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoldSettings:
+    """Settings of :func:`choose`.
 
-MOST_STEPS = 3e9
-"""More physics steps than this are not spent on folds."""
+    Attributes:
+        folds: Each costs a search and a polish.
+        blocks: Stretches of each recording that a fold leaves out.
+        most_steps: More physics steps than this are not spent on folds.
+    """
+
+    folds: int = 2
+    blocks: int = 2
+    most_steps: float = 3e9
+
+
+SETTINGS = FoldSettings()
 
 Member = tuple[FloatArray, float]
 """Physical parameters, (K,), and latency [s]."""
@@ -90,8 +99,8 @@ def choose(
         robust: Try the robust polish, too.
     """
     window_s = length * problem.episodes[0].period_s
-    if FOLDS * search_steps > MOST_STEPS:
-        note = f"left out: {FOLDS} searches would take {FOLDS * search_steps:.1g} physics steps"
+    if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
+        note = f"left out: {SETTINGS.folds} searches would take {cost:.1g} physics steps"
         return Choice("polish", {}, window_s, note=note)
     before = problem.steps
     candidates: dict[str, Fit] = {"search": _searched, "polish": _polished}
@@ -141,7 +150,7 @@ def on_folds(
     return Choice(chosen, {n: tuple(v) for n, v in found.items()}, window_s)
 
 
-def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
+def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each fold which samples of each recording it leaves out, (T,) each.
 
     Where there are as many motions as folds, whole motions are left out, every other one: other motion is
@@ -159,7 +168,7 @@ def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np
     found: list[list[npt.NDArray[np.bool_]]] = [[] for _ in range(count)]
     for number, episode in zip(unit, episodes, strict=True):
         T = len(episode.sample)
-        block = np.arange(T) * count * BLOCKS // T if len(episodes) < count else np.full(T, number)
+        block = np.arange(T) * count * SETTINGS.blocks // T if len(episodes) < count else np.full(T, number)
         for fold in range(count):
             found[fold].append(block % count == fold)
     return found

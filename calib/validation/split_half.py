@@ -18,21 +18,31 @@ from scipy.stats import norm
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.refinement import Polished, polish_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.uncertainty.at_fit import statement, widened_to, with_rows
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
+from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, statement, widened_to, with_rows
 from deal_hw.calibration import Alarm, listed
 from deal_hw.sim.recordings.windows import Windows
 from deal_hw.types import FloatArray
 
-ITERATIONS = 6
-MOST_STEPS = 3e8
-"""More physics steps than this are not spent on the comparison."""
 
-FEWEST_WINDOWS = 4
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitHalfSettings:
+    """Settings of :func:`compare_halves`.
 
-FALSE_ALARMS = 0.05
-"""How often any parameter of a right model may be flagged: with many parameters some intervals of halves
-always miss each other."""
+    Attributes:
+        iterations: Most iterations of each half's fit.
+        most_steps: More physics steps than this are not spent on the comparison.
+        fewest_windows: Fewer windows are not halved.
+        false_alarms: How often any parameter of a right model may be flagged [-]: with many parameters some
+            intervals of halves always miss each other.
+    """
+
+    iterations: int = 6
+    most_steps: float = 3e8
+    fewest_windows: int = 4
+    false_alarms: float = 0.05
+
+
+SETTINGS = SplitHalfSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,20 +138,21 @@ def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> 
     shooting, K = polished.shooting, len(problem.space)
     nothing = np.zeros(K)
     windows = sum(len(d.windows) for d in shooting.data)
-    if windows < FEWEST_WINDOWS:
+    if windows < SETTINGS.fewest_windows:
         return Halves((), (), nothing, note=f"{windows} windows are too few to halve: record longer")
     cost = _steps(problem, shooting)
-    if cost > MOST_STEPS:
+    if cost > SETTINGS.most_steps:
         return Halves((), (), nothing, note=f"left out: it would take {cost:.1g} physics steps")
     before = problem.steps
     block = 1
     if known.clustered is not None:
-        # Blocks as long as residuals hang together, but at least two blocks in each half.
-        block = max(1, min(round(known.clustered.block_samples / shooting.length), windows // FEWEST_WINDOWS))
+        # Blocks as long as residuals are correlated, but at least two blocks in each half.
+        longest = windows // SETTINGS.fewest_windows
+        block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
     estimates, stds, intervals = [], [], []
     for half in range(2):
         found = polish_windows(
-            *half_of(shooting, polished.point, half, block), ITERATIONS, fixed_latency=True
+            *half_of(shooting, polished.point, half, block), SETTINGS.iterations, fixed_latency=True
         )
         told = statement(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: what all of them say of clustering holds for it, too.
@@ -180,7 +191,7 @@ def agreement(
 
     rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
     told = ~known.shape.blind
-    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(told.sum()), 1)))
+    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(told.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
     far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
     flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
@@ -237,4 +248,4 @@ def _steps(problem: Problem, shooting: Shooting) -> float:
     samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
     # One normal matrix and one line of damped steps an iteration.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
-    return float(ITERATIONS * members * samples * substeps)
+    return float(SETTINGS.iterations * members * samples * substeps)

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.validation.checks import MOST_CAUSES
-from deal_hw.calib.validation.verdict import trust
+from deal_hw.calib.validation.verdict import SETTINGS, trust
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
 from deal_hw.cli.calibrate_model import Recordings
@@ -67,7 +66,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         except DealHwError as err:
             # Refused before any work: as good as red, if it says why.
             return row | {"colour": "refused", "named": names(fault, [], [str(err)]), "refusal": str(err)}
-    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_CAUSES]]
+    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[: SETTINGS.causes]]
     return row | {
         "causes": causes,
         "colour": trust(result).colour,

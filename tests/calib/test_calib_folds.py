@@ -12,9 +12,9 @@ from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.robust import huber_weights, kurtosis
 from deal_hw.calib.pipeline import PolishedMethod
-from deal_hw.calib.uncertainty.at_fit import with_rows
-from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
+from deal_hw.calib.validation.verdict import Validation, unexplained
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,

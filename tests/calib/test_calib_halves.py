@@ -10,9 +10,9 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, polish
 from deal_hw.calib.pipeline import foretell
-from deal_hw.calib.uncertainty.at_fit import statement, with_rows
-from deal_hw.calib.validation.checks import Validation, judge
+from deal_hw.calib.uncertainty.intervals import statement, with_rows
 from deal_hw.calib.validation.split_half import Halves, compare_halves, half_of, halves_rows, heed
+from deal_hw.calib.validation.verdict import Validation, judge
 from deal_hw.calibration import BEFORE_SEARCH, Progress
 from deal_hw.cli.bench_tasks import Case, make_case
 from deal_hw.drivers.cartpole.description import parameter_space

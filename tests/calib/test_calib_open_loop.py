@@ -16,7 +16,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_horizon, prediction_rmse
 from deal_hw.calib.open_loop import OpenLoop
 from deal_hw.calib.search.checkpoint import Checkpoint
-from deal_hw.calib.uncertainty.correlated import confounded
+from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.cli.calibrate_model import Recordings, prepare_model

@@ -13,12 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.calib.report.charts import autocorrelation
-from deal_hw.calib.report.figure import envelope
-from deal_hw.calib.report.folder import write_result
-from deal_hw.calib.report.gather import gather
-from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
-from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report
+from deal_hw.calib.report.charts import autocorrelation, envelope
+from deal_hw.calib.report.gather import Overlay, ReportInputs, Residuals, gather
+from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report, write_result
 from deal_hw.calib.validation.split_half import HalvesRow
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import Alarm, CalibrationResult, read_result

@@ -11,12 +11,12 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
-from deal_hw.calib.pipeline import PolishedMethod
+from deal_hw.calib.pipeline import PolishedMethod, RestartSettings
 from deal_hw.calib.search.checkpoint import Checkpoint
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Weki, WekiSettings
 from deal_hw.calib.search.identity import run_identity
-from deal_hw.calib.validation.checks import Validation
+from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model
@@ -92,15 +92,12 @@ def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> Non
     check_same(run(method, make_problem(1e-3), budget, Checkpoint(path, "a"), 0), whole)
 
 
-def test_polished_method_keeps_finished_searches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_polished_method_keeps_finished_searches(tmp_path: Path) -> None:
     """Stopped in the second search and in the polish: no search runs twice, the numbers are the same."""
-    from deal_hw.calib import pipeline
-
     # Nothing is ever explained and no two searches agree: all three attempts are made.
-    monkeypatch.setattr(pipeline, "MISMATCH_CHI2", 0.0)
-    monkeypatch.setattr(pipeline, "RESTARTS", pipeline.RestartSettings(same=0.0, fewest_generations=1))
+    restarts = RestartSettings(same=0.0, fewest_generations=1, explained=0.0)
     search = Weki(WekiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
-    method = PolishedMethod(search, settings=Validation(local_first=False))
+    method = PolishedMethod(search, settings=Validation(local_first=False), restarts=restarts)
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
     stages: list[str] = []
 
