@@ -18,9 +18,8 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.local import local_fit
-from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust
-from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis
+from deal_hw.calib.fit.refinement import Polished, at_parameters, local_fit, polish, polish_robust
+from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.restarts import Attempts
 from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, statement, with_rows
 from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
@@ -230,7 +229,7 @@ class PolishedMethod(Calibration):
             return None
         if progress is not None:
             progress(Progress("folds", 0, 1, "does the polish help on what it has not seen?"))
-        robust = self.settings.robust and kurtosis(polished.normal.residual) > HEAVY_TAILS
+        robust = self.settings.robust and kurtosis(polished.normal.residual) > ROBUST.heavy_tails
         # Drawn after all searches, so that a resumed run draws the same.
         seed = int(rng.integers(2**32))
         length = polished.shooting.length

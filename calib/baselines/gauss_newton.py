@@ -20,7 +20,7 @@ from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.contacts import damped_step
-from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, value_bounds
+from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.calib.uncertainty.intervals import uncertainty
@@ -112,7 +112,7 @@ class Innovations:
         if follow:
             self.offsets = [np.zeros((len(d.windows), 2 * d.start_position.shape[1])) for d in self.windows]
         K = len(problem.space)
-        steps = np.append(np.full(K, PARAMETER_STEP), LATENCY_STEP_S)
+        steps = np.append(np.full(K, DIFFERENCES.parameter), DIFFERENCES.latency_s)
         self._steps = steps[: K + (problem.fixed_latency_s is None)]
         mean, std = problem.space.prior
         self._expected = np.flatnonzero(np.isfinite(std))

@@ -24,7 +24,7 @@ from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.innovations import explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
-from deal_hw.calib.fit.residual import PARAMETER_STEP
+from deal_hw.calib.fit.residual import DIFFERENCES
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
 from deal_hw.calib.uncertainty.intervals import intervals
@@ -217,7 +217,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
     space = error.space
     mean, std = space.prior
     expected = np.isfinite(std) & (weight > 0)
-    step = PARAMETER_STEP * np.eye(len(space))
+    step = DIFFERENCES.parameter * np.eye(len(space))
 
     def rows(values: FloatArray) -> FloatArray:
         found = error.residual(values)
@@ -229,7 +229,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
 
     def jacobian(value: FloatArray) -> FloatArray:
         r = rows(np.concatenate([value[None], value + step]))
-        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
+        return np.asarray((r[1:] - r[0]).T / DIFFERENCES.parameter)
 
     bounds = space.to_scale(space.low), space.to_scale(space.high)
     return least_squares(residual, start, jac=jacobian, bounds=bounds, **ends)

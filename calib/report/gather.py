@@ -12,7 +12,6 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData, samples_in
 from deal_hw.calib.fit.output_error import longest_windows
-from deal_hw.calib.validation.split_half import HalvesRow, halves_rows
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
@@ -94,7 +93,6 @@ class ReportInputs:
         residuals: Whitened errors of the fitted recordings.
         tick_s: Device period, the unit of the latency scan [s]; None where unknown.
         telemetry: Verdicts of the telemetry checks, in words.
-        halves: Agreement of disjoint halves of the data.
         left_out: What is not drawn, in words.
     """
 
@@ -104,7 +102,6 @@ class ReportInputs:
     residuals: tuple[Residuals, ...] = ()
     tick_s: float | None = None
     telemetry: tuple[str, ...] = ()
-    halves: tuple[HalvesRow, ...] = ()
     left_out: tuple[str, ...] = ()
 
 
@@ -115,7 +112,6 @@ def gather(
     holdout: Sequence[Episode] = (),
     *,
     telemetry: Sequence[str] = (),
-    halves: Sequence[HalvesRow] = (),
     window_s: float = SETTINGS.window_s,
     threads: int | None = None,
 ) -> ReportInputs:
@@ -127,7 +123,6 @@ def gather(
         episodes: The fitted recordings.
         holdout: Recordings that the search has not seen.
         telemetry: Verdicts of the telemetry checks, in words.
-        halves: Agreement of disjoint halves of the data; by default what the result's provenance says.
         window_s: Drawn predictions restart this often [s]; where no recording is as long, more often.
         threads: Simulation threads.
     """
@@ -153,7 +148,6 @@ def gather(
         residuals=tuple(residuals),
         tick_s=episodes[0].step_s if episodes else None,
         telemetry=tuple(telemetry),
-        halves=tuple(halves) or halves_rows(result.provenance),
         left_out=tuple(left_out),
     )
 

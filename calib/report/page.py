@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -19,6 +18,7 @@ from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 
@@ -36,15 +36,10 @@ _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "setti
 class Row:
     """One line of the table of parameters; positions are percent of the search range."""
 
-    name: str
-    unit: str
-    nominal: float
+    parameter: Parameter
     estimate: float
     low: float
     high: float
-    range_low: float
-    range_high: float
-    log: bool
     verdict: str
     told: bool
     at_bound: str
@@ -53,16 +48,6 @@ class Row:
     nominal_at: float
     estimate_at: float
     prior: str
-
-
-@dataclass(frozen=True, slots=True)
-class AdviceRow:
-    """One line of what to record next, in words."""
-
-    parameter: str
-    before: str
-    after: str
-    sentence: str
 
 
 def write_report(path: Path, inputs: ReportInputs) -> None:
@@ -77,12 +62,8 @@ def write_report(path: Path, inputs: ReportInputs) -> None:
     """
     path = path / REPORT if path.is_dir() else path
     text = render(inputs)
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        fresh.write_text(text, encoding="utf-8", errors="backslashreplace")
-        os.replace(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
+    with published_together(path.parent) as waiting:
+        (waiting / path.name).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def render(inputs: ReportInputs) -> str:
@@ -121,6 +102,7 @@ def render(inputs: ReportInputs) -> str:
         heldout_window_s=float(heldout.get("window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
+        halves=_mapping(_mapping(provenance.get("halves")).get("parameters")),
         residuals=drawn,
         advice=advice_rows(result),
         scan=charts.latency_scan(scan, inputs.tick_s),
@@ -157,15 +139,10 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         low, high = map(float, result.interval[k])
         rows.append(
             Row(
-                name=p.name,
-                unit=p.unit,
-                nominal=p.nominal,
+                parameter=p,
                 estimate=float(result.estimate[k]),
                 low=low,
                 high=high,
-                range_low=p.low,
-                range_high=p.high,
-                log=p.scale == "log",
                 verdict=result.verdicts[k] if result.verdicts else "",
                 told=bool(told(result)[k]),
                 at_bound=bound,
@@ -194,15 +171,15 @@ def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, li
     return names, rows
 
 
-def advice_rows(result: CalibrationResult) -> list[AdviceRow]:
-    """Return the table of what to record next."""
+def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
+    """Return the table of what to record next, in words."""
     return [
-        AdviceRow(
-            parameter=str(row["parameter"]),
-            before=_spread(result, str(row["parameter"]), row["std"]),
-            after=_spread(result, str(row["parameter"]), row["std_after"]) if row["excitation"] else "–",
-            sentence=str(row["sentence"]),
-        )
+        {
+            "parameter": str(row["parameter"]),
+            "before": _spread(result, str(row["parameter"]), row["std"]),
+            "after": _spread(result, str(row["parameter"]), row["std_after"]) if row["excitation"] else "–",
+            "sentence": str(row["sentence"]),
+        }
         for row in result.advice
     ]
 

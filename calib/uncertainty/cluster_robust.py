@@ -77,7 +77,7 @@ class _Level:
     follows: npt.NDArray[np.bool_]
 
     @property
-    def hang_together(self) -> bool:
+    def autocorrelated(self) -> bool:
         """Whether neighbouring blocks are correlated."""
         power = np.sum(self.shift**2, axis=0)
         product = np.sum((self.shift[1:] * self.shift[:-1])[self.follows], axis=0)
@@ -95,7 +95,7 @@ def clustered(
         bread: Covariance under independent residuals of unit variance, (P, P); zero rows and columns for
             coordinates that are fixed.
         samples: Samples H of a window.
-        correlation_samples: How long residuals hang together; blocks are at least twice as long.
+        correlation_samples: Autocorrelation time of the residuals; blocks are at least twice as long.
 
     Returns:
         None where the recordings do not hold enough blocks.
@@ -103,7 +103,7 @@ def clustered(
     if not rows:
         return None
     found: Clustered | None = None
-    hanging = True
+    correlated = True
     for parts, group in _levels(rows, samples):
         length = group * samples // parts
         if length < max(SETTINGS.shortest, 2 * correlation_samples) and parts > 1:
@@ -111,10 +111,10 @@ def clustered(
         level = _level(rows, bread, samples, parts, group)
         blocks = len(level.shift)
         if blocks < SETTINGS.fewest_blocks or (
-            found is not None and blocks < SETTINGS.enough_blocks and not hanging
+            found is not None and blocks < SETTINGS.enough_blocks and not correlated
         ):
             break
-        found, hanging = _clustered(level, length), level.hang_together
+        found, correlated = _clustered(level, length), level.autocorrelated
     return found
 
 

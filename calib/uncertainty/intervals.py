@@ -195,7 +195,7 @@ def uncertainty(
     covariance = _covariance(data / inflation + np.diag(belief), free)
     cluster = _cluster(rows, covariance / inflation, residuals, tau)
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
-    # What the data cannot see stays as wide as the range, however its residuals hang together.
+    # What the data cannot see stays as wide as the range, however autocorrelated its residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
     factor = np.maximum(factor, 1.0)
     covariance = covariance * np.outer(factor, factor)

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish, polish_robust
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
+from deal_hw.calib.fit.refinement import polish, polish_robust
+from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
@@ -43,8 +43,6 @@ SETTINGS = FoldSettings()
 
 Member = tuple[FloatArray, float]
 """Physical parameters, (K,), and latency [s]."""
-
-Fit = Callable[[Problem, CalibrationResult], Member]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +101,18 @@ def choose(
         note = f"left out: {SETTINGS.folds} searches would take {cost:.1g} physics steps"
         return Choice("polish", {}, window_s, note=note)
     before = problem.steps
-    candidates: dict[str, Fit] = {"search": _searched, "polish": _polished}
-    if robust:
-        candidates["robust polish"] = _robust
+    fixed = problem.fixed_latency_s is not None
 
     def fits(train: Problem, fold: int) -> dict[str, Member]:
         searched = search.run(train, budget, np.random.default_rng([seed, fold]))
-        return {name: fit(train, searched) for name, fit in candidates.items()}
+        polished = polish(train, searched.estimate, searched.latency_s, fixed_latency=fixed)
+        found = {
+            "search": (searched.estimate, searched.latency_s), "polish": (polished.theta, polished.latency_s)
+        }  # fmt: skip
+        if robust:
+            weighed = polish_robust(polished, fixed)
+            found["robust polish"] = weighed.theta, weighed.latency_s
+        return found
 
     def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
         return prediction_error(test, members, length)
@@ -229,22 +232,3 @@ def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]],
         total += np.sum(np.where(np.isfinite(error), error, span) ** 2, axis=(1, 2, 3))
         count += int(np.count_nonzero(np.isfinite(data.std)))
     return np.asarray(np.sqrt(total / max(count, 1)))
-
-
-def _searched(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    return searched.estimate, searched.latency_s
-
-
-def _polished(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    found = _polish(problem, searched)
-    return found.theta, found.latency_s
-
-
-def _robust(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    found = polish_robust(_polish(problem, searched), problem.fixed_latency_s is not None)
-    return found.theta, found.latency_s
-
-
-def _polish(problem: Problem, searched: CalibrationResult) -> Polished:
-    fixed = problem.fixed_latency_s is not None
-    return polish(problem, searched.estimate, searched.latency_s, fixed_latency=fixed)

@@ -191,7 +191,7 @@ def diagnose(
         found: How the joints moved, with linearised residuals.
         hessian: Normal matrix of parameters and latency; fixed ones have zero rows and columns, (P, P).
         joint_names: Names of the joints.
-        correlation_samples: How long residuals hang together: random columns explain the more.
+        correlation_samples: Autocorrelation time of the residuals: random columns explain the more.
     """
     gain = np.asarray(np.linalg.pinv(hessian, rcond=1e-12, hermitian=True), dtype=np.float64)
     moved = np.concatenate([m.velocity.reshape(-1, m.velocity.shape[2]) for m in found])

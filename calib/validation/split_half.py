@@ -7,20 +7,18 @@ every phase of the motion. It costs some iterations over each half, less than on
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import norm
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, polish_windows
-from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.fit.residual import Point, Shooting, taken
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, statement, widened_to, with_rows
 from deal_hw.calibration import Alarm, listed
-from deal_hw.sim.recordings.windows import Windows
 from deal_hw.types import FloatArray
 
 
@@ -113,20 +111,6 @@ class Halves:
         )
 
 
-def halves_rows(provenance: Mapping[str, Any]) -> tuple[HalvesRow, ...]:
-    """Return the rows that a result's provenance holds; none where the comparison was not made."""
-    found = provenance.get("halves", {}).get("parameters", {})
-    return tuple(
-        HalvesRow(name=name, first=_three(row["first"]), second=_three(row["second"]))
-        for name, row in found.items()
-    )
-
-
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
-    estimate, low, high = map(float, values)
-    return estimate, low, high
-
-
 def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> Halves:
     """Polish two halves of the windows alone and compare; the latency stays what it is.
 
@@ -187,7 +171,7 @@ def agreement(
     space = problem.space
 
     def three(half: int, k: int) -> tuple[float, float, float]:
-        return _three([estimates[half][k], *intervals[half][k]])
+        return float(estimates[half][k]), float(intervals[half][k, 0]), float(intervals[half][k, 1])
 
     rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
     told = ~known.shape.blind
@@ -222,24 +206,10 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
         first += len(of_episode.windows)
         mine = number % 2 == half
         if mine.any():
-            data.append(take(of_episode, mine))
+            data.append(taken(of_episode, mine))
             position.append(point.position[e][mine])
             velocity.append(point.velocity[e][mine])
     return shooting.on(data), Point(point.value, tuple(position), tuple(velocity))
-
-
-def take(data: WindowData, chosen: npt.NDArray[np.bool_]) -> WindowData:
-    """Return some of the windows, chosen by a mask (W,)."""
-    return dataclasses.replace(
-        data,
-        windows=Windows(data.windows.start[chosen], data.windows.length, data.windows.stride),
-        measured=data.measured[chosen],
-        std=data.std[chosen],
-        start_position=data.start_position[chosen],
-        start_velocity=data.start_velocity[chosen],
-        prior_mean=data.prior_mean[chosen],
-        prior_std=data.prior_std[chosen],
-    )
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:

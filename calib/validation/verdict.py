@@ -94,7 +94,7 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
 
 
 def unexplained(polished: Polished) -> bool:
-    """Return whether the residual is larger, or hangs together longer, than noise does."""
+    """Return whether the residual is larger, or autocorrelated longer, than noise is."""
     if polished.chi2 <= MISMATCH.negligible_chi2:
         return False
     if polished.chi2 > MISMATCH.chi2:

@@ -10,7 +10,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust, polish_windows
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.fit.robust import huber_weights, kurtosis
+from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline import PolishedMethod
 from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error

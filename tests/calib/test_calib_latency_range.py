@@ -10,9 +10,8 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import damped_step
-from deal_hw.calib.fit.local import local_fit
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, fit_horizon
-from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.refinement import Polished, local_fit, polish
 from deal_hw.calib.validation.verdict import latency_alarms
 from deal_hw.errors import ConfigurationError
 

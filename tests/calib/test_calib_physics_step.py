@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.local import local_fit
+from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.uncertainty.intervals import Uncertainty, statement, with_rows
 from deal_hw.calib.uncertainty.time_steps import (
     StepCheck,

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from deal_hw.calib.report.charts import autocorrelation, envelope
 from deal_hw.calib.report.gather import Overlay, ReportInputs, Residuals, gather
 from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report, write_result
-from deal_hw.calib.validation.split_half import HalvesRow
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -120,13 +119,17 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
         alarms=(Alarm(HOSTILE, HOSTILE, HOSTILE),),
         null_directions=(HOSTILE,),
         trace=({HOSTILE: 1.0}, {HOSTILE: 2.0}),
-        provenance={"dataset": HOSTILE, HOSTILE: {HOSTILE: HOSTILE}, "settings": {HOSTILE: HOSTILE}},
+        provenance={
+            "dataset": HOSTILE,
+            HOSTILE: {HOSTILE: HOSTILE},
+            "settings": {HOSTILE: HOSTILE},
+            "halves": {"parameters": {HOSTILE: {"first": [1, 0, 2], "second": [3, 2.5, 4], "agree": False}}},
+        },
     )
     given_ = dataclasses.replace(
         inputs(found, name=HOSTILE),
         telemetry=(HOSTILE,),
         left_out=(HOSTILE,),
-        halves=(HalvesRow(name=HOSTILE, first=(1, 0, 2), second=(3, 2.5, 4)),),
     )
     page = Tags(render(given_))
     assert "script" not in page.tags
