@@ -69,7 +69,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
         return search
     from deal_hw.calib.pipeline import Calibration
     from deal_hw.calib.search.eki import Eki
-    from deal_hw.calib.validation.checks import Validation
+    from deal_hw.calib.validation.verdict import Validation
 
     if isinstance(search, Eki):
         search = dataclasses.replace(

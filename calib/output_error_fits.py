@@ -28,10 +28,15 @@ from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizo
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline import Calibration, CalibrationRun, Fits, Outcome
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.uncertainty.at_fit import with_rows
-from deal_hw.calib.uncertainty.correlated import confounded
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty, ended_at_bound, uncertainty
-from deal_hw.calib.validation.checks import Validation, with_causes, with_step
+from deal_hw.calib.uncertainty.intervals import (
+    MISMATCH,
+    Uncertainty,
+    ended_at_bound,
+    mismatch,
+    uncertainty,
+    with_rows,
+)
+from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import (
     Choice,
     Member,
@@ -41,7 +46,8 @@ from deal_hw.calib.validation.cross_validation import (
     time_masks,
 )
 from deal_hw.calib.validation.split_half import Halves, agreement, heed
-from deal_hw.calibration import CalibrationMethod, CalibrationResult
+from deal_hw.calib.validation.verdict import Validation, with_causes, with_step
+from deal_hw.calibration import Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
@@ -259,14 +265,10 @@ class OutputErrorFits(Fits):
             intervals.append(told.interval)
         return agreement(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)
 
-    def _unexplained(self, chi2: float) -> tuple[str, ...]:
-        if chi2 <= MISMATCH_CHI2:
+    def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
+        if chi2 <= MISMATCH.chi2:
             return ()
-        return (
-            f"the model does not explain the recordings to their noise: over {self._settings.mismatch_s:g} "
-            f"s, from fitted start states, predictions are off by {np.sqrt(chi2):.1f} times the sensor's "
-            "noise; the intervals count all of it as noise",
-        )
+        return (mismatch(chi2, f" over {self._settings.mismatch_s:g} s from fitted start states"),)
 
 
 def open_loop(search: CalibrationMethod[Problem] | None = None) -> Calibration:

@@ -19,15 +19,13 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.local import local_fit
-from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust
-from deal_hw.calib.fit.robust import HEAVY_TAILS, kurtosis
+from deal_hw.calib.fit.refinement import Polished, at_parameters, local_fit, polish, polish_robust
+from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.uncertainty.at_fit import statement, with_rows
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, Uncertainty
-from deal_hw.calib.uncertainty.latency_scan import averaged, scan_latency
-from deal_hw.calib.validation.checks import Validation, judge, unexplained
+from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, statement, with_rows
+from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
 from deal_hw.calib.validation.cross_validation import Choice, choose
+from deal_hw.calib.validation.verdict import Validation, judge, unexplained
 from deal_hw.calibration import (
     BEFORE_SEARCH,
     Budget,
@@ -50,12 +48,13 @@ class RestartSettings:
         same: Two searches whose unexplained chi2 differ by a smaller share say that the model is wrong, not
             the search.
         fewest_generations: With fewer left in the budget another search would not get anywhere.
+        explained: Below this chi2 no other search is run.
     """
 
-    explained: float = MISMATCH_CHI2
     restarts: int = 2
     same: float = 0.2
     fewest_generations: int = 15
+    explained: float = MISMATCH.chi2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,7 +257,7 @@ class Refinement(Fits):
         if not run.settings.folds or floating or conclusive(run.problem, refined):
             return None
         run.say("cross-validation", "does the refinement help on what it has not seen?")
-        robust = run.settings.robust and kurtosis(refined.normal.residual) > HEAVY_TAILS
+        robust = run.settings.robust and kurtosis(refined.normal.residual) > ROBUST.heavy_tails
         # Drawn after all searches, so that a resumed run draws the same.
         seed = int(run.rng.integers(2**32))
         # A fold needs no more generations than the whole did.

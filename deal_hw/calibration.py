@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar, get_args
 
@@ -13,6 +13,7 @@ import numpy as np
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterDistribution, ParameterSpace
 from deal_hw.reading import number, numbers, object_of, read_json, reading, texts
+from deal_hw.schema import from_values
 from deal_hw.types import FloatArray
 
 LATENCY_RANGE_S = (0.0, 0.04)
@@ -73,6 +74,43 @@ class Budget:
     polish: bool = True
 
 
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """A reason to distrust a result, in sentences for people.
+
+    Attributes:
+        seen: What was seen, with its number and unit.
+        means: What it means.
+        do: What to do.
+    """
+
+    seen: str
+    means: str
+    do: str
+
+    def __post_init__(self) -> None:
+        """Check that no part is missing."""
+        if not all(part.strip() for part in (self.seen, self.means, self.do)):
+            raise ValueError(
+                f"an alarm has three parts: what was seen, what it means, what to do; got {self!r}"
+            )
+
+    def __str__(self) -> str:
+        """Return all of it in one line."""
+        return f"{self.seen} {self.means} {self.do}"
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Return names in a sentence, the first few of many.
+
+    Args:
+        names: What to name.
+        most: So many are named.
+    """
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationResult:
     """What a calibration found.
@@ -89,7 +127,7 @@ class CalibrationResult:
         latency_s: Total latency found, or given [s].
         latency_interval_s: 90 % interval of the latency [s].
         chi2: Mean squared residual over its expected variance; 1 is a perfect model.
-        alarms: Reasons to distrust the model (mismatch), in words; empty is good.
+        alarms: Reasons to distrust the result; empty is good.
         advice: What to record next, one mapping a weak or unidentified parameter: ``parameter``, its standard
             deviation in its own scale now (``std``) and after that recording (``std_after``),
             ``excitation`` and a ``sentence``; empty where nothing is open or nobody asked.
@@ -112,7 +150,7 @@ class CalibrationResult:
     latency_s: float = 0.0
     latency_interval_s: tuple[float, float] = (0.0, 0.0)
     chi2: float = float("nan")
-    alarms: tuple[str, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
     advice: Sequence[Mapping[str, Any]] = ()
     heldout_nrmse: Mapping[str, float] = field(default_factory=dict)
     trace: Sequence[Mapping[str, float]] = ()
@@ -154,7 +192,7 @@ class CalibrationResult:
             "latency_s": self.latency_s,
             "latency_interval_s": list(self.latency_interval_s),
             "chi2": self.chi2,
-            "alarms": list(self.alarms),
+            "alarms": [asdict(alarm) for alarm in self.alarms],
             "advice": [dict(row) for row in self.advice],
             "heldout_nrmse": dict(self.heldout_nrmse),
             "steps": self.steps,
@@ -194,7 +232,7 @@ class CalibrationResult:
             latency_s=number(values["latency_s"], "latency_s", 0.0, LONGEST_LATENCY_S),
             latency_interval_s=(float(low_s), float(high_s)),
             chi2=float(numbers(values["chi2"], "chi2", (), finite=False)),
-            alarms=texts(values["alarms"], "alarms"),
+            alarms=tuple(from_values(list[Alarm], values["alarms"])),
             advice=tuple(object_of(row, "advice") for row in values.get("advice", ())),
             heldout_nrmse={
                 name: float(numbers(value, "heldout_nrmse", (), finite=False))

@@ -65,7 +65,7 @@ def measure(profile: str, seed: int, name: str, seconds: float, threads: int | N
         "width_geometric_percent": float(100 * np.exp(np.log(width).mean())),
         "coverage90": float(inside.mean()),
         "chi2": result.chi2,
-        "alarms": list(result.alarms),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "per_parameter": {
             p: {"error_percent": float(100 * error[k]), "width_percent": float(100 * width[k])}
             for k, p in enumerate(space.names)

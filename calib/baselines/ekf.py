@@ -16,17 +16,11 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.problem import WindowData
-from deal_hw.calib.fit.residual import (
-    LATENCY_STEP_S,
-    PARAMETER_STEP,
-    POSITION_STEP,
-    VELOCITY_STEP,
-    value_bounds,
-)
+from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.uncertainty.intervals import Z90, intervals
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 
 
@@ -183,9 +177,9 @@ class _Passes(Stepper):
         covariance[n:, n:] = np.diag(self._prior_std**2)
         steps = np.concatenate(
             [
-                np.full(C, POSITION_STEP),
-                np.full(C, VELOCITY_STEP),
-                np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)[:P],
+                np.full(C, DIFFERENCES.position),
+                np.full(C, DIFFERENCES.velocity),
+                np.append(np.full(len(problem.space), DIFFERENCES.parameter), DIFFERENCES.latency_s)[:P],
             ]
         )
         drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)
@@ -239,8 +233,11 @@ class _Passes(Stepper):
         alarms = []
         if not self._misfit < self.settings.diverged:
             alarms.append(
-                f"the filter's innovations are {self._misfit:.1f} times their own variance: it diverged, and "
-                "its covariance means nothing"
+                Alarm(
+                    f"The filter's innovations are {self._misfit:.1f} times their own variance.",
+                    "The filter diverged: its covariance means nothing.",
+                    "Use another method, or narrower ranges (--range NAME LOW HIGH).",
+                )
             )
         spread = Z90 * math.sqrt(max(self._covariance[K, K], 0.0)) if self._free_latency else 0.0
         return self.log.result(

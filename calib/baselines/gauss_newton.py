@@ -16,7 +16,7 @@ import numpy as np
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import cut, is_noisy, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, value_bounds
+from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
@@ -78,7 +78,7 @@ class Innovations:
                     linearise(problem, around, data, whitening.next_offset(data.measured))
                     for data, whitening in zip(self.windows, self._whitenings, strict=True)
                 ]
-        steps = np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)
+        steps = np.append(np.full(len(problem.space), DIFFERENCES.parameter), DIFFERENCES.latency_s)
         self._steps = steps[: len(steps) - (problem.fixed_latency_s is not None)]
         mean, std = problem.space.prior
         self._expected = np.flatnonzero(np.isfinite(std))

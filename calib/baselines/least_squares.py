@@ -25,12 +25,12 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
-from deal_hw.calib.fit.residual import PARAMETER_STEP
+from deal_hw.calib.fit.residual import DIFFERENCES
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import State
 from deal_hw.calib.uncertainty.intervals import intervals
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import spread, stretches
@@ -74,7 +74,7 @@ class Found:
     message: str
     source: str
     steps: int = 0
-    alarms: tuple[str, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
     interval: FloatArray | None = None
 
 
@@ -136,7 +136,8 @@ class OneShot(Stepper):
     def load(self, state: State) -> None:
         """Continue from a saved state."""
         saved = state["found"]
-        self._found = None if saved is None else Found(**{**saved, "alarms": tuple(saved["alarms"])})
+        if saved is not None:
+            self._found = Found(**{**saved, "alarms": tuple(Alarm(**alarm) for alarm in saved["alarms"])})
 
 
 class OneShotSearch(Search, abc.ABC):
@@ -200,7 +201,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, settings: LeastS
         iterations=int(solution.nfev),
         message=str(solution.message),
         source=f"textbook s^2 inv(J'J), latency {latency_s:g} s",
-        alarms=() if solution.status else (f"not converged after {solution.nfev} iterations",),
+        alarms=() if solution.status else (_unfinished(int(solution.nfev)),),
     )
 
 
@@ -209,7 +210,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
     space = error.space
     mean, std = space.prior
     expected = np.isfinite(std) & (weight > 0)
-    step = PARAMETER_STEP * np.eye(len(space))
+    step = DIFFERENCES.parameter * np.eye(len(space))
 
     def rows(values: FloatArray) -> FloatArray:
         found = error.residual(values)
@@ -221,7 +222,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
 
     def jacobian(value: FloatArray) -> FloatArray:
         r = rows(np.concatenate([value[None], value + step]))
-        return np.asarray((r[1:] - r[0]).T / PARAMETER_STEP)
+        return np.asarray((r[1:] - r[0]).T / DIFFERENCES.parameter)
 
     bounds = space.to_scale(space.low), space.to_scale(space.high)
     return least_squares(residual, start, jac=jacobian, bounds=bounds, **ends)
@@ -347,7 +348,15 @@ def _solve_starts(
         message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
         source=f"textbook s^2 inv(J'J), best of {settings.starts} starts",
         steps=part.steps,
-        alarms=() if best.iterations < iterations else (f"not converged after {iterations} iterations",),
+        alarms=() if best.iterations < iterations else (_unfinished(iterations),),
+    )
+
+
+def _unfinished(iterations: int) -> Alarm:
+    return Alarm(
+        f"The fit had not converged after {iterations} iterations.",
+        "Its values may still be far from those that fit best.",
+        "Allow more (--generations).",
     )
 
 

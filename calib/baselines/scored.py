@@ -15,7 +15,7 @@ from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import SearchLog
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 
 CHANGING = frozenset({"critic"})
@@ -85,15 +85,16 @@ class ScoredStepper(Stepper):
         centre, population = self.found()
         scored = sum(row["scored"] for row in self.log.trace)
         lost = sum(row["diverged"] for row in self.log.trace)
-        alarms = [
-            f"{lost:.0f} of {scored:.0f} members diverged and had no score; narrow the ranges or shorten the "
-            "physics step"
-        ]
+        alarm = Alarm(
+            f"{lost:.0f} of {scored:.0f} members diverged and had no score.",
+            "Simulations explode over much of the search range, and nothing was searched there.",
+            "Narrow the ranges (--range NAME LOW HIGH), or shorten the physics step.",
+        )
         return self.log.result(
             centre,
             population,
             chi2=explained(self.problem, centre, self.settings.scoring.horizon_ticks),
-            alarms=alarms if lost > 0.5 * scored else (),
+            alarms=(alarm,) if lost > 0.5 * scored else (),
             extra={"interval": self.INTERVAL, **self.facts()},
         )
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.design.experiment_design import Experiment, MakeBehaviour, Prediction
-from deal_hw.calib.uncertainty.intervals import IDENTIFIABLE_STD, WEAK_SHARE
+from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
@@ -232,7 +232,7 @@ def _said_weak(result: CalibrationResult, k: int) -> bool:
 
 
 def _told(space: ParameterSpace, k: int, std: float) -> bool:
-    return std <= IDENTIFIABLE_STD * (1.0 if space.log_scale[k] else float(space.width[k]))
+    return std <= INTERVALS.identifiable_std * (1.0 if space.log_scale[k] else float(space.width[k]))
 
 
 def _advice(
@@ -256,7 +256,7 @@ def _advice(
     if after > worth * before:
         how = (
             "measure it by other means (scale, ruler, stall torque), or give what it is bound to as known"
-            if before > WEAK_SHARE * prior
+            if before > INTERVALS.weak_share * prior
             else "record for longer, or measure it by other means"
         )
         sentence = (

@@ -4,8 +4,9 @@ Multiple shooting explains every sample with start states of its own, which a mo
 (backlash, a friction law, a slipped clock) uses to explain what is no start state. Over windows of seconds a
 damped robot forgets where it began, so start states need no fit, and what is minimised is what a user wants
 small: the error of a prediction. Each channel is measured by its own residual, which is estimated together
-with the parameters, so nobody has to say how good the model is. Residuals of a wrong model hang together:
-they count as so many as they have correlation times, and the search range is the prior for the rest.
+with the parameters, so nobody has to say how good the model is. Residuals of a wrong model are
+autocorrelated: they count as so many as they have correlation times, and the search range is the prior for
+    the rest.
 """
 
 from __future__ import annotations
@@ -18,8 +19,13 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
-from deal_hw.calib.fit.robust import channel_scale, correlated_samples, huber_weights
-from deal_hw.calib.fit.solver import SolverSettings, solve
+from deal_hw.calib.fit.solver import (
+    SolverSettings,
+    channel_scale,
+    correlated_samples,
+    huber_weights,
+    solve,
+)
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -123,7 +129,7 @@ def fit_horizon(
         # Residuals are measured anew every few steps: nobody has said how good the model is.
         weighed, _ = _weighed(plain, point, recipe)
         before = weighed.costs([point])[0]
-        # The prior holds what is not seen; residuals that hang together weigh too little for another hold.
+        # The prior holds what is not seen; autocorrelated residuals weigh too little for another hold.
         solver = SolverSettings(
             iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
         )
@@ -210,7 +216,7 @@ def _weighed(
 ) -> tuple[Shooting, FloatArray]:
     """Return the fit with each channel measured by its own residual, and these measures, (M,).
 
-    Residuals of a wrong model hang together: they count as so many as they have correlation times.
+    Residuals of a wrong model are autocorrelated: they count as so many as they have correlation times.
     """
     problem = plain.problem
     errors = [_errors(d, r) for d, r in zip(plain.data, plain.residuals(point), strict=True)]

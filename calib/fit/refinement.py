@@ -1,8 +1,12 @@
-"""The refinement: least squares on multiple shooting in growing windows, the latency one more unknown."""
+"""The refinement: least squares on multiple shooting in growing windows, the latency one more unknown.
+
+The first answer of a calibration is the refinement of the model's own values, without any search.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,8 +15,8 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
-from deal_hw.calib.fit.robust import cauchy_windows, huber_weights
-from deal_hw.calib.fit.solver import SolverSettings, settled, solve
+from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, huber_weights, settled, solve
+from deal_hw.calibration import Progress, ProgressCallback
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -43,6 +47,9 @@ class RefinementSettings:
         given_still: A round of weights that moves no parameter by more, in its own scale, is the last.
         given_right: Where the chi2 of most of the shortest windows is below this the latency is the right
             whole step.
+        most_windows: So many of the windows are most [-].
+        local_s: The local fit finds its way on so much of the recordings [s].
+        local_hopeless: Shortest windows whose chi2 stays above this are not explained by longer ones either.
     """
 
     stages_s: tuple[float, ...] = (0.2, 0.4, 0.8)
@@ -60,11 +67,12 @@ class RefinementSettings:
     given_chi2: float = 1e-9
     given_still: float = 1e-7
     given_right: float = 1.0
+    most_windows: float = 0.75
+    local_s: float = 8.0
+    local_hopeless: float = 4.0
 
 
 SETTINGS = RefinementSettings()
-MOST_WINDOWS = 0.75
-"""So many of the windows are most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +136,6 @@ def polish(
         fixed_latency = True
     elif stages_s is None:
         stages_s = settings.contact_stages_s if problem.robot.base is not None else settings.stages_s
-    free = len(space) + (0 if fixed_latency else 1)
     result: Polished | None = None
     # Fixed: a polish is part of the data's analysis, not of the search's luck.
     rng = np.random.default_rng(0)
@@ -149,15 +156,14 @@ def polish(
             solver = SolverSettings(iterations=iterations)
             point, normal, used = solve(shooting, point, solver, fixed_latency=fixed_latency)
         done += used
-        chi2 = normal.cost / max(normal.count - free, 1)
-        if result is not None and not shooting.given and chi2 > settings.worse * max(result.chi2, 1.0):
+        found = _polished(shooting, point, normal, done, fixed_latency)
+        if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
             break
-        theta, latency_s = shooting.theta(point), float(point.value[-1])
+        result, theta, latency_s = found, found.theta, found.latency_s
         if not shooting.given:
             states = shooting.states(point)
-        result = Polished(theta, latency_s, chi2, normal, point, shooting, done)
         if notify is not None:
-            notify(done, chi2)
+            notify(done, found.chi2)
     if result is None:
         raise InsufficientDataError("no window length was given")
     return result
@@ -179,6 +185,10 @@ def polish_windows(
     else:
         solver = SolverSettings(iterations=iterations)
         point, normal, used = solve(shooting, point, solver, fixed_latency=fixed_latency)
+    return _polished(shooting, point, normal, used, fixed_latency)
+
+
+def _polished(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Polished:
     free = len(shooting.problem.space) + (0 if fixed_latency else 1)
     chi2 = normal.cost / max(normal.count - free, 1)
     return Polished(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
@@ -234,9 +244,8 @@ def at_parameters(
         normal = shooting.normal(point)
     else:
         point, normal = settled(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
-    free = len(problem.space) + (problem.fixed_latency_s is None)
-    chi2 = normal.cost / max(normal.count - free, 1)
-    return Polished(theta, latency_s, chi2, normal, point, shooting, 0)
+    found = _polished(shooting, point, normal, 0, problem.fixed_latency_s is not None)
+    return dataclasses.replace(found, theta=theta, latency_s=latency_s)
 
 
 def _samples(problem: Problem, seconds: float) -> int:
@@ -274,7 +283,7 @@ def _whole_step(
 def _most(normal: Normal) -> float:
     """Return the chi2 that most windows stay below."""
     each = np.concatenate([np.mean(r**2, axis=(1, 2)) for r in normal.residual])
-    return float(np.quantile(each, MOST_WINDOWS))
+    return float(np.quantile(each, SETTINGS.most_windows))
 
 
 def _from_exact(plain: Shooting, point: Point, iterations: int, rounds: int) -> tuple[Point, Normal, int]:
@@ -321,3 +330,50 @@ def _with_contacts(
         if normal.cost > settings.shaken * before:
             break
     return point, normal, used
+
+
+def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished | None:
+    """Refine the model's own values; return None where they are too far to be refined.
+
+    Costs a small part of a search. Where its residual is explained by the sensors' noise nothing is left to
+    search for. A part of the recordings says where the fit goes; all of them are fitted only where that part
+    can be explained.
+    """
+    fixed = problem.fixed_latency_s is not None
+    latency_s = problem.first_latency_s
+
+    def notify(done: int, chi2: float) -> None:
+        if progress is not None:
+            words = f"from the model's own values: chi2 {chi2:.3g}"
+            progress(Progress("local fit", done, done, words, values={"chi2": chi2}))
+
+    def fit(part: Problem, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None) -> Polished:
+        return polish(
+            part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.exact
+        )
+
+    part, nominal = _spread(problem, SETTINGS.local_s), problem.space.nominal
+    if part is problem or problem.exact:
+        found = fit(problem, nominal, latency_s, None)
+        return found if np.isfinite(found.chi2) else None
+    stages_s = SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
+    short, *longer = stages_s
+    found = fit(part, nominal, latency_s, (short,))
+    if not found.chi2 < SETTINGS.local_hopeless:
+        return found if np.isfinite(found.chi2) else None
+    try:
+        return fit(problem, found.theta, found.latency_s, longer)
+    except InsufficientDataError:
+        # No recording holds a longer window.
+        return fit(problem, found.theta, found.latency_s, (short,))
+
+
+def _spread(problem: Problem, seconds: float) -> Problem:
+    """Return the problem with pieces of a second, evenly spread, that add up to about so many seconds."""
+    lengths = [len(e.sample) for e in problem.episodes]
+    period_s = problem.episodes[0].period_s
+    piece = max(round(1.0 / period_s), 1)
+    every = max(math.floor(sum(lengths) * period_s / seconds), 1)
+    number = np.arange(sum(lengths)) // piece
+    kept = np.split(number % every == 0, np.cumsum(lengths)[:-1])
+    return problem.part(kept) if every > 1 else problem

@@ -7,28 +7,45 @@ it.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Prediction, Problem, WindowData
 from deal_hw.types import FloatArray
 
-PARAMETER_STEP = 1e-4
-CONTACT_STEP = 2e-2
-"""Parameter step where feet touch the floor: sticking and slipping kink predictions on every scale, and a
-secant says more of them than a derivative."""
 
-CONTACT_STATE_STEP = 0.5
-"""Step of start states there, in standard deviations of the smoothed ones."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DifferenceSettings:
+    """Steps of the differences that linearise predictions.
 
-EXACT_STEP = 1e-5
-"""Parameter step where states are exact: the residual then has no floor to hide a secant's error under."""
+    Attributes:
+        parameter: Of a parameter, in its own scale.
+        contact_parameter: The same where feet touch the floor: sticking and slipping kink predictions on
+            every scale, and a secant says more of them than a derivative.
+        exact_parameter: The same where states are exact: the residual then has no floor to hide a secant's
+            error under.
+        latency_s: Of the latency [s].
+        position: Of a start position [rad or m].
+        velocity: Of a start velocity [rad/s or m/s].
+        contact_state: Of start states where feet touch the floor, in standard deviations of the smoothed
+            ones.
+    """
 
-LATENCY_STEP_S = 2e-4
-POSITION_STEP = 1e-6
-VELOCITY_STEP = 1e-4
+    parameter: float = 1e-4
+    contact_parameter: float = 2e-2
+    exact_parameter: float = 1e-5
+    latency_s: float = 2e-4
+    position: float = 1e-6
+    velocity: float = 1e-4
+    contact_state: float = 0.5
+
+
+DIFFERENCES = DifferenceSettings()
 
 States = list[tuple[FloatArray, FloatArray]]
 """Positions and velocities at every sample of each episode, (T, C) each."""
@@ -129,11 +146,13 @@ class Shooting:
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
         self.start_information = [1 / d.prior_std**2 for d in self.data]
-        self._parameter_step = EXACT_STEP if problem.exact else PARAMETER_STEP
-        self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
+        self._parameter_step = DIFFERENCES.exact_parameter if problem.exact else DIFFERENCES.parameter
+        self._state_step = np.concatenate(
+            [np.full(C, DIFFERENCES.position), np.full(C, DIFFERENCES.velocity)]
+        )
         if self.contacts:
-            self._parameter_step = CONTACT_STEP
-            self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
+            self._parameter_step = DIFFERENCES.contact_parameter
+            self._state_step = np.maximum(DIFFERENCES.contact_state * self.state_std, self._state_step)
 
     @property
     def contacts(self) -> bool:
@@ -200,7 +219,7 @@ class Shooting:
         moved = 0 if self.given else C
         members = 1 + K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
-        steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
+        steps = np.concatenate([np.full(K, self._parameter_step), [DIFFERENCES.latency_s], self._state_step])
         steps = stretch * steps[: members - 1]
         # A latency or a friction below nothing is no model: there differences are taken inwards.
         low, high = value_bounds(self.problem)
@@ -279,16 +298,22 @@ class Shooting:
         value, C = point.value + step, self.problem.coordinates
         if self.given:
             return Point(value, point.position, point.velocity)
-        position, velocity = [], []
+        chosen = []
         for e, (gain, shift) in enumerate(normal.back):
             follow = gain @ step
             ways = -np.stack([np.zeros_like(shift), shift, follow, shift + follow])
-            x, v = point.position[e] + ways[..., :C], point.velocity[e] + ways[..., C:]
-            costs = self._window_costs(e, np.repeat(value[None], len(ways), axis=0), x, v)
-            best, window = np.argmin(costs, axis=0), np.arange(len(shift))
-            position.append(x[best, window])
-            velocity.append(v[best, window])
-        return Point(value, tuple(position), tuple(velocity))
+            chosen.append(
+                self._best(e, value, point.position[e] + ways[..., :C], point.velocity[e] + ways[..., C:])
+            )
+        position, velocity = zip(*chosen, strict=True)
+        return Point(value, position, velocity)
+
+    def _best(self, e: int, value: FloatArray, x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return each window's cheapest start state, (W, C) twice, of those given, (D, W, C) twice."""
+        costs = self._window_costs(e, np.repeat(value[None], len(x), axis=0), x, v)
+        best = np.argmin(costs, axis=0)
+        window = np.arange(x.shape[1])
+        return x[best, window], v[best, window]
 
     def vector(self, point: Point) -> FloatArray:
         """Return all whitened residuals at a point, those of what is known beforehand last, (M,)."""
@@ -376,19 +401,16 @@ class Shooting:
         """
         C = self.problem.coordinates
         std = spread * self.state_std
-        values = np.repeat(point.value[None], count, axis=0)
-        position, velocity = [], []
+        chosen = []
         for e, data in enumerate(self.data):
-            W = len(data.windows)
-            draw = std * rng.standard_normal((count, W, 2 * C))
+            draw = std * rng.standard_normal((count, len(data.windows), 2 * C))
             draw[0] = 0.0
             x, v = point.position[e] + draw[..., :C], point.velocity[e] + draw[..., C:]
             x[1::2] = data.start_position + draw[1::2, :, :C]
             v[1::2] = data.start_velocity + draw[1::2, :, C:]
-            best = np.argmin(self._window_costs(e, values, x, v), axis=0)
-            position.append(x[best, np.arange(W)])
-            velocity.append(v[best, np.arange(W)])
-        return Point(point.value, tuple(position), tuple(velocity))
+            chosen.append(self._best(e, point.value, x, v))
+        position, velocity = zip(*chosen, strict=True)
+        return Point(point.value, position, velocity)
 
     def _predict(self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray) -> Prediction:
         theta = self.problem.space.from_scale(values[:, :-1])
@@ -413,3 +435,10 @@ def _rows(
         np.concatenate([jp, np.zeros((W, S, jp.shape[2]))], axis=1),
         np.concatenate([js, root[:, :, None] * np.eye(S)], axis=1),
     )
+
+
+def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
+    """Return some of the windows, chosen by a mask (W,) or by their rows."""
+    names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
+    windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
+    return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})

@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData, samples_in
+from deal_hw.calib.fit.residual import taken
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.types import FloatArray
 
-WINDOW_S = 0.5
-MOST_WINDOWS = 12
-NOTHING = 1e-9
-"""Predictions that agree to this many standard deviations of the noise are the same [-]."""
-FAINT = 1.0
 
-NUDGE = 1e-6
-"""A parameter is changed by so much, in its own scale, to see whether predictions jump."""
-PUSH = 1e-3
-"""And by so much to see how steep they really are."""
-JUMP = 10.0
-"""A nudge that changes predictions by so many times what the push says is a jump."""
-MANY = 0.2
-"""Share of windows that must jump: where a contact begins or ends at another moment some do, by no fault."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensitivitySettings:
+    """Settings of :func:`look` and :func:`jumps`.
+
+    Attributes:
+        window_s: Length of the windows [s].
+        most_windows: So many are predicted.
+        nothing: Predictions that agree to this many standard deviations of the noise are the same [-].
+        faint: A range that changes nothing by more standard deviations than this is hardly visible [-].
+        nudge: A parameter is changed by so much, in its own scale, to see whether predictions jump,
+        push: and by so much to see how steep they really are.
+        jump: A nudge that changes predictions by so many times what the push says is a jump [-].
+        many: Share of windows that must jump [-]: where a contact begins or ends at another moment some do,
+            by no fault.
+    """
+
+    window_s: float = 0.5
+    most_windows: int = 12
+    nothing: float = 1e-9
+    faint: float = 1.0
+    nudge: float = 1e-6
+    push: float = 1e-3
+    jump: float = 10.0
+    many: float = 0.2
+
+
+SETTINGS = SensitivitySettings()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +56,14 @@ class Visibility:
     @property
     def invisible(self) -> tuple[str, ...]:
         """Parameters that change nothing."""
-        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < NOTHING)
+        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < SETTINGS.nothing)
 
     @property
     def faint(self) -> tuple[str, ...]:
         """Parameters whose whole range changes no sample by more than the noise."""
-        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if NOTHING <= e < FAINT)
+        return tuple(
+            n for n, e in zip(self.names, self.effect, strict=True) if SETTINGS.nothing <= e < SETTINGS.faint
+        )
 
 
 def look(problem: Problem) -> Visibility:
@@ -87,8 +103,8 @@ def jumps(problem: Problem) -> dict[str, float]:
     # Towards the middle of the range, or a value at its end would be nudged to nothing.
     inwards = np.where(value > (space.to_scale(space.low) + space.to_scale(space.high)) / 2, -1.0, 1.0)
     values = np.repeat(value[None], 1 + 2 * K, axis=0)
-    values[1 : 1 + K] += NUDGE * np.diag(inwards)
-    values[1 + K :] += PUSH * np.diag(inwards)
+    values[1 : 1 + K] += SETTINGS.nudge * np.diag(inwards)
+    values[1 + K :] += SETTINGS.push * np.diag(inwards)
     theta = space.from_scale(values)
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     changes = []
@@ -98,9 +114,10 @@ def jumps(problem: Problem) -> dict[str, float]:
         changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
     nudged, pushed = np.split(np.concatenate(changes, axis=1), 2)
     jumping = nudged > np.maximum(
-        JUMP * NUDGE / PUSH * pushed, NOTHING * np.min(problem.noise_std[problem.channels])
+        SETTINGS.jump * SETTINGS.nudge / SETTINGS.push * pushed,
+        SETTINGS.nothing * np.min(problem.noise_std[problem.channels]),
     )
-    rough = np.mean(jumping, axis=1) > MANY
+    rough = np.mean(jumping, axis=1) > SETTINGS.many
     return {name: float(nudged[k].max()) for k, name in enumerate(space.names) if rough[k]}
 
 
@@ -120,28 +137,19 @@ def require_visible(found: Visibility) -> None:
 
 def _windows(problem: Problem) -> list[WindowData]:
     try:
-        return problem.windows(samples_in(problem, WINDOW_S))
+        return problem.windows(samples_in(problem, SETTINGS.window_s))
     except InsufficientDataError:
         return problem.windows(samples_in(problem, 0.0))
 
 
 def _some(windows: list[WindowData]) -> list[WindowData]:
-    """Return about MOST_WINDOWS of the windows, evenly over all recordings."""
+    """Return about as many of the windows, evenly over all recordings."""
     total = sum(len(data.windows) for data in windows)
-    every = max(total // MOST_WINDOWS, 1)
+    every = max(total // SETTINGS.most_windows, 1)
     kept, first = [], 0
     for data in windows:
-        W = len(data.windows)
-        rows = np.arange((-first) % every, W, every)
-        first += W
-        if not rows.size:
-            continue
-        arrays = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
-        kept.append(
-            dataclasses.replace(
-                data,
-                windows=dataclasses.replace(data.windows, start=data.windows.start[rows]),
-                **{name: getattr(data, name)[rows] for name in arrays},
-            )
-        )
+        rows = np.arange((-first) % every, len(data.windows), every)
+        first += len(data.windows)
+        if rows.size:
+            kept.append(taken(data, rows))
     return kept

@@ -1,64 +1,207 @@
-"""The page's charts: overlays, residuals, correlations, latency scan, search trace and population."""
+"""The page's charts, as inline SVG that follows the page's light or dark colours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
+import matplotlib
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from deal_hw.calib.report.figure import (
-    CALIBRATED,
-    FAINT,
-    INK,
-    MINUS,
-    NOMINAL,
-    PAPER,
-    REAL,
-    drawing,
-    envelope,
-    grid,
-    log_scale,
-    svg,
-)
-from deal_hw.calib.report.inputs import Overlay, Residuals
+from deal_hw.calib.report.gather import Overlay, Residuals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
-WIDTH = 10.2
-"""Inches; the page scales charts to its width."""
 
-CHANNELS = 8
-"""Channels whose residuals are drawn: those with the largest."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChartSettings:
+    """How large charts are.
 
-PANELS = 24
-"""Channels whose motion is drawn: the first ones."""
+    Attributes:
+        width: Width of a chart [inches]; the page scales charts to its own.
+        channels: Channels whose residuals are drawn: those with the largest.
+        panels: Channels whose motion is drawn: the first ones.
+        points: Points of all motion on the page; long series are thinned to their lows and highs.
+        lags: Longest lag of autocorrelations [samples].
+        numbered: Up to so many parameters the correlations are written into their cells.
+    """
 
-POINTS = 60_000
-"""Points of all motion on the page; long series are thinned to their lows and highs."""
+    width: float = 10.2
+    channels: int = 8
+    panels: int = 24
+    points: int = 60_000
+    lags: int = 20
+    numbered: int = 12
 
-LAGS = 20
-NUMBERED = 12
-"""Up to so many parameters the correlations are written into their cells."""
+
+SETTINGS = ChartSettings()
+
+INK, FAINT, REAL, NOMINAL, CALIBRATED, MINUS, PAPER = (
+    "#010101", "#020202", "#030303", "#040404", "#050505", "#060606", "#070707",
+)  # fmt: skip
+"""Colours to draw with: stand-ins, each of which becomes a variable of the page's style sheet."""
+
+_VARIABLES = {
+    INK: "ink", FAINT: "faint", REAL: "real", NOMINAL: "nominal", CALIBRATED: "calibrated", MINUS: "minus",
+    PAPER: "paper",
+}  # fmt: skip
+
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "deal-hw",
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    # Names are the user's: a dollar sign in one is no formula.
+    "text.parse_math": False,
+    "axes.formatter.use_mathtext": False,
+    "axes.unicode_minus": True,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    # A fixed place: looking for a free one costs a third of the drawing.
+    "axes.titley": 1.0,
+    "axes.titlecolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "lines.linewidth": 1.2,
+    "path.simplify_threshold": 0.3,
+}
+_UNUSED_IDS = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
+_GEOMETRY = re.compile(r' (?:d|x|y|transform|points)="[^"]*"')
+_DECIMALS = re.compile(r"-?\d+\.\d{2,}")
+_FONT = re.compile(r"'DejaVu Sans'[^;\"]*")
 
 
-def overlay(shown: Overlay, panels: int = PANELS) -> Markup:
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Set the style of the page's figures and nothing outside."""
+    with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
+        # The font here only measures text; the reader's browser has the letters.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
+
+
+def svg(figure: Figure, label: str) -> Markup:
+    """Return a figure as inline SVG.
+
+    Args:
+        figure: The figure, drawn in the colours of this module.
+        label: What it shows, for those who do not see it.
+    """
+    file = io.StringIO()
+    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    for stand_in, name in _VARIABLES.items():
+        text = text.replace(stand_in, f"var(--{name})")
+    # Ids must be unique in the page; only clip paths and marks, named by their digest, are referred to.
+    text = _UNUSED_IDS.sub("", text)
+    text = _GEOMETRY.sub(lambda found: _DECIMALS.sub(_rounded, found[0]), text)
+    text = _FONT.sub("sans-serif", text)
+    inches = figure.get_size_inches()
+    box = f"0 0 {72 * inches[0]:.1f} {72 * inches[1]:.1f}"
+    opening = (
+        f'<svg viewBox="{box}" style="max-width:{96 * inches[0]:.0f}px" role="img" '
+        f'aria-label="{escape(label)}">'
+    )
+    return Markup(opening + text[text.index(">") + 1 :])
+
+
+def _rounded(number: re.Match[str]) -> str:
+    return f"{float(number[0]):.1f}"
+
+
+def log_scale(axis: Any) -> None:
+    """Make an axis logarithmic with plain numbers at its ticks."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.yaxis.set_minor_formatter(NullFormatter())
+
+
+def grid(
+    rows: int, columns: int, width: float, row_height: float, gap: float = 0.7, **options: Any
+) -> tuple[Figure, Any]:
+    """Return a figure with rows times columns axes, (rows, columns).
+
+    Args:
+        rows: Rows.
+        columns: Columns.
+        width: Inches.
+        row_height: Inches, the gap included.
+        gap: Between rows, for tick labels, title and perhaps an axis label [inches].
+        options: Passed on to ``Figure.subplots``.
+    """
+    figure = Figure(figsize=(width, rows * row_height))
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    inch = 1.0 / (rows * row_height)
+    figure.subplots_adjust(
+        left=0.62 / width, right=1 - 0.15 / width, bottom=0.42 * inch, top=1 - 0.28 * inch,
+        hspace=gap / (row_height - gap), wspace=0.75 * columns / max(width - 0.8 * columns, 1.0),
+    )  # fmt: skip
+    return figure, axes
+
+
+def envelope(time: FloatArray, values: FloatArray, buckets: int = 350) -> tuple[FloatArray, FloatArray]:
+    """Thin a long series so that its picture stays the same: lowest and highest of each bucket, in order.
+
+    Args:
+        time: (T,).
+        values: (T,); NaN leaves a gap.
+        buckets: Buckets; series of up to twice as many samples stay as they are.
+
+    Returns:
+        Times and values, up to two a bucket.
+    """
+    if len(values) <= 2 * buckets:
+        return time, values
+    keep: list[int] = []
+    for part in np.array_split(np.arange(len(values)), buckets):
+        finite = part[np.isfinite(values[part])]
+        if len(finite) < len(part):
+            keep.append(int(part[~np.isfinite(values[part])][0]))
+        if len(finite):
+            keep.extend({int(finite[np.argmin(values[finite])]), int(finite[np.argmax(values[finite])])})
+    order = np.unique(keep)
+    return time[order], values[order]
+
+
+def overlay(shown: Overlay, panels: int = SETTINGS.panels) -> Markup:
     """Draw real, nominal and calibrated motion, one panel a channel.
 
     Args:
         shown: The motion.
         panels: Panels of all overlays on the page, which share the points there may be.
     """
-    M = min(len(shown.names), PANELS)
-    buckets = int(np.clip(POINTS / (6 * panels), 80, 350))
+    M = min(len(shown.names), SETTINGS.panels)
+    buckets = int(np.clip(SETTINGS.points / (6 * panels), 80, 350))
     columns = 1 if M <= 2 else 2
     rows = -(-M // columns)
     with drawing():
-        figure, axes = grid(rows, columns, WIDTH, 1.55 if columns == 1 else 1.3, gap=0.38, sharex=True)
+        figure, axes = grid(
+            rows, columns, SETTINGS.width, 1.55 if columns == 1 else 1.3, gap=0.38, sharex=True
+        )
         for m, axis in enumerate(axes.ravel()):
             if m >= M:
                 axis.set_visible(False)
@@ -93,10 +236,14 @@ def residuals(shown: Residuals) -> tuple[Markup, str]:
     """Draw whitened residuals over time, as histogram and as autocorrelation; say which, if not all."""
     M = shown.whitened.shape[2]
     size = np.array([_root_mean_square(shown.whitened[..., m]) for m in range(M)])
-    order = np.argsort(-np.nan_to_num(size))[:CHANNELS]
-    words = "" if M <= CHANNELS else f"the {CHANNELS} channels with the largest residuals of {M}"
+    order = np.argsort(-np.nan_to_num(size))[: SETTINGS.channels]
+    words = (
+        ""
+        if M <= SETTINGS.channels
+        else f"the {SETTINGS.channels} channels with the largest residuals of {M}"
+    )
     with drawing():
-        figure, axes = grid(len(order), 3, WIDTH, 1.5, gap=0.55, width_ratios=(2.6, 1, 1))
+        figure, axes = grid(len(order), 3, SETTINGS.width, 1.5, gap=0.55, width_ratios=(2.6, 1, 1))
         for row, m in enumerate(sorted(order)):
             _residual_row(axes[row], shown, int(m), float(size[m]))
             if row < len(order) - 1:
@@ -149,7 +296,7 @@ def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
     """
     clean = np.nan_to_num(values)
     power = float(np.mean(clean**2)) or 1.0
-    lags = range(1, min(LAGS, values.shape[1] - 1) + 1)
+    lags = range(1, min(SETTINGS.lags, values.shape[1] - 1) + 1)
     rho = [float(np.mean(clean[:, lag:] * clean[:, :-lag]) / power) for lag in lags]
     return np.array(rho), 2.0 / float(np.sqrt(max(values.size, 1)))
 
@@ -188,7 +335,7 @@ def _cell(axis: Any, i: int, j: int, value: float, count: int) -> None:
                 (j + 0.04, i + 0.04), 0.92, 0.92, facecolor=colour, alpha=min(abs(value), 1.0), linewidth=0
             )
         )
-    if count <= NUMBERED and i != j and abs(value) >= 0.05:
+    if count <= SETTINGS.numbered and i != j and abs(value) >= 0.05:
         ink = PAPER if abs(value) > 0.6 else INK
         words = f"{value:.1f}".replace("0.", ".")
         axis.text(j + 0.5, i + 0.52, words, ha="center", va="center", fontsize=7, color=ink)
@@ -222,7 +369,7 @@ def trace(rows: Sequence[Mapping[str, float]]) -> Markup | None:
         return None
     columns = min(3, len(series))
     with drawing():
-        figure, axes = grid(-(-len(series) // columns), columns, WIDTH, 1.9, gap=0.8)
+        figure, axes = grid(-(-len(series) // columns), columns, SETTINGS.width, 1.9, gap=0.8)
         for axis, (key, values) in zip(axes.ravel(), series.items(), strict=False):
             axis.plot(np.arange(1, len(values) + 1), values, color=CALIBRATED)
             finite = values[np.isfinite(values)]
@@ -255,9 +402,14 @@ def population(
     longest = 0.075 * max(len(name) for name in space.names) + 0.2
     height = 0.24 * K + 0.6
     with drawing():
-        figure, ((axis,),) = grid(1, 1, WIDTH * 0.75, height)
+        figure, ((axis,),) = grid(1, 1, SETTINGS.width * 0.75, height)
         axis.set_position(
-            (longest / (WIDTH * 0.75), 0.5 / height, 1 - (longest + 0.2) / (WIDTH * 0.75), 1 - 0.55 / height)
+            (
+                longest / (SETTINGS.width * 0.75),
+                0.5 / height,
+                1 - (longest + 0.2) / (SETTINGS.width * 0.75),
+                1 - 0.55 / height,
+            )
         )
         for k in range(K):
             axis.plot(

@@ -1,9 +1,10 @@
-"""From robot, result and recordings to what the report shows: the only part that simulates."""
+"""What the report shows, from robot, result and recordings: the only part of it that simulates."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,20 +12,97 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData, samples_in
 from deal_hw.calib.fit.output_error import longest_windows
-from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
-from deal_hw.calib.validation.normalised_error import HELDOUT_WINDOW_S
-from deal_hw.calib.validation.split_half import HalvesRow, halves_rows
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
-PANELS = 24
-"""Panels drawn of each sort of recordings, one a channel; more would make the page long and say the same."""
 
-WHITENED_SIZE = 600
-"""Samples times channels of a window that is whitened: its covariance matrix has so many rows."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatherSettings:
+    """Settings of :func:`gather`.
+
+    Attributes:
+        panels: Panels drawn of each sort of recordings, one a channel; more would make the page long and say
+            the same.
+        whitened_size: Samples times channels of a window that is whitened: its covariance has so many rows.
+        window_s: Longest window that is whitened [s].
+    """
+
+    panels: int = 24
+    whitened_size: int = 600
+    window_s: float = 0.2
+
+
+SETTINGS = GatherSettings()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overlay:
+    """One recording beside open-loop predictions that restart from the measured state.
+
+    Attributes:
+        title: Which recording.
+        heldout: The search never saw it.
+        names: The M measured channels.
+        units: Unit of each channel, (M,).
+        time_s: Time of each sample, (T,) [s].
+        real: Measured values, (T, M).
+        nominal: Predicted by the user's own model, (T, M); NaN where nothing was predicted.
+        calibrated: Predicted by the calibrated model, likewise.
+        window_s: The prediction restarts this often [s].
+    """
+
+    title: str
+    heldout: bool
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    time_s: FloatArray
+    real: FloatArray
+    nominal: FloatArray
+    calibrated: FloatArray
+    window_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Residuals:
+    """Whitened prediction errors of the calibrated model: white and of unit variance where it is right.
+
+    Attributes:
+        title: Which recording.
+        names: The M measured channels.
+        time_s: Time at the end of each window's samples, (W, H) [s].
+        whitened: Recording minus prediction, in standard deviations, (W, H, M); NaN where it diverged.
+    """
+
+    title: str
+    names: tuple[str, ...]
+    time_s: FloatArray
+    whitened: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportInputs:
+    """Everything on the page.
+
+    Attributes:
+        robot: The robot's name.
+        result: What the calibration found.
+        overlays: Recordings beside predictions.
+        residuals: Whitened errors of the fitted recordings.
+        tick_s: Device period, the unit of the latency scan [s]; None where unknown.
+        telemetry: Verdicts of the telemetry checks, in words.
+        left_out: What is not drawn, in words.
+    """
+
+    robot: str
+    result: CalibrationResult
+    overlays: tuple[Overlay, ...] = ()
+    residuals: tuple[Residuals, ...] = ()
+    tick_s: float | None = None
+    telemetry: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 def gather(
@@ -34,8 +112,7 @@ def gather(
     holdout: Sequence[Episode] = (),
     *,
     telemetry: Sequence[str] = (),
-    halves: Sequence[HalvesRow] = (),
-    window_s: float = HELDOUT_WINDOW_S,
+    window_s: float = SETTINGS.window_s,
     threads: int | None = None,
 ) -> ReportInputs:
     """Simulate what the report shows.
@@ -46,7 +123,6 @@ def gather(
         episodes: The fitted recordings.
         holdout: Recordings that the search has not seen.
         telemetry: Verdicts of the telemetry checks, in words.
-        halves: Agreement of disjoint halves of the data; by default what the result's provenance says.
         window_s: Drawn predictions restart this often [s]; where no recording is as long, more often.
         threads: Simulation threads.
     """
@@ -57,7 +133,7 @@ def gather(
         word = "held-out" if heldout else "fitted"
         if not group:
             continue
-        shown = group[: max(min(PANELS // len(group[0].channels), len(group)), 1)]
+        shown = group[: max(min(SETTINGS.panels // len(group[0].channels), len(group)), 1)]
         if len(group) > len(shown):
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
         problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
@@ -72,7 +148,6 @@ def gather(
         residuals=tuple(residuals),
         tick_s=episodes[0].step_s if episodes else None,
         telemetry=tuple(telemetry),
-        halves=tuple(halves) or halves_rows(result.provenance),
         left_out=tuple(left_out),
     )
 
@@ -125,7 +200,7 @@ def _units(problem: Problem) -> tuple[str, ...]:
 def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str]) -> list[Residuals]:
     centre = Members(result.estimate[None], np.array([result.latency_s]))
     M = len(problem.channels)
-    length = max(min(samples_in(problem, HELDOUT_WINDOW_S), WHITENED_SIZE // M), 2)
+    length = max(min(samples_in(problem, SETTINGS.window_s), SETTINGS.whitened_size // M), 2)
     found = []
     try:
         windows = problem.windows(length)

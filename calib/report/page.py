@@ -1,10 +1,9 @@
-"""The page itself: words and numbers for the template, and the file."""
+"""What a calibration writes: the report's page, and the result folder with numbers, trace and model."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -12,17 +11,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 
-from deal_hw.calib.report import charts
-from deal_hw.calib.report.inputs import ReportInputs
+from deal_hw.calib.report.gather import ReportInputs
+from deal_hw.calib.uncertainty.intervals import ended_at_bound
 from deal_hw.calib.validation.verdict import trust
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import RESULT_FILE, CalibrationResult
+from deal_hw.data.files import published_together, write_json
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.parameters import Parameter
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 
+DISTRIBUTION = "distribution.json"
+MODEL = "calibrated.xml"
+TRACE = "trace.npz"
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
-AT_BOUND = 1e-6
-"""A parameter so near an end of its range, as a share of the range, ended there."""
 
 _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "halves")
 """Provenance with a place of its own on the page."""
@@ -32,15 +36,10 @@ _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "setti
 class Row:
     """One line of the table of parameters; positions are percent of the search range."""
 
-    name: str
-    unit: str
-    nominal: float
+    parameter: Parameter
     estimate: float
     low: float
     high: float
-    range_low: float
-    range_high: float
-    log: bool
     verdict: str
     told: bool
     at_bound: str
@@ -49,16 +48,6 @@ class Row:
     nominal_at: float
     estimate_at: float
     prior: str
-
-
-@dataclass(frozen=True, slots=True)
-class AdviceRow:
-    """One line of what to record next, in words."""
-
-    parameter: str
-    before: str
-    after: str
-    sentence: str
 
 
 def write_report(path: Path, inputs: ReportInputs) -> None:
@@ -73,16 +62,17 @@ def write_report(path: Path, inputs: ReportInputs) -> None:
     """
     path = path / REPORT if path.is_dir() else path
     text = render(inputs)
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        fresh.write_text(text, encoding="utf-8", errors="backslashreplace")
-        os.replace(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
+    with published_together(path.parent) as waiting:
+        (waiting / path.name).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def render(inputs: ReportInputs) -> str:
     """Return the page; all that comes from the user is escaped."""
+    # Only here: matplotlib takes half a second to load.
+    from jinja2 import Environment, StrictUndefined
+
+    from deal_hw.calib.report import charts
+
     # StrictUndefined: a name that the template has and this module lacks is an error, not a gap.
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -91,7 +81,7 @@ def render(inputs: ReportInputs) -> str:
     result = inputs.result
     provenance = dict(result.provenance)
     scan = _mapping(provenance.get("latency_scan"))
-    panels = sum(min(len(shown.names), charts.PANELS) for shown in inputs.overlays)
+    panels = sum(min(len(shown.names), charts.SETTINGS.panels) for shown in inputs.overlays)
     heldout = _mapping(provenance.get("heldout_rmse"))
     names, joints = heldout_rows(heldout)
     drawn = [(shown, *charts.residuals(shown)) for shown in inputs.residuals]
@@ -108,10 +98,11 @@ def render(inputs: ReportInputs) -> str:
         ],
         weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
-        panels_each=charts.PANELS,
+        panels_each=charts.SETTINGS.panels,
         heldout_window_s=float(heldout.get("window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
+        halves=_mapping(_mapping(provenance.get("halves")).get("parameters")),
         residuals=drawn,
         advice=advice_rows(result),
         scan=charts.latency_scan(scan, inputs.tick_s),
@@ -137,10 +128,10 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         100 * np.clip(space.normalize(values), 0, 1)
         for values in (result.interval[:, 0], result.interval[:, 1], space.nominal, result.estimate)
     ]
-    unit = space.normalize(result.estimate)
+    ended = ended_at_bound(space, result.estimate)
     rows = []
     for k, p in enumerate(space):
-        bound = "lower" if unit[k] < AT_BOUND else "upper" if unit[k] > 1 - AT_BOUND else ""
+        bound = ("upper" if at[3][k] > 50 else "lower") if ended[k] else ""
         prior = ""
         if p.prior_mean is not None and p.prior_std is not None:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
@@ -148,15 +139,10 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         low, high = map(float, result.interval[k])
         rows.append(
             Row(
-                name=p.name,
-                unit=p.unit,
-                nominal=p.nominal,
+                parameter=p,
                 estimate=float(result.estimate[k]),
                 low=low,
                 high=high,
-                range_low=p.low,
-                range_high=p.high,
-                log=p.scale == "log",
                 verdict=result.verdicts[k] if result.verdicts else "",
                 told=bool(told(result)[k]),
                 at_bound=bound,
@@ -185,15 +171,15 @@ def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, li
     return names, rows
 
 
-def advice_rows(result: CalibrationResult) -> list[AdviceRow]:
-    """Return the table of what to record next."""
+def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
+    """Return the table of what to record next, in words."""
     return [
-        AdviceRow(
-            parameter=str(row["parameter"]),
-            before=_spread(result, str(row["parameter"]), row["std"]),
-            after=_spread(result, str(row["parameter"]), row["std_after"]) if row["excitation"] else "–",
-            sentence=str(row["sentence"]),
-        )
+        {
+            "parameter": str(row["parameter"]),
+            "before": _spread(result, str(row["parameter"]), row["std"]),
+            "after": _spread(result, str(row["parameter"]), row["std_after"]) if row["excitation"] else "–",
+            "sentence": str(row["sentence"]),
+        }
         for row in result.advice
     ]
 
@@ -225,3 +211,57 @@ def _plain(value: Any) -> str:
     if isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def write_result(
+    folder: Path, robot: RobotModel, result: CalibrationResult, report: ReportInputs | None = None
+) -> dict[str, Path]:
+    """Write everything a calibration found; all of it appears, or none.
+
+    Args:
+        folder: Where to write; made if need be.
+        robot: The nominal model.
+        result: What was found.
+        report: What the report shows; None to write none.
+
+    Returns:
+        The files by name; included files of the model that changed are among them.
+
+    Raises:
+        DatasetError: The folder cannot be written.
+        ConfigurationError: A calibrated value cannot be written into the model; all other files are there.
+        KeyboardInterrupt: Ctrl-C; nothing was changed, or all files are there.
+    """
+    unwritable: ConfigurationError | None = None
+    try:
+        with published_together(folder) as waiting:
+            names = [RESULT_FILE, DISTRIBUTION, TRACE]
+            write_json(waiting / RESULT_FILE, result.to_json())
+            write_json(waiting / DISTRIBUTION, result.distribution().to_json())
+            np.savez(waiting / TRACE, **_trace(result))
+            if report is not None:
+                write_report(waiting / REPORT, report)
+                names.append(REPORT)
+            source = f"method {result.method}, distribution {result.distribution().digest()}"
+            try:
+                require_other(folder / MODEL, robot.description.mjcf)
+                written = write_calibrated_mjcf(
+                    robot, result.space, result.estimate, waiting / MODEL, result.latency_s, source
+                )
+                names += [file.name for file in written]
+            except ConfigurationError as err:
+                # A model that cannot be written must not cost the numbers.
+                unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
+    except OSError as err:
+        raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
+    if unwritable is not None:
+        raise unwritable
+    return {name: folder / name for name in names}
+
+
+def _trace(result: CalibrationResult) -> dict[str, Any]:
+    keys = sorted({key for row in result.trace for key in row})
+    columns: dict[str, Any] = {key: np.array([row.get(key, np.nan) for row in result.trace]) for key in keys}
+    if result.population is not None:
+        columns["population"] = result.population
+    return columns

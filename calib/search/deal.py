@@ -118,10 +118,7 @@ class _Deal(KalmanStepper):
         alarms = []
         # Without sensor noise chi2 is in units of the wire's rounding, which no critic resolves.
         if self._noisy and not chi2 <= self.settings.alarm_chi2:
-            alarms.append(
-                f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(self.log.trace)} generations; polish it, search again with another seed, or use eki"
-            )
+            alarms.append(self.log.unexplained(chi2))
         return self.log.result(
             centre,
             members,

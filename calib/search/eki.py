@@ -104,11 +104,7 @@ class _Eki(KalmanStepper):
         chi2, z = self._best or (float("nan"), self.kalman.ask())
         alarms = []
         if not chi2 <= self.settings.restart_chi2 and not self._brief:
-            alarms.append(
-                f"the search left a residual of {chi2:.1f} times its expected variance after "
-                f"{len(self.log.trace)} generations; "
-                "allow more generations, widen the ranges, or suspect the model"
-            )
+            alarms.append(self.log.unexplained(chi2))
         members, centre = self.population(z)
         return self.log.result(
             centre,

@@ -11,7 +11,7 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.types import FloatArray
 
 Z90 = 1.6448536269514722
@@ -86,13 +86,21 @@ class SearchLog:
         self._earlier_steps, self._earlier_seconds = state["steps"], state["seconds"]
         self._steps, self._start = self.problem.steps, time.perf_counter()
 
+    def unexplained(self, chi2: float) -> Alarm:
+        """Return the alarm of a search that left a residual."""
+        return Alarm(
+            f"After {len(self.trace)} generations the residual is {chi2:.1f} times its expected variance.",
+            "The search ended elsewhere than at the robot, or the model lacks something.",
+            "Refine it, search again (another --seed, more --generations, wider ranges), or doubt the model.",
+        )
+
     def result(
         self,
         centre: Members,
         population: Members,
         *,
         chi2: float = float("nan"),
-        alarms: Sequence[str] = (),
+        alarms: Sequence[Alarm] = (),
         extra: Mapping[str, Any] | None = None,
         **better: Any,
     ) -> CalibrationResult:

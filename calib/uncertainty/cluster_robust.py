@@ -24,14 +24,25 @@ import numpy.typing as npt
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.types import FloatArray
 
-FEWEST_BLOCKS = 8
-"""With fewer blocks nothing can be said of how residuals hang together."""
 
-ENOUGH_BLOCKS = 24
-"""Blocks are made as long as so many of them allow."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClusterSettings:
+    """Settings of :func:`clustered`.
 
-_PARTS = (8, 4, 2)
-_SHORTEST = 4
+    Attributes:
+        fewest_blocks: With fewer blocks nothing can be said of how residuals are correlated.
+        enough_blocks: Blocks are made as long as so many of them allow.
+        parts: Parts that a window is cut into at first.
+        shortest: Fewest samples of a part.
+    """
+
+    fewest_blocks: int = 8
+    enough_blocks: int = 24
+    parts: tuple[int, ...] = (8, 4, 2)
+    shortest: int = 4
+
+
+SETTINGS = ClusterSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +77,7 @@ class _Level:
     follows: npt.NDArray[np.bool_]
 
     @property
-    def hang_together(self) -> bool:
+    def autocorrelated(self) -> bool:
         """Whether neighbouring blocks are correlated."""
         power = np.sum(self.shift**2, axis=0)
         product = np.sum((self.shift[1:] * self.shift[:-1])[self.follows], axis=0)
@@ -84,7 +95,7 @@ def clustered(
         bread: Covariance under independent residuals of unit variance, (P, P); zero rows and columns for
             coordinates that are fixed.
         samples: Samples H of a window.
-        correlation_samples: How long residuals hang together; blocks are at least twice as long.
+        correlation_samples: Autocorrelation time of the residuals; blocks are at least twice as long.
 
     Returns:
         None where the recordings do not hold enough blocks.
@@ -92,23 +103,25 @@ def clustered(
     if not rows:
         return None
     found: Clustered | None = None
-    hanging = True
+    correlated = True
     for parts, group in _levels(rows, samples):
         length = group * samples // parts
-        if length < max(_SHORTEST, 2 * correlation_samples) and parts > 1:
+        if length < max(SETTINGS.shortest, 2 * correlation_samples) and parts > 1:
             continue
         level = _level(rows, bread, samples, parts, group)
         blocks = len(level.shift)
-        if blocks < FEWEST_BLOCKS or (found is not None and blocks < ENOUGH_BLOCKS and not hanging):
+        if blocks < SETTINGS.fewest_blocks or (
+            found is not None and blocks < SETTINGS.enough_blocks and not correlated
+        ):
             break
-        found, hanging = _clustered(level, length), level.hang_together
+        found, correlated = _clustered(level, length), level.autocorrelated
     return found
 
 
 def _levels(rows: Sequence[WindowRows], samples: int) -> list[tuple[int, int]]:
     """Return (parts of a window, windows in a group) from the shortest block to the longest."""
     longest = max((len(r.residual) for r in rows), default=0)
-    levels = [(parts, 1) for parts in (*_PARTS, 1) if samples // parts >= 1]
+    levels = [(parts, 1) for parts in (*SETTINGS.parts, 1) if samples // parts >= 1]
     group = 2
     while group <= longest:
         levels.append((1, group))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,46 +12,70 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import t as t_law
 from scipy.stats import truncnorm
 
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Polished
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calibration import Verdict
+from deal_hw.calibration import Alarm, Verdict, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 Z90 = 1.6448536269514722
 """Half width of a 90 % interval in standard deviations."""
 
-KINKS = 1.2
-"""Factor on standard deviations for what linearising leaves out: stick-slip and saturation bend the
-likelihood. Measured on tuning seeds: without it 90 % intervals held 86-89 % of the truths."""
 
-CONTACT_KINKS = 2.0
-"""The same where feet touch the floor. On five sensed Go2 tuning seeds errors were 0.9 to 1.7 times (root
-mean square) what linearising says, about 1.5 over all; as it differs so much from robot to robot, Student's
-quantile with four degrees of freedom, 1.3 times the normal one, belongs to it."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MismatchSettings:
+    """Residuals that noise does not make.
 
-IDENTIFIABLE_STD = 0.15
-"""Up to this standard deviation, in ln units or parts of a linear range, a parameter is identified."""
+    Attributes:
+        chi2: Mean squared residual over the noise's above which the model is wrong [-].
+        correlation_samples: Autocorrelation time above which it is [samples].
+        negligible_chi2: Residuals this far below the noise need no explanation, autocorrelated or not [-].
+    """
 
-WEAK_SHARE = 0.5
-"""Up to this share of the prior's standard deviation the data say something."""
+    chi2: float = 1.3
+    correlation_samples: float = 2.0
+    negligible_chi2: float = 0.5
 
-BLIND_SHARE = 0.9
-"""Beyond this share of the prior's standard deviation the data say nothing."""
 
-AT_BOUND = 1e-6
-"""A parameter so near an end of its range, as a share of the range, ended there."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntervalSettings:
+    """Settings of :func:`uncertainty`.
 
-PRIOR_BLOCKS = 4.0
-"""The overall inflation counts like so many blocks in a parameter's own: few blocks say little."""
+    Attributes:
+        kinks: Factor on standard deviations for what linearising leaves out [-]: stick-slip and saturation
+            bend the likelihood. Measured on tuning seeds: without it 90 % intervals held 86-89 % of the
+            truths.
+        contact_kinks: The same where feet touch the floor [-]. On five sensed Go2 tuning seeds errors were
+            0.9 to 1.7 times (root mean square) what linearising says, about 1.5 over all; as it differs so
+            much from robot to robot, Student's quantile with four degrees of freedom, 1.3 times the normal
+            one, belongs to it.
+        identifiable_std: Up to this standard deviation, in ln units or parts of a linear range, a parameter
+            is identified [-].
+        weak_share: Up to this share of the prior's standard deviation the data say something [-].
+        blind_share: Beyond this share of the prior's standard deviation the data say nothing [-].
+        at_bound: A parameter so near an end of its range, as a share of the range, ended there [-].
+        prior_blocks: The overall inflation counts like so many blocks in a parameter's own: few blocks say
+            little.
+        lags: Longest lag of the autocorrelation time [samples].
+        near: Share of the refinement's step in parameters [-]: over a whole one dry friction kinks often
+            enough to look like information where a recording without noise has none.
+    """
 
-MISMATCH_CHI2 = 1.3
-MISMATCH_TIME = 2.0
-NEGLIGIBLE_CHI2 = 0.5
-"""Residuals this far below the noise need no explanation, however they hang together."""
+    kinks: float = 1.2
+    contact_kinks: float = 2.0
+    identifiable_std: float = 0.15
+    weak_share: float = 0.5
+    blind_share: float = 0.9
+    at_bound: float = 1e-6
+    prior_blocks: float = 4.0
+    lags: int = 12
+    near: float = 0.1
 
-_LAGS = 12
+
+MISMATCH, SETTINGS = MismatchSettings(), IntervalSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +88,7 @@ class Uncertainty:
         latency_interval_s: 90 % interval of the latency [s].
         verdicts: One a parameter.
         null_directions: Combinations that the data cannot see, in words.
-        alarms: Signs that the model is wrong, in words.
+        alarms: Signs that the model is wrong.
         inflation: Factor on the variance for what the model does not explain.
         shape: What the intervals keep whatever the covariance is.
         clustered: Variances clustered by blocks of time over those of independent residuals; None where it
@@ -76,7 +101,7 @@ class Uncertainty:
     latency_interval_s: tuple[float, float]
     verdicts: tuple[Verdict, ...]
     null_directions: tuple[str, ...]
-    alarms: tuple[str, ...]
+    alarms: tuple[Alarm, ...]
     inflation: float
     shape: Shape
     clustered: Clustered | None
@@ -110,7 +135,7 @@ def correlation_time(residuals: tuple[FloatArray, ...]) -> float:
             if power[j] <= 0:
                 continue
             total = 1.0
-            for lag in range(1, min(_LAGS, H - 1) + 1):
+            for lag in range(1, min(SETTINGS.lags, H - 1) + 1):
                 rho = float(np.mean(r[:, lag:, j] * r[:, :-lag, j]) / power[j])
                 if rho <= 2.0 / np.sqrt(r[:, lag:, j].size):
                     break
@@ -133,7 +158,7 @@ def uncertainty(
     gradient: FloatArray | None = None,
     prior: FloatArray | None = None,
     rows: Sequence[WindowRows] = (),
-    kinks: float = KINKS,
+    kinks: float = SETTINGS.kinks,
 ) -> Uncertainty:
     """Turn normal equations into statements.
 
@@ -164,13 +189,13 @@ def uncertainty(
     belief = known + 1.0 / flat
     # Null directions see the range through their own scale, so only what was measured counts here.
     unseen = null_space(space, data[:K, :K] / inflation + np.diag(known[:K]))
-    blind = unseen.std > IDENTIFIABLE_STD * _unit(space)
+    blind = unseen.std > SETTINGS.identifiable_std * _unit(space)
     bound = _at_bound(space, theta, slope[:K]) * ~blind
     free = np.append(bound == 0, not fixed_latency)
     covariance = _covariance(data / inflation + np.diag(belief), free)
     cluster = _cluster(rows, covariance / inflation, residuals, tau)
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
-    # What the data cannot see stays as wide as the range, however its residuals hang together.
+    # What the data cannot see stays as wide as the range, however autocorrelated its residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
     factor = np.maximum(factor, 1.0)
     covariance = covariance * np.outer(factor, factor)
@@ -185,7 +210,7 @@ def uncertainty(
     )
     if fixed_latency:
         latency = (latency_s, latency_s)
-    blind |= std[:K] > BLIND_SHARE * np.sqrt(flat[:K])
+    blind |= std[:K] > SETTINGS.blind_share * np.sqrt(flat[:K])
     shape = Shape(blind, bound)
     return Uncertainty(
         covariance=covariance[:K, :K],
@@ -208,7 +233,7 @@ def _unit(space: ParameterSpace) -> FloatArray:
 def _at_bound(space: ParameterSpace, theta: FloatArray, slope: FloatArray) -> npt.NDArray[np.int64]:
     """Return -1 or 1 where a parameter ended at a bound that the data press, (K,)."""
     unit = space.normalize(theta)
-    low, high = (unit < AT_BOUND) & (slope >= 0), (unit > 1 - AT_BOUND) & (slope <= 0)
+    low, high = (unit < SETTINGS.at_bound) & (slope >= 0), (unit > 1 - SETTINGS.at_bound) & (slope <= 0)
     return np.asarray(high.astype(np.int64) - low.astype(np.int64))
 
 
@@ -254,8 +279,8 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
         return np.ones(1)
     degrees = cluster.degrees
     ratio = cluster.ratio * inflation / uniform
-    drawn = (PRIOR_BLOCKS * inflation + degrees * ratio) / (PRIOR_BLOCKS + degrees)
-    quantile = t_law.ppf(0.95, PRIOR_BLOCKS + degrees) / Z90
+    drawn = (SETTINGS.prior_blocks * inflation + degrees * ratio) / (SETTINGS.prior_blocks + degrees)
+    quantile = t_law.ppf(0.95, SETTINGS.prior_blocks + degrees) / Z90
     heeded = cluster.ratio / uniform > chi2_law.ppf(0.95, degrees) / degrees
     factor = np.where(heeded, np.sqrt(drawn / inflation) * quantile, 1.0)
     return np.asarray(np.maximum(factor, 1.0))
@@ -277,7 +302,7 @@ def intervals(
     low = np.maximum(space.from_scale(center - Z90 * std), space.low)
     high = np.minimum(space.from_scale(center + Z90 * std), space.high)
     # The estimate of a parameter that the data cannot see is arbitrary: its interval is the range's own 90 %.
-    blind = std > BLIND_SHARE * space.width / np.sqrt(12.0)
+    blind = std > SETTINGS.blind_share * space.width / np.sqrt(12.0)
     if shape is not None:
         blind = blind | shape.blind
         # What is beyond a bound was never searched; what is left lies on one side.
@@ -295,10 +320,10 @@ def _verdicts(space: ParameterSpace, std: FloatArray, blind: npt.NDArray[np.bool
     for k in range(len(space)):
         if blind[k]:
             found.append("not identifiable")
-        elif std[k] <= IDENTIFIABLE_STD * unit[k]:
+        elif std[k] <= SETTINGS.identifiable_std * unit[k]:
             found.append("identifiable")
         else:
-            found.append("weak" if std[k] <= WEAK_SHARE * prior_std[k] else "not identifiable")
+            found.append("weak" if std[k] <= SETTINGS.weak_share * prior_std[k] else "not identifiable")
     return tuple(found)
 
 
@@ -309,35 +334,126 @@ def _alarms(
     tau: float,
     timing_std_s: float,
     pressed: npt.NDArray[np.bool_],
-) -> tuple[str, ...]:
+) -> tuple[Alarm, ...]:
     alarms = []
     if timing_std_s > 0:
         alarms.append(
-            f"the state samples' time jitters by {1e3 * timing_std_s:.1f} ms: the model's delay is "
-            "constant, so where commands jitter too the intervals are too narrow"
+            Alarm(
+                f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
+                "The model's delay is constant: if commands jitter too, the intervals are too narrow.",
+                "Record over a link with less jitter, or with the device's own time stamps.",
+            )
         )
-    if chi2 > MISMATCH_CHI2:
+    if chi2 > MISMATCH.chi2:
+        alarms.append(mismatch(chi2))
+    if chi2 > MISMATCH.negligible_chi2 and tau > MISMATCH.correlation_samples:
         alarms.append(
-            f"the model does not explain the recording: residuals are {np.sqrt(chi2):.1f} times the "
-            "sensor noise (friction law, backlash, jittering delay, or a range that is too narrow)"
+            Alarm(
+                f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
+                "Something moves that the model does not have: a friction law, backlash or a varying delay.",
+                "Free a parameter for it or mend the hardware; trust predictions more than values.",
+            )
         )
-    if chi2 > NEGLIGIBLE_CHI2 and tau > MISMATCH_TIME:
-        alarms.append(
-            f"residuals hang together over {tau:.1f} samples where noise would not: something moves that "
-            "the model does not have (friction law, backlash or a varying delay)"
-        )
-    for k in np.flatnonzero(ended_at_bound(space, theta)):
-        fixed = (
-            "it was fixed there for the others' intervals" if pressed[k] else "the data do not press it there"
-        )
-        alarms.append(
-            f"{space.names[k]} ended at the bound of its range, {theta[k]:.4g} {space.free[k].unit}: "
-            f"{fixed}; widen the range, or doubt the model"
-        )
+    ended = ended_at_bound(space, theta)
+    for which, means in (
+        (pressed, "The data ask for a value outside the range, or the model is wrong. The intervals of the "
+         "other parameters hold for this value."),
+        (~pressed, "The search ended there, but the data do not press the value to that end."),
+    ):  # fmt: skip
+        names = [
+            f"{space.names[k]} ({theta[k]:.4g} {space.free[k].unit})" for k in np.flatnonzero(ended & which)
+        ]
+        if names:
+            alarms.append(
+                Alarm(
+                    f"Ended at the bound of the search range: {listed(names)}.",
+                    means,
+                    "Widen the range (--range NAME LOW HIGH) if such a value is possible, or doubt the "
+                    "model.",
+                )
+            )
     return tuple(alarms)
+
+
+def mismatch(chi2: float, window: str = "") -> Alarm:
+    """Return the alarm of residuals above the sensors' noise.
+
+    Args:
+        chi2: Mean squared residual over the noise's.
+        window: Over how long, in words.
+    """
+    return Alarm(
+        f"Residuals are {np.sqrt(chi2):.1f} times the sensor's noise{window}.",
+        "The model does not explain the recording: it lacks something that the robot has (a friction law, "
+        "backlash, a delay that varies), or a range is too narrow. The intervals count all of it as noise.",
+        "Mend the causes that other alarms name, or widen ranges, and calibrate again. Judge this model by "
+        "its "
+        "held-out error.",
+    )
 
 
 def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which parameters lie at an end of their range, pressed against it or not, (K,)."""
     unit = space.normalize(theta)
-    return np.asarray((unit < AT_BOUND) | (unit > 1 - AT_BOUND))
+    return np.asarray((unit < SETTINGS.at_bound) | (unit > 1 - SETTINGS.at_bound))
+
+
+def with_rows(polished: Polished) -> Polished:
+    """Return the same with linearised residuals, from which variances are clustered.
+
+    Central differences where nothing kinks: what is said of directions without information depends on them.
+    """
+    if polished.normal.rows:
+        return polished
+    shooting = polished.shooting
+    if shooting.problem.robot.base is None:
+        normal = shooting.normal(polished.point, keep=True, stretch=SETTINGS.near, central=True)
+    else:
+        normal = shooting.normal(polished.point, keep=True)
+    return dataclasses.replace(polished, normal=normal)
+
+
+def statement(problem: Problem, polished: Polished, fixed_latency: bool) -> Uncertainty:
+    """Return what the data say where the polish ended.
+
+    Args:
+        problem: The problem.
+        polished: Where; variances are clustered where it holds linearised residuals.
+        fixed_latency: The latency was given, or decided.
+    """
+    normal = polished.normal
+    return uncertainty(
+        problem.space,
+        polished.theta,
+        polished.latency_s,
+        normal.hessian,
+        polished.chi2,
+        normal.residual,
+        problem.latency_range_s,
+        fixed_latency=fixed_latency,
+        timing_std_s=problem.noise.timing_std_s,
+        gradient=normal.gradient,
+        prior=normal.prior,
+        rows=normal.rows,
+        kinks=SETTINGS.kinks if problem.robot.base is None or problem.exact else SETTINGS.contact_kinks,
+    )
+
+
+def widened_to(problem: Problem, known: Uncertainty, theta: FloatArray, std: FloatArray) -> Uncertainty:
+    """Return the statement with standard deviations that are at least these, correlations kept.
+
+    Args:
+        problem: The problem.
+        known: The statement.
+        theta: The estimate it is about, (K,).
+        std: Least standard deviations in each parameter's own scale, (K,).
+    """
+    own = np.sqrt(np.diag(known.covariance))
+    factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)
+    covariance = known.covariance * np.outer(factor, factor)
+    return dataclasses.replace(
+        known,
+        covariance=covariance,
+        interval=intervals(problem.space, theta, covariance, known.shape),
+        widened=known.widened * factor,
+    )

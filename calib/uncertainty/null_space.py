@@ -1,27 +1,52 @@
-"""Combinations of parameters that the data cannot see: a readable basis, and in words.
+"""What the data cannot tell apart: combinations of parameters, and whole kinds of them.
 
 Any rotation of the directions of no information is as good as any other; the one with the fewest parameters
-in each is the one that a person can act on ("measure one of them").
+in each is the one that a person can act on ("measure one of them"). A pair of single parameters hardly shows
+what is confounded, as a delay goes with the armatures of all joints together; so whole kinds are compared.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
 
+from deal_hw.calib.data.problem import Problem
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
-SEEN = 1.0
-"""Information below this, relative to what the range itself says, is none."""
+LATENCY = "latency"
 
-ROUNDING = 1e-13
-"""So is what lies this far below the direction that is seen best: differences are not more exact."""
 
-PART = 0.1
-"""Parameters that move by less than this part of the one that moves most are not named."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NullSpaceSettings:
+    """Settings of :func:`null_space` and :func:`confounded`.
+
+    Attributes:
+        seen: Information below this, relative to what the range itself says, is none [-].
+        rounding: So is what lies this far below the direction that is seen best [-]: differences are not
+            more exact.
+        part: Parameters that move by less than this part of the one that moves most are not named [-].
+        wide: Standard deviation of a weak prior that keeps matrices invertible, in search ranges. With the
+            range itself as prior a kind that the data leave open would look known, and its partner would not
+            be named.
+        narrower: Kinds are named where fixing one makes the other's interval narrower by this factor [-]: a
+            third of its variance comes from the other.
+        mostly: From this factor on, three quarters of the variance, they are confounded; below it partly [-].
+    """
+
+    seen: float = 1.0
+    rounding: float = 1e-13
+    part: float = 0.1
+    wide: float = 10.0
+    narrower: float = 1.25
+    mostly: float = 2.0
+
+
+SETTINGS = NullSpaceSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +71,7 @@ def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
     """
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
-    blind = values < max(SEEN, ROUNDING * float(values[-1]))
+    blind = values < max(SETTINGS.seen, SETTINGS.rounding * float(values[-1]))
     # Posterior variance along each of them, the range's own variance being the prior's.
     spread = vectors[:, blind] ** 2 @ (1.0 / (1.0 + np.maximum(values[blind], 0.0)))
     directions = sparse_basis(vectors[:, blind].T) * root
@@ -99,7 +124,7 @@ def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]
 
 
 def _words(space: ParameterSpace, direction: FloatArray) -> str:
-    parts = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > PART]
+    parts = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > SETTINGS.part]
     lead = np.sign(direction[parts[0]])
     up = [space.names[k] for k in parts if np.sign(direction[k]) == lead]
     down = [space.names[k] for k in parts if np.sign(direction[k]) != lead]
@@ -114,3 +139,66 @@ def _words(space: ParameterSpace, direction: FloatArray) -> str:
         f"{', '.join(up)} can be raised while {', '.join(down)} "
         f"{'is' if len(down) == 1 else 'are'} lowered without a trace: measure one of them"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Confounded:
+    """Two kinds of parameters that the data tell apart badly.
+
+    Attributes:
+        first: A kind, or ``latency``.
+        second: Another kind.
+        factor: How much narrower the first's intervals were (the median, element by element), were the second
+            known.
+    """
+
+    first: str
+    second: str
+    factor: float
+
+    @property
+    def words(self) -> str:
+        """In a sentence."""
+        degree = "" if self.factor >= SETTINGS.mostly else "partly "
+        return (
+            f"{self.first} and {self.second} are {degree}confounded: with {self.second} known the interval "
+            f"of {self.first} would be {self.factor:.1f} times narrower"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {"first": self.first, "second": self.second, "factor": self.factor}
+
+
+def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, ...]:
+    """Return the confounded pairs of kinds, the worst first.
+
+    Args:
+        problem: Says which parameter is of which kind, and the ranges.
+        information: What the data say of parameters, in their own scale, and latency, (K + 1, K + 1); without
+            any prior.
+    """
+    space = problem.space
+    low, high = problem.latency_range_s
+    weak = 12.0 / (SETTINGS.wide * np.append(space.width, high - low)) ** 2
+    precision = information + np.diag(weak)
+    kinds = {kind: [k for k, p in enumerate(space) if p.kind == kind] for kind in {p.kind for p in space}}
+    if problem.fixed_latency_s is None:
+        kinds[LATENCY] = [len(space)]
+    # Latency first, so that a pair with it is said from its side.
+    names = sorted(kinds, key=lambda name: (name != LATENCY, name))
+    whole = _free_std(precision, [i for members in kinds.values() for i in members])
+    found = []
+    for a, b in itertools.combinations(names, 2):
+        without = [i for name, members in kinds.items() if name != b for i in members]
+        alone = _free_std(precision, without)
+        factor = float(np.median([whole[i] / alone[i] for i in kinds[a]]))
+        if factor >= SETTINGS.narrower:
+            found.append(Confounded(a, b, factor))
+    return tuple(sorted(found, key=lambda pair: -pair.factor))
+
+
+def _free_std(precision: FloatArray, free: list[int]) -> dict[int, float]:
+    """Return standard deviations of the free entries, the others fixed."""
+    variance = np.diag(np.linalg.inv(precision[np.ix_(free, free)]))
+    return {i: float(np.sqrt(v)) for i, v in zip(free, variance, strict=True)}

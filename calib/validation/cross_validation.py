@@ -17,25 +17,32 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish, polish_robust
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult
+from deal_hw.calib.fit.refinement import polish, polish_robust
+from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
-FOLDS = 2
-"""Each costs a search and a polish."""
 
-BLOCKS = 2
-"""Stretches of each recording that a fold leaves out."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoldSettings:
+    """Settings of :func:`choose`.
 
-MOST_STEPS = 3e9
-"""More physics steps than this are not spent on folds."""
+    Attributes:
+        folds: Each costs a search and a polish.
+        blocks: Stretches of each recording that a fold leaves out.
+        most_steps: More physics steps than this are not spent on folds.
+    """
+
+    folds: int = 2
+    blocks: int = 2
+    most_steps: float = 3e9
+
+
+SETTINGS = FoldSettings()
 
 Member = tuple[FloatArray, float]
 """Physical parameters, (K,), and latency [s]."""
-
-Fit = Callable[[Problem, CalibrationResult], Member]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,17 +97,22 @@ def choose(
         robust: Try the robust polish, too.
     """
     window_s = length * problem.episodes[0].period_s
-    if FOLDS * search_steps > MOST_STEPS:
-        note = f"left out: {FOLDS} searches would take {FOLDS * search_steps:.1g} physics steps"
+    if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
+        note = f"left out: {SETTINGS.folds} searches would take {cost:.1g} physics steps"
         return Choice("polish", {}, window_s, note=note)
     before = problem.steps
-    candidates: dict[str, Fit] = {"search": _searched, "polish": _polished}
-    if robust:
-        candidates["robust polish"] = _robust
+    fixed = problem.fixed_latency_s is not None
 
     def fits(train: Problem, fold: int) -> dict[str, Member]:
         searched = search.run(train, budget, np.random.default_rng([seed, fold]))
-        return {name: fit(train, searched) for name, fit in candidates.items()}
+        polished = polish(train, searched.estimate, searched.latency_s, fixed_latency=fixed)
+        found = {
+            "search": (searched.estimate, searched.latency_s), "polish": (polished.theta, polished.latency_s)
+        }  # fmt: skip
+        if robust:
+            weighed = polish_robust(polished, fixed)
+            found["robust polish"] = weighed.theta, weighed.latency_s
+        return found
 
     def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
         return prediction_error(test, members, length)
@@ -141,7 +153,7 @@ def on_folds(
     return Choice(chosen, {n: tuple(v) for n, v in found.items()}, window_s)
 
 
-def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np.bool_]]]:
+def fold_masks(problem: Problem, count: int = SETTINGS.folds) -> list[list[npt.NDArray[np.bool_]]]:
     """Return for each fold which samples of each recording it leaves out, (T,) each.
 
     Where there are as many motions as folds, whole motions are left out, every other one: other motion is
@@ -159,7 +171,7 @@ def fold_masks(problem: Problem, count: int = FOLDS) -> list[list[npt.NDArray[np
     found: list[list[npt.NDArray[np.bool_]]] = [[] for _ in range(count)]
     for number, episode in zip(unit, episodes, strict=True):
         T = len(episode.sample)
-        block = np.arange(T) * count * BLOCKS // T if len(episodes) < count else np.full(T, number)
+        block = np.arange(T) * count * SETTINGS.blocks // T if len(episodes) < count else np.full(T, number)
         for fold in range(count):
             found[fold].append(block % count == fold)
     return found
@@ -220,22 +232,3 @@ def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]],
         total += np.sum(np.where(np.isfinite(error), error, span) ** 2, axis=(1, 2, 3))
         count += int(np.count_nonzero(np.isfinite(data.std)))
     return np.asarray(np.sqrt(total / max(count, 1)))
-
-
-def _searched(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    return searched.estimate, searched.latency_s
-
-
-def _polished(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    found = _polish(problem, searched)
-    return found.theta, found.latency_s
-
-
-def _robust(problem: Problem, searched: CalibrationResult) -> tuple[FloatArray, float]:
-    found = polish_robust(_polish(problem, searched), problem.fixed_latency_s is not None)
-    return found.theta, found.latency_s
-
-
-def _polish(problem: Problem, searched: CalibrationResult) -> Polished:
-    fixed = problem.fixed_latency_s is not None
-    return polish(problem, searched.estimate, searched.latency_s, fixed_latency=fixed)

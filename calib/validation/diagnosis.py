@@ -9,7 +9,7 @@ is the share of the residual's excess over noise that it explains beyond what as
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,48 +21,84 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
+from deal_hw.calibration import Alarm
 from deal_hw.types import FloatArray
 
 Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "contact"]
 
-NOTICED = 0.03
-"""A cause that explains less than this share of the excess is not named."""
 
-BY_CHANCE = 1e-3
-"""Nor is one that random columns would match with this probability."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiagnosisSettings:
+    """Settings of :func:`diagnose`.
 
-LOW_SPEEDS = (0.1, 0.4)
-"""Speeds, as parts of a joint's rms speed, within which friction's excess at low speed falls to 1/e."""
+    Attributes:
+        noticed: A cause that explains less than this share of the excess is not named [-].
+        by_chance: Nor is one that random columns would match with this probability [-].
+        low_speeds: Speeds, as parts of a joint's rms speed, within which friction's excess at low speed falls
+            to 1/e [-].
+        play_s: After a reversal a gear with play does not drive for about so long [s].
+        delay_piece_s: A varying delay is taken as constant for so long [s].
+        burst_part: Bursts are where so small a part of the time
+        burst_share: holds so much of the residual, [-] both,
+        burst_kurtosis: and its kurtosis is that high (noise: 3).
+        burst_size: A burst's squared residual over the median's [-].
+        certain: Standard errors by which the residual must exceed noise before anything is said of it.
+        still: Part of the rms speed below which a velocity has no direction [-].
+    """
 
-PLAY_S = 0.03
-"""After a reversal a gear with play does not drive for about so long [s]."""
+    noticed: float = 0.03
+    by_chance: float = 1e-3
+    low_speeds: tuple[float, ...] = (0.1, 0.4)
+    play_s: float = 0.03
+    delay_piece_s: float = 0.1
+    burst_part: float = 0.05
+    burst_share: float = 0.4
+    burst_kurtosis: float = 8.0
+    burst_size: float = 40.0
+    certain: float = 4.0
+    still: float = 1e-3
 
-DELAY_PIECE_S = 0.1
-"""A varying delay is taken as constant for so long [s]."""
 
-BURST_PART, BURST_SHARE, BURST_KURTOSIS = 0.05, 0.4, 8.0
-"""Bursts: this part of the time holds that share of the residual, whose kurtosis is that high (noise: 3)."""
+SETTINGS = DiagnosisSettings()
 
-BURST_SIZE = 40.0
-"""A burst's squared residual over the median's."""
-
-CERTAIN = 4.0
-"""Standard errors by which the residual must exceed noise before anything is said of it."""
-
-STILL = 1e-3
-"""Part of the rms speed below which a velocity has no direction."""
-
-ADVICE: dict[Cause, str] = {
-    "friction": "friction depends on speed (Stribeck), or creeps where it should hold: free "
-    "dof_friction_creep, dof_frictionloss and dof_damping of",
-    "backlash": "the residual follows reversals: play in the gear of",
-    "delay": "the timing varies: command or sensing delay jitters, so mend the link or measure its law; "
-    "seen in",
-    "damping": "a force grows with speed: free dof_damping or servo_damping of",
-    "inertia": "a force follows acceleration: free dof_armature, body_mass or the actuator's gain of",
-    "load": "a constant force is missing: free encoder_bias, body_mass or body_ipos of",
-    "contact": "the residual comes in bursts, as contacts make that the model does not have: leave out",
+LOOKS: Mapping[Cause, tuple[str, str, str]] = {
+    "friction": (
+        "a force against slow motion",
+        "Friction depends on speed (Stribeck), or creeps where it should hold.",
+        "Free dof_friction_creep, dof_frictionloss and dof_damping of {}.",
+    ),
+    "backlash": (
+        "an offset at each reversal",
+        "There is play in the gear.",
+        "Mend the gear of {}, or accept an error of that size.",
+    ),
+    "delay": (
+        "a timing error that changes",
+        "The delay of commands or sensors varies; the model's is constant.",
+        "Mend the link, or measure the law of its delay; look at {} first.",
+    ),
+    "damping": (
+        "a force that grows with speed",
+        "Damping was not free, or follows another law (the square of speed).",
+        "Free dof_damping or servo_damping of {}; if they are free, doubt the law.",
+    ),
+    "inertia": (
+        "a force in proportion to acceleration",
+        "An inertia or a gain was not free, or its range is too narrow.",
+        "Free dof_armature, body_mass or the actuator's gain of {}.",
+    ),
+    "load": (
+        "a constant force",
+        "A mass, its centre or an encoder's zero was not free.",
+        "Free encoder_bias, body_mass or body_ipos of {}.",
+    ),
+    "contact": (
+        "bursts",
+        "The robot touches something that the model does not have.",
+        "Leave out {}.",
+    ),
 }
+"""What each cause looks like, what it means, and what to do about it, {} being where."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +109,19 @@ class Finding:
         cause: Which.
         share: Share of the residual's excess over noise that it explains.
         joints: Joints that show it most, most first.
-        words: What to do, for people.
+        alarm: For people.
     """
 
     cause: Cause
     share: float
     joints: tuple[str, ...]
-    words: str
+    alarm: Alarm
+
+
+def _named(cause: Cause, share: float, joints: tuple[str, ...], where: str) -> Finding:
+    looks, means, do = LOOKS[cause]
+    seen = f"{100 * share:.0f} % of what is unexplained looks like {looks}: {cause}."
+    return Finding(cause, share, joints, Alarm(seen, means, do.replace("{}", where)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +191,7 @@ def diagnose(
         found: How the joints moved, with linearised residuals.
         hessian: Normal matrix of parameters and latency; fixed ones have zero rows and columns, (P, P).
         joint_names: Names of the joints.
-        correlation_samples: How long residuals hang together: random columns explain the more.
+        correlation_samples: Autocorrelation time of the residuals: random columns explain the more.
     """
     gain = np.asarray(np.linalg.pinv(hessian, rcond=1e-12, hermitian=True), dtype=np.float64)
     moved = np.concatenate([m.velocity.reshape(-1, m.velocity.shape[2]) for m in found])
@@ -158,7 +200,7 @@ def diagnose(
     count = sum(_count(m) for m in found)
     # What white noise leaves is not to be explained; neither is what is not certain to be more.
     excess = max(left.total - count, (1.0 - 1.0 / correlation_samples) * left.total)
-    if excess < CERTAIN * np.sqrt(2.0 * correlation_samples * count):
+    if excess < SETTINGS.certain * np.sqrt(2.0 * correlation_samples * count):
         return ()
     chance = max(left.total / count, 1.0) * correlation_samples
     results: list[Finding] = []
@@ -170,8 +212,8 @@ def diagnose(
     results.append(_finding("delay", explained, used, chance, excess, scale, joint_names))
     bursts = _bursts(found)
     if bursts:
-        results.append(Finding("contact", bursts[0], (), f"{ADVICE['contact']} {bursts[1]}"))
-    told = [f for f in results if f.share >= NOTICED]
+        results.append(_named("contact", bursts[0], (), bursts[1]))
+    told = [f for f in results if f.share >= SETTINGS.noticed]
     return tuple(sorted(told, key=lambda f: -f.share))
 
 
@@ -192,11 +234,11 @@ def _finding(
     names: Sequence[str],
 ) -> Finding:
     share = min((explained - used * chance) / excess, 1.0)
-    if chi2_law.sf(explained / chance, max(used, 1)) > BY_CHANCE:
+    if chi2_law.sf(explained / chance, max(used, 1)) > SETTINGS.by_chance:
         share = 0.0
     order = np.argsort(-each)
     chosen = tuple(names[j] for j in order[:4] if each[j] >= 0.25 * each[order[0]])
-    return Finding(cause, float(share), chosen, f"{ADVICE[cause]} {', '.join(chosen)}")
+    return _named(cause, float(share), chosen, ", ".join(chosen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,13 +308,14 @@ def _forced(motion: Motion, force: FloatArray) -> FloatArray:
 def _friction(motion: Motion, scale: FloatArray) -> FloatArray:
     v = motion.velocity
     return _forced(
-        motion, np.stack([-np.sign(v) * np.exp(-np.abs(v) / (s * scale)) for s in LOW_SPEEDS], axis=-1)
+        motion,
+        np.stack([-np.sign(v) * np.exp(-np.abs(v) / (s * scale)) for s in SETTINGS.low_speeds], axis=-1),
     )
 
 
 def _backlash(motion: Motion, scale: FloatArray) -> FloatArray:
-    direction = held_direction(motion.velocity, STILL * scale)
-    samples = max(round(PLAY_S / motion.period_s), 1)
+    direction = held_direction(motion.velocity, SETTINGS.still * scale)
+    samples = max(round(SETTINGS.play_s / motion.period_s), 1)
     recent = direction.copy()
     recent[:, samples:] -= direction[:, :-samples]
     recent[:, :samples] -= direction[:, :1]
@@ -317,7 +360,7 @@ def _varying_delay(left: _Left) -> tuple[float, int]:
     explained, used = 0.0, 0
     for motion, normal, r in zip(left.motions, left.normal, left.residual, strict=True):
         W, H, M, _ = motion.direct.shape
-        size = max(round(DELAY_PIECE_S / motion.period_s), 2)
+        size = max(round(SETTINGS.delay_piece_s / motion.period_s), 2)
         pieces = max(H // size, 1)
         label = np.minimum(np.arange(H) // size, pieces - 1)
         moved = np.einsum("whmj,whj->whm", motion.direct, motion.velocity)
@@ -346,10 +389,10 @@ def _bursts(found: Sequence[Motion]) -> tuple[float, str] | None:
     joined = np.concatenate(values)
     kurtosis = float(np.mean(joined**4)) / max(float(np.mean(joined**2)) ** 2, 1e-300)
     each, time = np.concatenate(power), np.concatenate(times)
-    most = np.argsort(-each)[: max(round(BURST_PART * len(each)), 1)]
-    most = most[each[most] > BURST_SIZE * np.median(each)]
+    most = np.argsort(-each)[: max(round(SETTINGS.burst_part * len(each)), 1)]
+    most = most[each[most] > SETTINGS.burst_size * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))
-    if kurtosis < BURST_KURTOSIS or share < BURST_SHARE:
+    if kurtosis < SETTINGS.burst_kurtosis or share < SETTINGS.burst_share:
         return None
     period_s = found[0].period_s
     seconds = sorted({round(t / (10 * period_s)) for t in time[most].tolist()})

@@ -1,17 +1,167 @@
-"""How far an estimate is from a truth that only a bench knows, and how wide intervals may at best be."""
+"""How good a calibration is: on motion that it has not seen, and against a truth that only a bench knows."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.uncertainty.intervals import Z90
 from deal_hw.parameters import ParameterSpace
-from deal_hw.types import FloatArray
+from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.tangent_coordinates import to_vector
+from deal_hw.sim.recordings.episode import Episode
+from deal_hw.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldoutErrors:
+    """Errors of open-loop predictions, by predictor.
+
+    Attributes:
+        names: The n measured coordinates.
+        window_s: Predictions restarted from the measured state this often [s].
+        nrmse: Root mean square error over the signal's range, mean over the coordinates.
+        rmse: Root mean square errors of the coordinates, (n,) [rad or m]; infinite where it diverged.
+    """
+
+    names: tuple[str, ...]
+    window_s: float
+    nrmse: Mapping[str, float]
+    rmse: Mapping[str, FloatArray]
+
+    def mean(self) -> dict[str, float]:
+        """Return the mean of :attr:`rmse` over the coordinates by predictor."""
+        return {name: float(np.mean(values)) for name, values in self.rmse.items()}
+
+    def pooled(self) -> dict[str, float]:
+        """Return the root mean square over all samples and coordinates by predictor."""
+        return {name: float(np.sqrt(np.mean(values**2))) for name, values in self.rmse.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the errors in rad or m as plain JSON values; None where a prediction diverged."""
+        return {
+            "window_s": self.window_s,
+            "mean": _plain(self.mean()),
+            "pooled": _plain(self.pooled()),
+            "by_coordinate": {
+                name: _plain(dict(zip(self.names, map(float, values), strict=True)))
+                for name, values in self.rmse.items()
+            },
+        }
+
+
+def _plain(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+
+class HeldOut:
+    """Recordings that no search has seen: what each candidate predicts of them is simulated once.
+
+    Args:
+        robot: The robot's model.
+        space: The parameters.
+        episodes: The recordings.
+        window_s: Predictions restart from the smoothed reported state this often [s].
+        threads: Simulation threads.
+        truth: Noise-free positions at the episodes' samples, (T, n) each in the order of the measured
+            coordinates, where there are any; else the reported ones are what is predicted.
+
+    Raises:
+        InsufficientDataError: No recording holds a window.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        space: ParameterSpace,
+        episodes: Sequence[Episode],
+        window_s: float = 0.2,
+        threads: int | None = None,
+        truth: Sequence[FloatArray] | None = None,
+    ) -> None:
+        self.problem = problem = Problem(robot, space, episodes, threads=threads)
+        self._window_s = window_s
+        self._columns = columns = problem.channels[problem.channels < problem.coordinates]
+        self._windows = problem.windows(samples_in(problem, window_s))
+        self._references = [
+            problem.episodes[data.episode].position[:, columns] if truth is None else truth[data.episode]
+            for data in self._windows
+        ]
+        self._spans = [
+            signal_range(problem.episodes[data.episode], reference, columns, robot.rotation)
+            for data, reference in zip(self._windows, self._references, strict=True)
+        ]
+        self._known: dict[tuple[bytes, float] | None, tuple[FloatArray, FloatArray]] = {}
+        self._simulate({None: None})
+
+    def errors(self, candidates: Mapping[str, tuple[FloatArray, float]]) -> HeldoutErrors:
+        """Return the errors of candidates and of "null".
+
+        Args:
+            candidates: Name to physical parameters, (K,), and latency [s].
+        """
+        keys: dict[str, tuple[bytes, float] | None] = {
+            name: (np.asarray(theta, dtype=np.float64).tobytes(), latency_s)
+            for name, (theta, latency_s) in candidates.items()
+        }
+        fresh = {key: candidates[name] for name, key in keys.items() if key not in self._known}
+        if fresh:
+            self._simulate(fresh)
+        found = {name: self._known[key] for name, key in {**keys, "null": None}.items()}
+        span = np.maximum(np.max(self._spans, axis=0), 1e-300)
+        return HeldoutErrors(
+            names=tuple(self.problem.robot.coordinates[c] for c in self._columns),
+            window_s=self._window_s,
+            nrmse={name: float(np.mean(rms / span)) for name, (rms, _) in found.items()},
+            rmse={name: rmse for name, (_, rmse) in found.items()},
+        )
+
+    def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:
+        """Keep root mean squares, (n,), of all samples, and of those that were reported."""
+        given = [fit for fit in fits.values() if fit is not None]
+        squares, counts = np.zeros((2, len(fits), len(self._columns))), np.zeros(2)
+        for data, reference, span in zip(self._windows, self._references, self._spans, strict=True):
+            episode, sample = self.problem.episodes[data.episode], data.windows.samples()
+            if given:
+                theta, latency = np.stack([fit[0] for fit in given]), np.array([fit[1] for fit in given])
+                predicted = self.problem.predict(theta, latency, data).position[..., self._columns]
+            else:
+                still = data.start_position[:, None, self._columns]
+                predicted = np.broadcast_to(still, reference[sample].shape)[None]
+            # A diverged member is as wrong as the whole range.
+            error = np.where(np.isfinite(predicted), predicted - reference[sample], span)
+            squares[0] += np.sum(error**2, axis=(1, 2))
+            counts[0] += sample.size
+            seen = np.ones(sample.shape, bool) if episode.reported is None else episode.reported[sample]
+            error = (predicted - episode.position[:, self._columns][sample])[:, seen]
+            squares[1] += np.sum(np.where(np.isfinite(error), error, np.inf) ** 2, axis=1)
+            counts[1] += np.count_nonzero(seen)
+        rms = np.sqrt(squares / np.maximum(counts, 1)[:, None, None])
+        self._known.update(zip(fits, zip(rms[0], rms[1], strict=True), strict=True))
+
+
+def signal_range(episode: Episode, values: FloatArray, columns: IntArray, rotation: slice) -> FloatArray:
+    """Return the range that each measured coordinate covers in a recording, (n,).
+
+    Args:
+        episode: The recording.
+        values: The coordinates' values, (T, n).
+        columns: Which coordinates they are, (n,).
+        rotation: Which coordinates are a base's rotation vector: their charts move with the base, so their
+            range is that of the whole turn from the first orientation.
+    """
+    span = np.ptp(values, axis=0)
+    if episode.reference is not None:
+        turned = np.ptp(to_vector(episode.reference, episode.reference[0]), axis=0)
+        for i, c in enumerate(columns):
+            if rotation.start <= c < rotation.stop:
+                span[i] = turned[c - rotation.start]
+    return np.asarray(span)
 
 
 def error_percent(theta: FloatArray, truth: FloatArray) -> float:

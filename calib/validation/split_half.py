@@ -7,31 +7,40 @@ every phase of the motion. It costs some iterations over each half, less than on
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import norm
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, polish_windows
-from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.uncertainty.at_fit import statement, widened_to, with_rows
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty
-from deal_hw.sim.recordings.windows import Windows
+from deal_hw.calib.fit.residual import Point, Shooting, taken
+from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, statement, widened_to, with_rows
+from deal_hw.calibration import Alarm, listed
 from deal_hw.types import FloatArray
 
-ITERATIONS = 6
-MOST_STEPS = 3e8
-"""More physics steps than this are not spent on the comparison."""
 
-FEWEST_WINDOWS = 4
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitHalfSettings:
+    """Settings of :func:`compare_halves`.
 
-FALSE_ALARMS = 0.05
-"""How often any parameter of a right model may be flagged: with many parameters some intervals of halves
-always miss each other."""
+    Attributes:
+        iterations: Most iterations of each half's fit.
+        most_steps: More physics steps than this are not spent on the comparison.
+        fewest_windows: Fewer windows are not halved.
+        false_alarms: How often any parameter of a right model may be flagged [-]: with many parameters some
+            intervals of halves always miss each other.
+    """
+
+    iterations: int = 6
+    most_steps: float = 3e8
+    fewest_windows: int = 4
+    false_alarms: float = 0.05
+
+
+SETTINGS = SplitHalfSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,28 +95,20 @@ class Halves:
         }
 
     @property
-    def alarm(self) -> str:
-        """In words; empty where nothing is flagged."""
+    def alarms(self) -> tuple[Alarm, ...]:
+        """One that names all that is flagged; none where nothing is."""
         if not self.flagged:
-            return ""
+            return ()
+        both = {r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g})" for r in self.rows}
         return (
-            f"two halves of the data disagree about {', '.join(self.flagged)}: the value depends on what is "
-            "fitted, so the model lacks something; their intervals were widened to hold both"
+            Alarm(
+                "Two halves of the data disagree about "
+                f"{listed([name + both.get(name, '') for name in self.flagged])}.",
+                "A value that depends on what is fitted means that the model lacks something. The intervals "
+                "were widened to hold both.",
+                "Find what the model lacks (see the other alarms), or fit only motion like that of the task.",
+            ),
         )
-
-
-def halves_rows(provenance: Mapping[str, Any]) -> tuple[HalvesRow, ...]:
-    """Return the rows that a result's provenance holds; none where the comparison was not made."""
-    found = provenance.get("halves", {}).get("parameters", {})
-    return tuple(
-        HalvesRow(name=name, first=_three(row["first"]), second=_three(row["second"]))
-        for name, row in found.items()
-    )
-
-
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
-    estimate, low, high = map(float, values)
-    return estimate, low, high
 
 
 def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> Halves:
@@ -121,20 +122,21 @@ def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> 
     shooting, K = polished.shooting, len(problem.space)
     nothing = np.zeros(K)
     windows = sum(len(d.windows) for d in shooting.data)
-    if windows < FEWEST_WINDOWS:
+    if windows < SETTINGS.fewest_windows:
         return Halves((), (), nothing, note=f"{windows} windows are too few to halve: record longer")
     cost = _steps(problem, shooting)
-    if cost > MOST_STEPS:
+    if cost > SETTINGS.most_steps:
         return Halves((), (), nothing, note=f"left out: it would take {cost:.1g} physics steps")
     before = problem.steps
     block = 1
     if known.clustered is not None:
-        # Blocks as long as residuals hang together, but at least two blocks in each half.
-        block = max(1, min(round(known.clustered.block_samples / shooting.length), windows // FEWEST_WINDOWS))
+        # Blocks as long as residuals are correlated, but at least two blocks in each half.
+        longest = windows // SETTINGS.fewest_windows
+        block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
     estimates, stds, intervals = [], [], []
     for half in range(2):
         found = polish_windows(
-            *half_of(shooting, polished.point, half, block), ITERATIONS, fixed_latency=True
+            *half_of(shooting, polished.point, half, block), SETTINGS.iterations, fixed_latency=True
         )
         told = statement(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: what all of them say of clustering holds for it, too.
@@ -169,11 +171,11 @@ def agreement(
     space = problem.space
 
     def three(half: int, k: int) -> tuple[float, float, float]:
-        return _three([estimates[half][k], *intervals[half][k]])
+        return float(estimates[half][k]), float(intervals[half][k, 0]), float(intervals[half][k, 1])
 
     rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
     told = ~known.shape.blind
-    least = norm.ppf(1 - FALSE_ALARMS / (2 * max(int(told.sum()), 1)))
+    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(told.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
     far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
     flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
@@ -186,7 +188,7 @@ def heed(problem: Problem, known: Uncertainty, theta: FloatArray, halves: Halves
         return known
     flagged = np.array([name in halves.flagged for name in problem.space.names])
     wider = widened_to(problem, known, theta, np.where(flagged, halves.reach / Z90, 0.0))
-    return dataclasses.replace(wider, alarms=(*wider.alarms, halves.alarm))
+    return dataclasses.replace(wider, alarms=(*wider.alarms, *halves.alarms))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
@@ -204,24 +206,10 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
         first += len(of_episode.windows)
         mine = number % 2 == half
         if mine.any():
-            data.append(take(of_episode, mine))
+            data.append(taken(of_episode, mine))
             position.append(point.position[e][mine])
             velocity.append(point.velocity[e][mine])
     return shooting.on(data), Point(point.value, tuple(position), tuple(velocity))
-
-
-def take(data: WindowData, chosen: npt.NDArray[np.bool_]) -> WindowData:
-    """Return some of the windows, chosen by a mask (W,)."""
-    return dataclasses.replace(
-        data,
-        windows=Windows(data.windows.start[chosen], data.windows.length, data.windows.stride),
-        measured=data.measured[chosen],
-        std=data.std[chosen],
-        start_position=data.start_position[chosen],
-        start_velocity=data.start_velocity[chosen],
-        prior_mean=data.prior_mean[chosen],
-        prior_std=data.prior_std[chosen],
-    )
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:
@@ -230,4 +218,4 @@ def _steps(problem: Problem, shooting: Shooting) -> float:
     samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
     # One normal matrix and one line of damped steps an iteration.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
-    return float(ITERATIONS * members * samples * substeps)
+    return float(SETTINGS.iterations * members * samples * substeps)

@@ -1,19 +1,170 @@
-"""Can a calibration be used? One colour and one sentence; held-out motion is asked first."""
+"""Checks after a fit, and whether the result can be used: one colour; held-out motion is asked first."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2
-from deal_hw.calibration import CalibrationResult
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Polished
+from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, ended_at_bound
+from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
+from deal_hw.calib.validation.diagnosis import diagnose, motions
+from deal_hw.calib.validation.split_half import compare_halves, heed
+from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.types import FloatArray
 
 Colour = Literal["green", "amber", "red"]
 
-WORSE = 1.02
-"""A held-out error above the nominal model's by more than this factor is worse: less is chance where the
-nominal model was right."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VerdictSettings:
+    """Settings of the checks and of :func:`trust`.
+
+    Attributes:
+        worse: A held-out error above the nominal model's by more than this factor is worse [-]: less is
+            chance where the nominal model was right.
+        at_end: A latency ended at the end of its range where it is within this share of it [-].
+        causes: So many causes of a residual are alarms; all are in the provenance.
+    """
+
+    worse: float = 1.02
+    at_end: float = 0.01
+    causes: int = 2
+
+
+SETTINGS = VerdictSettings()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Validation:
+    """Which checks follow a polish."""
+
+    local_first: bool = True
+    """Refine the model's own values first; where that explains the recordings there is no search."""
+
+    folds: bool = True
+    """Where the residual is unexplained, keep the polish only if it predicts better on inner folds."""
+
+    robust: bool = False
+    """Try Huber's loss on those folds, too, where the residual has heavy tails."""
+
+    halves: bool = True
+    """Polish two halves of the data alone and compare."""
+
+    physics_step: bool = True
+    """Predict with half the physics step; intervals count what the step moves."""
+
+    diagnosis: bool = True
+    """Say what an unexplained residual looks like."""
+
+
+def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
+    """Return an alarm where a latency that was searched ended at the end of its range.
+
+    The lower end counts where it is above zero.
+
+    Args:
+        problem: The problem.
+        latency_s: The estimate [s].
+    """
+    if problem.fixed_latency_s is not None:
+        return ()
+    low, high = problem.latency_range_s
+    near = max(SETTINGS.at_end * (high - low), 0.5 * problem.episodes[0].step_s)
+    if latency_s > high - near:
+        side, wider = "later", (low, min(2 * high, LONGEST_LATENCY_S))
+    elif low > 0 and latency_s < low + near:
+        side, wider = "sooner", (0.0, high)
+    else:
+        return ()
+    return (
+        Alarm(
+            f"The latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "
+            f"{1e3 * high:g} ms).",
+            f"The robot may act {side} than that; then other parameters make up for it.",
+            f"Calibrate again with --latency-range {wider[0]:g} {wider[1]:g}.",
+        ),
+    )
+
+
+def unexplained(polished: Polished) -> bool:
+    """Return whether the residual is larger, or autocorrelated longer, than noise is."""
+    if polished.chi2 <= MISMATCH.negligible_chi2:
+        return False
+    if polished.chi2 > MISMATCH.chi2:
+        return True
+    return correlation_time(polished.normal.residual) > MISMATCH.correlation_samples
+
+
+def judge(
+    problem: Problem, polished: Polished, known: Uncertainty, settings: Validation
+) -> tuple[Uncertainty, dict[str, Any]]:
+    """Check and return what is then known, and facts for the provenance.
+
+    Args:
+        problem: The problem.
+        polished: Where the polish ended, with linearised residuals.
+        known: What is known there.
+        settings: Which checks.
+    """
+    facts: dict[str, Any] = {"inflation": known.inflation}
+    ended = np.flatnonzero(ended_at_bound(problem.space, polished.theta))
+    facts["at_bound"] = [problem.space.names[k] for k in ended]
+    if known.clustered is not None:
+        cluster = known.clustered
+        facts["clustered"] = {
+            "blocks": cluster.blocks,
+            "block_s": cluster.block_samples * problem.episodes[0].period_s,
+            "variance_ratio": dict(zip(problem.space.names, map(float, cluster.ratio), strict=False)),
+            "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
+        }
+    if settings.physics_step:
+        known, facts["physics_step"] = with_step(problem, polished, known, polished.theta)
+    if settings.halves:
+        halves = compare_halves(problem, polished, known)
+        known = heed(problem, known, polished.theta, halves)
+        facts["halves"] = halves.to_json()
+    if settings.diagnosis and unexplained(polished):
+        known, facts["diagnosis"] = with_causes(problem, polished, known)
+    return known, facts
+
+
+def with_step(
+    problem: Problem, polished: Polished, known: Uncertainty, theta: FloatArray
+) -> tuple[Uncertainty, dict[str, Any]]:
+    """Return what is known, the physics step counted, and what the check found, as plain JSON values.
+
+    Args:
+        problem: The problem.
+        polished: Where a fit of windows ended, with linearised residuals.
+        known: What was known before.
+        theta: The estimate that is about, (K,).
+    """
+    step = check_step(problem, polished)
+    alarms = step_alarm(problem, known, step)
+    known = counted(problem, known, theta, step)
+    return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), step.to_json()
+
+
+def with_causes(
+    problem: Problem, polished: Polished, known: Uncertainty
+) -> tuple[Uncertainty, list[dict[str, Any]]]:
+    """Return what is known, alarmed by what the residual looks like, and all causes as plain JSON values."""
+    free = np.append(known.shape.bound == 0, known.latency_interval_s[0] != known.latency_interval_s[1])
+    found = diagnose(
+        motions(problem, polished),
+        polished.normal.hessian * np.outer(free, free),
+        problem.robot.description.joint_names,
+        correlation_time(polished.normal.residual),
+    )
+    alarms = (f.alarm for f in found[: SETTINGS.causes])
+    return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,56 +173,76 @@ class Trust:
 
     Attributes:
         colour: Green: use it. Amber: it has a known weakness. Red: do not use it.
-        sentence: What was seen, what it means, what to do.
+        seen: What was seen.
+        means: What it means.
+        do: What to do.
     """
 
     colour: Colour
-    sentence: str
+    seen: str
+    means: str
+    do: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it in one line."""
+        return f"{self.seen} {self.means} {self.do}"
 
 
 def trust(result: CalibrationResult) -> Trust:
     """Return whether a result can be used."""
-    errors = result.heldout_nrmse
-    nominal, calibrated = errors.get("nominal"), errors.get("calibrated")
-    judged = nominal is not None and calibrated is not None
-    gain = ""
-    if nominal is not None and calibrated is not None:
-        if not calibrated <= WORSE * nominal:
-            return Trust(
-                "red",
-                f"On held-out motion the calibrated model errs by {100 * calibrated:.2g} % of the signal's "
-                f"range, your own model by {100 * nominal:.2g} %: it is worse. Do not use it; check units, "
-                "signs and joint order of the recordings, then the alarms.",
-            )
-        gain = f"On held-out motion the error is {nominal / max(calibrated, 1e-300):.1f} times smaller than "
-        gain += "your own model's."
-    mismatch = result.chi2 > MISMATCH_CHI2
-    if mismatch and not judged:
+    nominal, calibrated = (result.heldout_nrmse.get(name) for name in ("nominal", "calibrated"))
+    noise = (
+        f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise." if result.chi2 >= 0 else ""
+    )
+    mismatch = result.chi2 > MISMATCH.chi2
+    if nominal is None or calibrated is None:
+        record = "Record one more motion and name it with --holdout."
+        if mismatch:
+            means = "The model does not explain them, and no held-out recording says whether it is better."
+            return Trust("red", noise, means, f"Do not use it. {record}")
+        gain = "There is no held-out recording."
+    elif not calibrated <= SETTINGS.worse * nominal:
         return Trust(
             "red",
-            f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise and no held-out recording "
-            "says whether the model is better all the same. Record one (--holdout) and calibrate again.",
+            f"On held-out motion the calibrated model errs by {100 * calibrated:.2g} % of the signal's "
+            "range, your "
+            f"own model by {100 * nominal:.2g} %.",
+            "The calibrated model is worse.",
+            "Do not use it. Check units, signs and joint order of the recordings, then the alarms.",
         )
+    else:
+        record = ""
+        smaller = nominal / max(calibrated, 1e-300)
+        gain = f"On held-out motion the error is {smaller:.1f} times smaller than your own model's."
     if mismatch:
         return Trust(
             "amber",
-            f"{gain} Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise: the model lacks "
-            "something that the robot has. Use it, but trust predictions more than single parameters.",
+            f"{gain} {noise}",
+            "The model is better than yours, and lacks something that the robot has.",
+            "Use it, but trust predictions more than single values.",
         )
     if result.alarms:
-        return Trust("amber", f"{gain} There are alarms: read them before you use it.".strip())
+        count = f"There {'is 1 alarm' if len(result.alarms) == 1 else f'are {len(result.alarms)} alarms'}."
+        return Trust(
+            "amber", f"{gain} {count}", "The result has a known weakness.", "Read them before you use it."
+        )
     if math.isnan(result.chi2):
-        return Trust("amber", f"{gain} No test was made of whether the model explains the recording.".strip())
-    if result.null_directions or "not identifiable" in result.verdicts:
+        return Trust(
+            "amber", gain, "No test was made of whether the model explains the recordings.",
+            f"Compare the held-out error with what your task can bear. {record}".strip(),
+        )  # fmt: skip
+    untold = result.verdicts.count("not identifiable")
+    if result.null_directions or untold:
         return Trust(
             "amber",
-            f"{gain} The model explains the recordings, but they do not tell all parameters: those without a "
-            "value keep their whole range in training.".strip(),
+            f"{gain} {noise}"
+            + (f" {untold} of {len(result.space)} parameters have no value." if untold else ""),
+            "The model explains the recordings, but they do not tell all parameters.",
+            "Use it: training keeps the whole range of those. Or record what is advised below.",
         )
-    if not judged:
+    if record:
         return Trust(
-            "amber",
-            "The model explains the recordings, but no held-out recording says whether it holds on other "
-            "motion. Record one (--holdout).",
+            "amber", f"{gain} {noise}", "Nothing says whether the model holds on other motion.", record
         )
-    return Trust("green", f"{gain} What is left has the size of the sensor's noise.")
+    return Trust("green", f"{gain} {noise}", "What is left is the sensor's noise.", "Use it.")

@@ -282,7 +282,7 @@ def _compared(
     from deal_hw.calib.baselines.sysid import with_delay
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.methods import make_method
-    from deal_hw.calib.validation.heldout import heldout_rmse
+    from deal_hw.calib.validation.metrics import HeldOut
     from deal_hw.calib.validation.verdict import trust
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 
@@ -313,7 +313,7 @@ def _compared(
 
     fits = {str(i): (fit.theta, fit.latency_s) for i, fit in enumerate(shown)}
     fits |= {"sysid": (sysid.estimate, sysid.latency_s), "nominal": (work.space.nominal, 0.0)}
-    judged = heldout_rmse(work.robot, work.space, work.holdout, fits, settings.window_s, threads)
+    judged = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads).errors(fits)
     errors = judged.mean()
     ours = [errors[str(i)] for i in range(len(shown))]
     first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= settings.near * ours[-1])

@@ -46,8 +46,7 @@ def calibration_row(
     Returns:
         The row's part that concerns calibration, and the result.
     """
-    from deal_hw.calib.validation.metrics import error_percent, log_error_x100
-    from deal_hw.calib.validation.normalised_error import heldout_nrmse
+    from deal_hw.calib.validation.metrics import HeldOut, error_percent, log_error_x100
 
     d = case
     result = calibrate_episodes(
@@ -55,12 +54,10 @@ def calibration_row(
         threads=threads,
     )  # fmt: skip
     coverage, width = _intervals(d, result, threads)
-    errors = heldout_nrmse(
-        d.robot, d.space, [d.heldout],
-        {"nominal": (d.space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)},
-        truth=[d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]],
-        threads=threads,
-    )  # fmt: skip
+    truth = d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]
+    held_out = HeldOut(d.robot, d.space, [d.heldout], threads=threads, truth=[truth])
+    candidates = {"nominal": (d.space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}
+    errors = held_out.errors(candidates).nrmse
     verdicts = zip(d.space.names, result.verdicts, strict=False)
     untold = [name for name, verdict in verdicts if verdict == "not identifiable"]
     row = {
@@ -79,7 +76,7 @@ def calibration_row(
         "seconds": result.seconds,
         "flagged": bool(result.alarms) or bool(untold),
         "chi2": result.chi2,
-        "alarms": list(result.alarms),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "untold": untold,
         "null_directions": list(result.null_directions),
         "per_parameter": {

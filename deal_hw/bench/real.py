@@ -186,7 +186,7 @@ def run_cell(
         "steps": result.steps,
         "seconds": result.seconds,
         "flagged": bool(result.alarms),
-        "alarms": list(result.alarms),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "chi2": result.chi2,
         "at_bound": [
             name for name, u in zip(work.space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6

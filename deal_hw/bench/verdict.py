@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import Cells, Row
-from deal_hw.calib.validation.checks import MOST_CAUSES
-from deal_hw.calib.validation.verdict import trust
+from deal_hw.calib.validation.verdict import SETTINGS, trust
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
 from deal_hw.cli.calibrate_model import Recordings
@@ -77,12 +76,12 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         except DealHwError as err:
             # Refused before any work: as good as red, if it says why.
             return row | {"colour": "refused", "named": names(fault, [], [str(err)]), "refusal": str(err)}
-    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_CAUSES]]
+    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[: SETTINGS.causes]]
     return row | {
         "causes": causes,
         "colour": trust(result).colour,
-        "named": names(fault, causes, [*result.alarms, *work.telemetry]),
-        "alarms": list(result.alarms),
+        "named": names(fault, causes, [*map(str, result.alarms), *work.telemetry]),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "search": result.provenance.get("search", ""),
         "chi2": result.chi2,
         "seconds": result.seconds,

@@ -130,13 +130,17 @@ def warn_of_gravity(
         low, high = (own / 2, own * 2) if parameter is None else (parameter.low, parameter.high)
         if gain < 0:
             say(
-                f"warning: {joint} hangs against gravity (off its command by {found.deviation[a]:.2g}, "
-                f"torque in the model {found.load[a]:.2g}): is its sign in the column map right, its zero?"
+                f"warning: {joint} hangs against gravity: it is {found.deviation[a]:.2g} rad or m off its "
+                "command, where "
+                f"the model's gravity torque is {found.load[a]:.2g} N·m. Its sign or its zero is wrong: is "
+                "its sign "
+                "in the column map right?"
             )
         elif not low <= gain <= high:
             say(
-                f"warning: {joint} hangs as with a gain of about {gain:.3g}; the model has {own:.4g}, and "
-                f"{low:.3g} to {high:.3g} is searched: give `nominal: {gain:.2g}` in the parameters"
+                f"warning: {joint} hangs as with a gain of about {gain:.3g}; the model has {own:.4g}. "
+                f"The search ({low:.3g} to {high:.3g}) does not reach that: give `nominal: {gain:.2g}` in "
+                "the parameters"
             )
 
 
@@ -170,14 +174,18 @@ def require_visible_parameters(
     require_visible(found)
     if found.faint:
         say(
-            f"hardly visible, and so hardly to be found: {', '.join(found.faint)} (from one end of the range "
-            "to the other no prediction changes by more than the noise)"
+            f"warning: hardly visible: {', '.join(found.faint)}. From one end of its range to the other "
+            "each changes "
+            "no prediction by more than the sensor's noise, so its value can hardly be found: record "
+            "motion that "
+            "shows it, or give it with --known"
         )
     rough = jumps(problem)
     if rough:
         worst = max(rough, key=lambda name: rough[name])
         say(
-            f"warning: predictions jump (by {rough[worst]:.1g}) when {worst} changes by a millionth, and "
-            "no fit can follow that: the model's solver stops too early. Write <option "
+            f"warning: predictions jump (by {rough[worst]:.1g} rad or m) when {worst} changes by a "
+            "millionth. The "
+            "model's solver stops too early, and no fit can follow that. Write <option "
             'tolerance="1e-15" iterations="200" ls_tolerance="1e-6" ls_iterations="200"/> into the MJCF'
         )

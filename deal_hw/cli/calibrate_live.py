@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import (
+    Alarm,
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+)
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
@@ -71,8 +78,8 @@ class BestSoFar:
 
     Args:
         space: What is searched.
-        judge: Returns the held-out errors of a fit, (K,) and latency [s], and of the model's own values; None
-            where nothing is held out.
+        judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
+            and "null"; None where nothing is held out.
         quiet: Say nothing.
     """
 
@@ -93,7 +100,7 @@ class BestSoFar:
             return
         latency_s = progress.latency_s or 0.0
         errors = self._judge(progress.estimate, latency_s) if self._judge is not None else {}
-        error = errors.get("so far", progress.values.get("chi2", math.inf))
+        error = errors.get("calibrated", progress.values.get("chi2", math.inf))
         if self.result is not None and not error < self._error:
             return
         self._error = error
@@ -106,10 +113,15 @@ class BestSoFar:
             latency_s=latency_s,
             latency_interval_s=(latency_s, latency_s),
             chi2=progress.values.get("chi2", math.nan),
-            heldout_nrmse={
-                "nominal": errors["nominal"], "calibrated": errors["so far"], "null": errors["null"]
-            } if errors else {},
-            alarms=("interrupted: no interval was computed; ranges are those that were searched",),
+            heldout_nrmse=errors,
+            alarms=(
+                Alarm(
+                    f"The calibration was interrupted after {progress.stage}, "
+                    f"{time.monotonic() - self._began:.0f} s.",
+                    "No interval was computed; those given are the search ranges.",
+                    "Calibrate again; --resume goes on where it stopped.",
+                ),
+            ),
         )  # fmt: skip
         if not self._quiet:
             print(
@@ -143,7 +155,7 @@ def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[N
         yield
     except KeyboardInterrupt:
         if best.result is not None:
-            from deal_hw.calib.report.folder import write_result
+            from deal_hw.calib.report.page import write_result
             from deal_hw.data.files import interrupts_deferred
 
             with interrupts_deferred():

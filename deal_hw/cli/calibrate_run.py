@@ -30,14 +30,14 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.calib.report.inputs import ReportInputs
+    from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.control.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import Episode
 
 TABLE_WIDTH = 100
 HELDOUT_WINDOW_S = 0.2
-"""The same as in :mod:`deal_hw.calib.validation.normalised_error`, which is loaded on need."""
+"""The same as in :mod:`deal_hw.calib.validation.metrics`, which is loaded on need."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,9 +165,8 @@ def calibrate_episodes(
         from deal_hw.calib.data.checks import check_delays
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.methods import make_method
-        from deal_hw.calib.validation.checks import latency_alarms
-        from deal_hw.calib.validation.heldout import heldout_rmse
-        from deal_hw.calib.validation.normalised_error import heldout_nrmse
+        from deal_hw.calib.validation.metrics import HeldOut
+        from deal_hw.calib.validation.verdict import latency_alarms
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
@@ -183,11 +182,13 @@ def calibrate_episodes(
     )
     check_delays(problem)
 
-    def judge(theta: FloatArray, latency: float) -> Mapping[str, float]:
-        fits = {"nominal": (space.nominal, 0.0), "so far": (theta, latency)}
-        return heldout_nrmse(robot, space, holdout, fits, window_s=heldout_window_s, threads=threads)
+    held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
 
-    best = BestSoFar(space, judge if holdout else None, quiet)
+    def beside_nominal(theta: FloatArray, latency: float) -> dict[str, tuple[FloatArray, float]]:
+        return {"nominal": (space.nominal, 0.0), "calibrated": (theta, latency)}
+
+    judge = None if held_out is None else lambda *fit: held_out.errors(beside_nominal(*fit)).nrmse
+    best = BestSoFar(space, judge, quiet)
     searcher = make_method(method, polish=budget.polish)
     # The matrices are small: a second BLAS thread only spins, and where processors are shared each
     # decomposition then takes ten times as long.
@@ -212,14 +213,11 @@ def calibrate_episodes(
             result = searcher.run(problem, budget, rng, progress, store)
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
     result = dataclasses.replace(result, alarms=alarms)
-    if not holdout:
+    if held_out is None:
         return result
-    candidates = {"nominal": (space.nominal, 0.0), "calibrated": (result.estimate, result.latency_s)}
-    errors = heldout_nrmse(robot, space, holdout, candidates, window_s=heldout_window_s, threads=threads)
-    rmse = heldout_rmse(robot, space, holdout, candidates, window_s=heldout_window_s, threads=threads)
-    return dataclasses.replace(
-        result, heldout_nrmse=errors, provenance={**result.provenance, "heldout_rmse": rmse.to_json()}
-    )
+    errors = held_out.errors(beside_nominal(result.estimate, result.latency_s))
+    provenance = {**result.provenance, "heldout_rmse": errors.to_json()}
+    return dataclasses.replace(result, heldout_nrmse=errors.nrmse, provenance=provenance)
 
 
 def _require_windows(holdout: Sequence[Episode], window_s: float) -> None:
@@ -314,7 +312,7 @@ def finish(
     Raises:
         KeyboardInterrupt: Ctrl-C. It is said whether there are results; where there are, they are whole.
     """
-    from deal_hw.calib.report.folder import write_result
+    from deal_hw.calib.report.page import write_result
     from deal_hw.data.files import interrupts_deferred
 
     with saying_how_to_resume(checkpoint):
@@ -414,6 +412,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         name: Name under which `deal-hw collect` records this robot; "" where it does not.
     """
     from rich.console import Console
+    from rich.markup import escape
+    from rich.padding import Padding
     from rich.table import Table
 
     from deal_hw.calib.design.advice import next_step
@@ -449,8 +449,9 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for number, line in enumerate(next_step(result.advice, name)):
         # A command is to be copied: not wrapped.
         console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
-    for words in result.alarms:
-        console.print(f"[bold]alarm:[/bold] {words}")
+    for alarm in result.alarms:
+        console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
+        console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
     if not result.heldout_nrmse:
         console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
         return

@@ -221,7 +221,7 @@ def _summary(
         "cart_speed_m_s": {name: float(score[:, 1].mean()) for name, score in scores.items()},
         "cart_speed_std_m_s": {name: float(score[:, 1].std()) for name, score in scores.items()},
         "cadence": _cadence(cadence),
-        "alarms": list(result.alarms),
+        "alarms": [str(alarm) for alarm in result.alarms],
         "seconds": seconds,
         "paths": paths,
     }
@@ -254,8 +254,8 @@ def _print(summary: dict[str, Any], result: CalibrationResult, folder: Path) -> 
         "latency", "ms", "0", "", f"{1e3 * latency['found']:.1f}", "", f"{1e3 * latency['true']:.1f}"
     )
     console.print(table)
-    for words in result.alarms:
-        console.print(f"alarm: {words}")
+    for alarm in result.alarms:
+        console.print(f"alarm: {alarm}")
 
     table = Table(title="policies on the robot, mean ± std over deployments (the paper's Table 2)")
     for name in ("policy", "pole-angle error [rad]", "cart speed [m/s]"):

@@ -111,6 +111,6 @@ def _parameters(result: CalibrationResult) -> str:
 
 
 def _verdict(result: CalibrationResult) -> str:
-    lines = [f"- alarm: {alarm}" for alarm in result.alarms]
+    lines = [f"- alarm: {alarm.seen} {alarm.means} **{alarm.do}**" for alarm in result.alarms]
     lines += [f"- the data cannot see: {direction}" for direction in result.null_directions]
     return "\n".join(lines)

@@ -12,8 +12,8 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import settle
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2, MISMATCH_TIME, correlation_time
-from deal_hw.calib.validation.checks import unexplained
+from deal_hw.calib.uncertainty.intervals import MISMATCH, correlation_time
+from deal_hw.calib.validation.verdict import unexplained
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, parameter_space
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import ParameterSpace
@@ -46,7 +46,7 @@ def test_smoothed_start_states_settle_to_the_noise(
     assert cost == pytest.approx(windows[1].sum())
     normal = shooting.normal(after)
     assert cost / normal.count < 1.25 < 3.0 < windows[0].sum() / normal.count
-    assert correlation_time(normal.residual) < MISMATCH_TIME
+    assert correlation_time(normal.residual) < MISMATCH.correlation_samples
 
 
 def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three_unknown: Known) -> None:
@@ -56,7 +56,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three
     found = polish(
         problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=5, fixed_latency=True
     )
-    assert found.chi2 < MISMATCH_CHI2
+    assert found.chi2 < MISMATCH.chi2
     assert not unexplained(found)
     np.testing.assert_allclose(found.theta, truth, rtol=0.05)
 
@@ -79,7 +79,10 @@ def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Know
     shooting = Shooting(problem, 20)
     point, cost = settle(shooting, shooting.start(truth, 0.0), 6)
     normal = shooting.normal(point)
-    assert cost / normal.count > MISMATCH_CHI2 or correlation_time(normal.residual) > MISMATCH_TIME
+    assert (
+        cost / normal.count > MISMATCH.chi2
+        or correlation_time(normal.residual) > MISMATCH.correlation_samples
+    )
 
 
 def test_backward_differences_agree_with_forward_ones(small_problem: Callable[..., Problem]) -> None:

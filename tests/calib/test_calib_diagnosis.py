@@ -83,14 +83,15 @@ def test_friction_at_low_speed() -> None:
     v, _ = _motion()
     found = _diagnosed(_moved_by(-1.0 * np.sign(v) * np.exp(-np.abs(v) / 0.1)))
     assert found[0].cause == "friction" and found[0].joints == ("knee",)
-    assert found[0].share > 0.5 and "dof_friction_creep" in found[0].words
+    assert found[0].share > 0.5 and "dof_friction_creep" in found[0].alarm.do
 
 
 def test_backlash() -> None:
     """The sensor sits on the motor's side of 0.4 mrad of play: an offset with the direction of motion."""
     v, _ = _motion()
     found = _diagnosed(2e-4 * np.sign(v))
-    assert found[0].cause == "backlash" and "play in the gear of knee" in found[0].words
+    assert found[0].cause == "backlash" and "play in the gear" in found[0].alarm.means
+    assert "the gear of knee" in found[0].alarm.do
     assert found[0].share > 0.5
 
 
@@ -115,7 +116,7 @@ def test_inertia_or_gain() -> None:
     """A force in proportion to acceleration."""
     _, a = _motion()
     found = _diagnosed(_moved_by(0.05 * a))
-    assert found[0].cause == "inertia" and "dof_armature" in found[0].words
+    assert found[0].cause == "inertia" and "dof_armature" in found[0].alarm.do
 
 
 def test_missing_load() -> None:
@@ -132,7 +133,7 @@ def test_contact_comes_in_bursts() -> None:
         wrong[window, sample : sample + 12] = 20 * STD * rng.normal(size=12)
     found = {f.cause: f for f in _diagnosed(wrong)}
     assert "contact" in found
-    assert "0.98-1.07 s" in found["contact"].words and "3.18-3.28 s" in found["contact"].words
+    assert "0.98-1.07 s, 3.18-3.28 s" in found["contact"].alarm.do
 
 
 def test_direction_is_kept_where_a_joint_is_still() -> None:

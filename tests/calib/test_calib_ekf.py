@@ -130,7 +130,7 @@ def test_a_diverged_filter_says_so(recorded: Callable[..., Recorded]) -> None:
     made = Problem(load_model(DESCRIPTION), wrong, [episode], threads=1, fixed_latency_s=0.0)
     result = Ekf(EkfSettings(passes=2)).run(made, Budget(), np.random.default_rng(0))
     assert result.chi2 > 3.0
-    assert "diverged" in result.alarms[0]
+    assert "diverged" in result.alarms[0].means
 
 
 def test_passes_start_with_the_prior_that_a_parameter_has(recorded: Callable[..., Recorded]) -> None:

@@ -12,8 +12,8 @@ from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
-from deal_hw.calib.uncertainty.intervals import MISMATCH_CHI2
-from deal_hw.calib.uncertainty.latency_scan import scan_latency
+from deal_hw.calib.uncertainty.intervals import MISMATCH
+from deal_hw.calib.uncertainty.time_steps import scan_latency
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
@@ -62,7 +62,7 @@ def test_a_window_that_nothing_explains_bends_no_parameter_and_is_not_silenced(s
     problem = Problem(seen.robot, seen.space, [wrong], threads=1, fixed_latency_s=0.0)
     found = polish(problem, seen.truth * [1.1, 0.9, 1.1], 0.0, fixed_latency=True)
     np.testing.assert_allclose(found.theta, seen.truth, rtol=1e-4)
-    assert found.chi2 > MISMATCH_CHI2
+    assert found.chi2 > MISMATCH.chi2
 
 
 def test_the_scan_takes_the_polish_itself_at_its_own_step(seen: Seen) -> None:

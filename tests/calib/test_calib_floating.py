@@ -12,7 +12,7 @@ from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.validation.normalised_error import heldout_nrmse, signal_range
+from deal_hw.calib.validation.metrics import HeldOut, signal_range
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.episode import Episode
@@ -95,10 +95,10 @@ def test_other_start_states_never_cost_more(sensed: Case, three_unknown: Known) 
 def test_heldout_error_counts_measured_coordinates_only(exact: Case, sensed: Case) -> None:
     """The truth predicts another motion exactly; sensed, it is far better than the nominal model."""
     sets = {"nominal": (exact.space.nominal, 0.0), "true": (exact.theta, 0.0)}
-    errors = heldout_nrmse(exact.robot, exact.space, [exact.heldout], sets)
+    errors = HeldOut(exact.robot, exact.space, [exact.heldout]).errors(sets).nrmse
     assert errors["true"] < 1e-6 < 1e-2 < errors["nominal"]
     sets = {"nominal": (sensed.space.nominal, 0.0), "true": (sensed.theta, sensed.latency_s)}
-    errors = heldout_nrmse(sensed.robot, sensed.space, [sensed.heldout], sets)
+    errors = HeldOut(sensed.robot, sensed.space, [sensed.heldout]).errors(sets).nrmse
     assert errors["true"] < 0.5 * errors["nominal"]
 
 

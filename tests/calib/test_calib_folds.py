@@ -11,11 +11,11 @@ from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust, polish_windows
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.fit.robust import huber_weights, kurtosis
+from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline import Calibration
-from deal_hw.calib.uncertainty.at_fit import with_rows
-from deal_hw.calib.validation.checks import Validation, unexplained
+from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
+from deal_hw.calib.validation.verdict import Validation, unexplained
 from deal_hw.calibration import (
     Budget,
     CalibrationMethod,
@@ -120,7 +120,7 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> 
     folds = result.provenance["folds"]
     assert folds["chosen"] in ("search", "polish") and set(folds["errors"]) == {"search", "polish"}
     assert "diagnosis" in result.provenance
-    assert any("does not explain" in words for words in result.alarms)
+    assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
 def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(case: Case) -> None:

@@ -43,7 +43,7 @@ def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:
     assert list(at.shape.bound) == [0, 1]
     assert at.covariance[0, 0] == pytest.approx(1.44 / 1e4, rel=1e-3)
     assert inside.covariance[0, 0] == pytest.approx(1.44 / 1e4 / 0.19, rel=1e-2)
-    assert any(words.startswith("b ended at the bound") for words in at.alarms)
+    assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in at.alarms)
 
 
 def test_the_interval_at_a_bound_lies_on_one_side() -> None:
@@ -61,8 +61,8 @@ def test_a_bound_that_the_data_do_not_press_is_none() -> None:
     """At the bound, but the cost falls inwards: the parameter stays free."""
     told = _told(_space("a", "b"), [1.0, 5.0], np.diag([1e4, 1e4]), gradient=np.array([0.0, 5.0, 0.0]))
     assert list(told.shape.bound) == [0, 0]
-    (alarm,) = [words for words in told.alarms if "bound" in words]
-    assert alarm.startswith("b ended at the bound of its range, 5 kg: the data do not press it there")
+    (alarm,) = [alarm for alarm in told.alarms if "bound" in alarm.seen]
+    assert "b (5 kg)" in alarm.seen and "the data do not press" in alarm.means
 
 
 def test_what_ended_at_a_bound_is_what_the_alarms_name() -> None:
@@ -70,9 +70,11 @@ def test_what_ended_at_a_bound_is_what_the_alarms_name() -> None:
     space, theta = _space("a", "b", "c", "d"), [5.0, 0.2, 5.0, 4.99]
     hessian, gradient = np.diag([1e4, 1e4, 1e-9, 1e4]), np.array([-50.0, -50.0, 0.0, -50.0, 0.0])
     told = _told(space, theta, hessian, gradient=gradient)
-    named = [words.split()[0] for words in told.alarms if "ended at the bound" in words]
+    pressed, other = [alarm for alarm in told.alarms if "bound" in alarm.seen]
+    assert "a (5 kg)" in pressed.seen and "do not press" not in pressed.means
+    assert "b (0.2 kg), c (5 kg)" in other.seen and "do not press" in other.means
     ended = ended_at_bound(space, np.array(theta))
-    assert named == ["a", "b", "c"] and ended.tolist() == [True, True, True, False]
+    assert ended.tolist() == [True, True, True, False]
     assert list(told.shape.bound) == [1, 0, 0, 0]
 
 

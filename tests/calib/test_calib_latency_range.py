@@ -10,10 +10,9 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import damped_step
-from deal_hw.calib.fit.local import local_fit
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, fit_horizon
-from deal_hw.calib.fit.refinement import Polished, polish
-from deal_hw.calib.validation.checks import latency_alarms
+from deal_hw.calib.fit.refinement import Polished, local_fit, polish
+from deal_hw.calib.validation.verdict import latency_alarms
 from deal_hw.errors import ConfigurationError
 
 MakeProblem = Callable[..., Problem]
@@ -67,7 +66,7 @@ def test_range_bounds_the_search(small_problem: MakeProblem) -> None:
         ended = fit(default)
         assert ended.latency_s == pytest.approx(0.04, abs=1e-3)
         (alarm,) = latency_alarms(default, ended.latency_s)
-        assert "ended at 40 ms" in alarm and "--latency-range 0 0.08" in alarm
+        assert "ended at 40 ms" in alarm.seen and "--latency-range 0 0.08" in alarm.do
 
 
 def test_alarm_at_either_end(small_problem: MakeProblem) -> None:
@@ -76,9 +75,9 @@ def test_alarm_at_either_end(small_problem: MakeProblem) -> None:
     assert problem.first_latency_s == 0.02
     assert not latency_alarms(problem, 0.4)
     (early,) = latency_alarms(problem, 0.021)
-    assert "sooner" in early and "--latency-range 0 0.8" in early
+    assert "sooner" in early.means and "--latency-range 0 0.8" in early.do
     (late,) = latency_alarms(problem, 0.798)
-    assert "later" in late and "--latency-range 0.02 1" in late
+    assert "later" in late.means and "--latency-range 0.02 1" in late.do
     assert not latency_alarms(small_problem(fixed_latency_s=None), 0.0)
     assert not latency_alarms(small_problem(fixed_latency_s=0.04), 0.04)
 

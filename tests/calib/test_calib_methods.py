@@ -220,4 +220,4 @@ def test_eki_says_when_the_residual_is_not_explained() -> None:
     problem = Problem(d.robot, d.space, [d.fit], threads=1)
     result = Eki().run(problem, Budget(population=10, generations=2), np.random.default_rng(0))
     assert result.chi2 > 3.0
-    assert "residual" in result.alarms[0]
+    assert "residual" in result.alarms[0].seen

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.design.advice import menu_designs, next_recordings, next_step, options
-from deal_hw.calib.report.inputs import ReportInputs
+from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.main import main

@@ -18,9 +18,9 @@ from deal_hw.calib.output_error_fits import OutputErrorFits, open_loop
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Checkpoint
-from deal_hw.calib.uncertainty.correlated import confounded
-from deal_hw.calib.validation.checks import Validation
+from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
+from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.cli.calibrate_model import Recordings, prepare_model
 from deal_hw.cli.calibrate_run import Narrowing

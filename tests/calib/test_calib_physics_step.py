@@ -6,13 +6,18 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.local import local_fit
-from deal_hw.calib.uncertainty.at_fit import statement, with_rows
-from deal_hw.calib.uncertainty.intervals import Uncertainty
-from deal_hw.calib.uncertainty.physics_step import StepCheck, check_step, counted, halved, step_alarm
+from deal_hw.calib.fit.refinement import local_fit
+from deal_hw.calib.uncertainty.intervals import Uncertainty, statement, with_rows
+from deal_hw.calib.uncertainty.time_steps import (
+    StepCheck,
+    StepSettings,
+    check_step,
+    counted,
+    halved,
+    step_alarm,
+)
 from deal_hw.cli.calibrate_model import Recordings, prepare_model
 from deal_hw.cli.calibrate_run import Narrowing
 from deal_hw.types import FloatArray
@@ -52,7 +57,9 @@ def recording(step_s: float) -> str:
     return "\n".join(rows) + "\n"
 
 
-def checked(folder: Path, step_s: float) -> tuple[Problem, FloatArray, Uncertainty, StepCheck]:
+def checked(
+    folder: Path, step_s: float, settings: StepSettings | None = None
+) -> tuple[Problem, FloatArray, Uncertainty, StepCheck]:
     """Return problem, estimate, what is known and what half the step says, of data with a step."""
     (folder / "hinge.xml").write_text(HINGE.format(step=STEP_S, damping="0.07", armature="0.003"))
     (folder / "params.yaml").write_text(PARAMETERS)
@@ -69,7 +76,7 @@ def checked(folder: Path, step_s: float) -> tuple[Problem, FloatArray, Uncertain
     fit = local_fit(problem, None)
     assert fit is not None
     fit = with_rows(fit)
-    return problem, fit.theta, statement(problem, fit, fixed_latency=True), check_step(problem, fit)
+    return problem, fit.theta, statement(problem, fit, fixed_latency=True), check_step(problem, fit, settings)
 
 
 def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
@@ -80,9 +87,9 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
     wider = counted(problem, known, theta, found).interval
     assert np.all(wider[:, 0] <= TRUTH) and np.all(wider[:, 1] >= TRUTH)
     assert found.preferred
-    alarm = step_alarm(problem, known, found)
-    assert "2.5 ms is too coarse" in alarm and "--physics-step 0.00125" in alarm
-    assert "hinge.armature" in alarm or "hinge.damping" in alarm
+    (alarm,) = step_alarm(problem, known, found)
+    assert "2.5 ms is too coarse" in alarm.means and "--physics-step 0.00125" in alarm.do
+    assert "hinge.armature" in alarm.seen or "hinge.damping" in alarm.seen
     # Half the error is removed by half the step: corrected, the estimate is nearer the truth.
     corrected = problem.space.from_scale(problem.space.to_scale(theta) + found.bias[:-1])
     off, was = (np.abs(np.log(value / TRUTH)).max() for value in (corrected, theta))
@@ -92,19 +99,16 @@ def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:
 def test_recordings_simulated_with_the_models_own_step_raise_no_alarm(tmp_path: Path) -> None:
     """The finer step explains them worse: nothing is said, no interval is widened."""
     problem, theta, known, found = checked(tmp_path, STEP_S)
-    assert found.rejected and step_alarm(problem, known, found) == ""
+    assert found.rejected and step_alarm(problem, known, found) == ()
     assert counted(problem, known, theta, found) is known
     assert np.all(known.interval[:, 0] <= TRUTH) and np.all(known.interval[:, 1] >= TRUTH)
 
 
-def test_a_check_that_would_take_too_long_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_that_would_take_too_long_says_so(tmp_path: Path) -> None:
     """Nothing is compared, nothing is widened, and the provenance says why."""
-    from deal_hw.calib.uncertainty import physics_step
-
-    monkeypatch.setattr(physics_step, "MOST_STEPS", 10.0)
-    problem, theta, known, found = checked(tmp_path, STEP_S)
+    problem, theta, known, found = checked(tmp_path, STEP_S, StepSettings(most_steps=10.0))
     assert "it would take" in found.to_json()["note"]
-    assert counted(problem, known, theta, found) is known and step_alarm(problem, known, found) == ""
+    assert counted(problem, known, theta, found) is known and step_alarm(problem, known, found) == ()
 
 
 def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:

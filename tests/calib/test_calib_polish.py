@@ -13,13 +13,11 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline import Calibration
-from deal_hw.calib.uncertainty.at_fit import NEAR
-from deal_hw.calib.uncertainty.intervals import correlation_time, intervals, uncertainty
-from deal_hw.calib.uncertainty.latency_scan import LatencyScan
+from deal_hw.calib.uncertainty.intervals import SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calib.validation.checks import Validation
-from deal_hw.calib.validation.metrics import error_percent, interval_score, log_error_x100
-from deal_hw.calib.validation.normalised_error import heldout_nrmse
+from deal_hw.calib.uncertainty.time_steps import LatencyScan
+from deal_hw.calib.validation.metrics import HeldOut, error_percent, interval_score, log_error_x100
+from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError
@@ -101,11 +99,9 @@ def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) ->
 
 def test_heldout_error_falls_far_below_nominal(noisy: Demonstration) -> None:
     """On another motion family the true parameters predict four times better than the nominal ones."""
-    errors = heldout_nrmse(
-        noisy.robot, noisy.space, [noisy.heldout],
-        {"nominal": (noisy.space.nominal, 0.0), "truth": (noisy.theta, noisy.truth.latency_s)},
-        truth=[noisy.heldout_truth], threads=1,
-    )  # fmt: skip
+    held_out = HeldOut(noisy.robot, noisy.space, [noisy.heldout], threads=1, truth=[noisy.heldout_truth])
+    truth = (noisy.theta, noisy.truth.latency_s)
+    errors = held_out.errors({"nominal": (noisy.space.nominal, 0.0), "truth": truth}).nrmse
     assert errors["truth"] < 0.25 * errors["nominal"]
     assert errors["truth"] < errors["null"]
 
@@ -116,7 +112,7 @@ def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal:
     search = Near(ideal.theta, 0.02)
     result = Calibration(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.runs >= 2
-    assert any("does not explain" in words for words in result.alarms)
+    assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
 def test_white_noise_is_measured_under_motion() -> None:
@@ -181,7 +177,7 @@ def test_k11_names_its_null_directions_on_real_information(noisy: Demonstration)
     theta = np.array([noisy.truth.parameters[name] for name in space.names])
     shooting = Shooting(problem, 80)
     start = shooting.start(theta, noisy.truth.latency_s, [noisy.fit_truth])
-    hessian = shooting.normal(start, stretch=NEAR, central=True).hessian
+    hessian = shooting.normal(start, stretch=SETTINGS.near, central=True).hessian
     words = _unseen(space, hessian[:-1, :-1])
     assert len(words) == 2
     assert all("mass" in text for text in words)
@@ -208,7 +204,7 @@ def test_a_parameter_at_its_bound_is_reported() -> None:
         space, np.array([1.0, 5.0]), 0.01, np.diag([1e4, 1e4, 1e8]), 1.0,
         (np.random.default_rng(0).normal(size=(4, 50, 2)),), (0.0, 0.04),
     )  # fmt: skip
-    assert any(words.startswith("b ended at the bound") for words in told.alarms)
+    assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
     assert told.verdicts == ("identifiable", "identifiable")
 
 

@@ -13,15 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.calib.report.charts import autocorrelation
-from deal_hw.calib.report.figure import envelope
-from deal_hw.calib.report.folder import write_result
-from deal_hw.calib.report.gather import gather
-from deal_hw.calib.report.inputs import Overlay, ReportInputs, Residuals
-from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report
-from deal_hw.calib.validation.split_half import HalvesRow
+from deal_hw.calib.report.charts import autocorrelation, envelope
+from deal_hw.calib.report.gather import Overlay, ReportInputs, Residuals, gather
+from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report, write_result
 from deal_hw.calib.validation.verdict import trust
-from deal_hw.calibration import CalibrationResult, read_result
+from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -120,16 +116,20 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
     found = result(
         searched,
         method=HOSTILE,
-        alarms=(HOSTILE,),
+        alarms=(Alarm(HOSTILE, HOSTILE, HOSTILE),),
         null_directions=(HOSTILE,),
         trace=({HOSTILE: 1.0}, {HOSTILE: 2.0}),
-        provenance={"dataset": HOSTILE, HOSTILE: {HOSTILE: HOSTILE}, "settings": {HOSTILE: HOSTILE}},
+        provenance={
+            "dataset": HOSTILE,
+            HOSTILE: {HOSTILE: HOSTILE},
+            "settings": {HOSTILE: HOSTILE},
+            "halves": {"parameters": {HOSTILE: {"first": [1, 0, 2], "second": [3, 2.5, 4], "agree": False}}},
+        },
     )
     given_ = dataclasses.replace(
         inputs(found, name=HOSTILE),
         telemetry=(HOSTILE,),
         left_out=(HOSTILE,),
-        halves=(HalvesRow(name=HOSTILE, first=(1, 0, 2), second=(3, 2.5, 4)),),
     )
     page = Tags(render(given_))
     assert "script" not in page.tags
@@ -139,8 +139,8 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
 
 def test_alarms_come_first() -> None:
     """The first thing under the title is whether the result can be used, and why not."""
-    text = render(inputs(result(space(), alarms=("the rail is bent",))))
-    assert text.index("read them before you use it") < text.index("the rail is bent")
+    text = render(inputs(result(space(), alarms=(Alarm("the rail is bent by 2 mm", "friction", "buy one"),))))
+    assert text.index("Read them before you use it") < text.index("the rail is bent")
     assert text.index("the rail is bent") < text.index('id="parameters"')
 
 
@@ -154,13 +154,13 @@ HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
         # 2 % worse than nominal is chance, more is not; what is not a number is worse, too.
         ({"heldout_nrmse": {**HELD, "calibrated": 0.0611}}, "green", "1.0 times smaller"),
         ({"heldout_nrmse": {**HELD, "calibrated": 0.0613}}, "red", "6.1 % of the signal's range"),
-        ({"heldout_nrmse": {**HELD, "calibrated": float("nan")}}, "red", "it is worse"),
-        ({"heldout_nrmse": {**HELD, "calibrated": 0.07}, "chi2": 4.0}, "red", "it is worse"),
+        ({"heldout_nrmse": {**HELD, "calibrated": float("nan")}}, "red", "model is worse"),
+        ({"heldout_nrmse": {**HELD, "calibrated": 0.07}, "chi2": 4.0}, "red", "model is worse"),
         ({"chi2": 4.0}, "amber", "2.0 times the sensor's noise"),
-        ({"chi2": 4.0, "heldout_nrmse": {}}, "red", "no held-out recording"),
+        ({"chi2": 4.0, "heldout_nrmse": {}}, "red", "no held-out recording says"),
         ({"chi2": float("nan")}, "amber", "No test"),
         ({"null_directions": ("a and b",)}, "amber", "do not tell all parameters"),
-        ({"alarms": ("x",)}, "amber", "alarms"),
+        ({"alarms": (Alarm("x", "y", "z"),)}, "amber", "There is 1 alarm."),
         ({"heldout_nrmse": {}}, "amber", "no held-out recording"),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
-from deal_hw.calib.validation.heldout import heldout_rmse
+from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.compiling import load_mjcf
@@ -75,13 +75,19 @@ def test_heldout_errors_are_in_metres(robot: RobotModel) -> None:
     """At rest a prediction that never moves is right; one that follows the command is off by less than it."""
     space = ParameterSpace([Parameter.around("gain", "servo_stiffness", ("drive",), "N/m", 50.0, ratio=1e9)])
     candidates = {"model": (np.array([50.0]), 0.0), "slack": (np.array([1e-7]), 0.0)}
-    found = heldout_rmse(robot, space, [steps_of(robot)], candidates, window_s=0.5, threads=1)
+    held_out = HeldOut(robot, space, [steps_of(robot)], window_s=0.5, threads=1)
+    found = held_out.errors(candidates)
     assert found.names == ("rail",) and set(found.rmse) == {"model", "slack", "null"}
     assert found.mean()["null"] == 0.0 and found.mean()["slack"] == pytest.approx(0.0, abs=1e-8)
     assert 0.01 < found.mean()["model"] < 0.1
     assert found.mean()["model"] == pytest.approx(found.pooled()["model"])
     assert found.to_json()["by_coordinate"]["model"]["rail"] == pytest.approx(found.rmse["model"][0])
     assert not math.isnan(found.window_s)
+    # What is known of a candidate is not simulated again.
+    steps = held_out.problem.steps
+    again = held_out.errors({"model": candidates["model"], "stiffer": (np.array([60.0]), 0.0)})
+    assert again.rmse["model"] == found.rmse["model"] and set(again.nrmse) == {"model", "stiffer", "null"}
+    assert held_out.problem.steps - steps == steps / 2
 
 
 KNEE = """

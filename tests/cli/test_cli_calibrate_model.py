@@ -197,7 +197,9 @@ def test_latency_at_the_end_of_its_range(
     found = json.loads((tmp_path / "calibration" / "result.json").read_text())
     assert found["latency_s"] == pytest.approx(0.004)
     assert found["provenance"]["latency_range_s"] == [0.0, 0.004]
-    assert any("the latency ended at 4 ms" in a and "--latency-range 0 0.008" in a for a in found["alarms"])
+    assert any(
+        "latency ended at 4 ms" in a["seen"] and "--latency-range 0 0.008" in a["do"] for a in found["alarms"]
+    )
     assert "alarm: the latency ended at 4 ms" in capsys.readouterr().out.replace("\n", " ")
 
 

@@ -168,7 +168,7 @@ def test_a_worse_fit_does_not_replace_the_best(capsys: pytest.CaptureFixture[str
     """Of three fits the second predicts held-out motion best; the third is neither said nor kept."""
     space = k9_space().with_free(("cart.mass", "servo.stiffness"))
     errors = iter((0.2, 0.1, 0.15))
-    best = BestSoFar(space, lambda *_: {"nominal": 0.5, "so far": next(errors), "null": 1.0})
+    best = BestSoFar(space, lambda *_: {"nominal": 0.5, "calibrated": next(errors), "null": 1.0})
     best(Progress("search", 1, 9))
     assert best.result is None
     for stage in ("local fit", "search", "refinement"):

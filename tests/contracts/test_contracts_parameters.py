@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 
@@ -118,11 +118,15 @@ def test_result_there_and_back() -> None:
     result = CalibrationResult(
         method="eki", space=SPACE, estimate=np.array([2.0, 0.5]),
         interval=np.array([[1.8, 2.2], [0.4, 0.6]]), verdicts=("identifiable", "weak"), latency_s=0.012,
-        latency_interval_s=(0.0115, 0.0125), alarms=("x",), heldout_nrmse={"nominal": 0.3},
+        latency_interval_s=(0.0115, 0.0125), alarms=(Alarm("x", "y", "z"),), heldout_nrmse={"nominal": 0.3},
     )  # fmt: skip
     again = CalibrationResult.from_json(json.loads(json.dumps(result.to_json())))
     np.testing.assert_array_equal(again.interval, result.interval)
-    assert again.verdicts == result.verdicts and again.alarms == ("x",) and again.latency_s == 0.012
+    assert (
+        again.verdicts == result.verdicts
+        and again.alarms == (Alarm("x", "y", "z"),)
+        and again.latency_s == 0.012
+    )
     covariance = again.distribution().covariance
     assert covariance is not None
     # The linear one: (0.6 - 0.4) / 2 / 1.645 = 0.0608.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.calibration import CalibrationResult
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording.reader import CycleTable
 from deal_hw.data.recording.record import CycleRecord
@@ -50,7 +50,7 @@ def result() -> CalibrationResult:
         null_directions=("all masses together",),
         latency_s=LATENCY_S,
         latency_interval_s=(0.007, 0.009),
-        alarms=("backlash suspected",),
+        alarms=(Alarm("backlash of 2 mm", "play in the gear", "mend it"),),
     )
 
 

@@ -188,7 +188,10 @@ def test_summary_lists_errors_and_parameters(rrd: Rrd, shown: Any) -> None:
     assert "| cart.mass | 0.3 | 0.18 | 0.162 to 0.198 | kg | weak |" in text
     assert all(name in text for name in shown.result.space.names)
     assert "latency 8.0 ms (7.0 to 9.0)" in text and "pole.length 0.3 m" in text
-    assert "alarm: backlash suspected" in text and "the data cannot see: all masses together" in text
+    assert (
+        "alarm: backlash of 2 mm play in the gear **mend it**" in text
+        and "the data cannot see: all masses together" in text
+    )
 
 
 def test_layout_travels_with_the_file(rrd: Rrd) -> None:

@@ -18,7 +18,7 @@ import yaml
 from mcap_ros2.writer import Writer
 
 from deal_hw.calib.search.resume import Checkpoint, pack
-from deal_hw.calibration import CalibrationResult, read_result
+from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.cli.emulate_common import read_truth
 from deal_hw.cli.train import read_distribution
 from deal_hw.data.importing.columns import read_column_map
@@ -243,7 +243,8 @@ def make_result(folder: Path) -> list[bytes]:
     interval = np.stack([space.low, space.high], axis=1)
     result = CalibrationResult(
         method="fuzz", space=space, estimate=space.nominal, interval=interval, covariance=np.eye(K) * 0.01,
-        verdicts=("weak",) * K, latency_s=0.01, chi2=1.0, heldout_nrmse={"nominal": 0.1}, alarms=("a",),
+        verdicts=("weak",) * K, latency_s=0.01, chi2=1.0, heldout_nrmse={"nominal": 0.1},
+        alarms=(Alarm("a", "b", "c"),),
         advice=({"sentence": "b"},), null_directions=("c",), provenance={"seed": 1},
     )  # fmt: skip
     return [json.dumps(result.to_json()).encode()]

@@ -1,0 +1,64 @@
+"""Each alarm says what was seen, what it means and what to do."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import deal_hw.calib
+from deal_hw.calib.validation.diagnosis import LOOKS
+from deal_hw.calibration import Alarm, listed
+
+ROOT = Path(deal_hw.calib.__file__).resolve().parents[1]
+
+
+def raised() -> Iterator[tuple[str, ast.Call]]:
+    """Yield where each alarm of the calibrators and of the command is made."""
+    for folder in ("calib", "deal_hw/cli"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "Alarm":
+                    yield f"{path.relative_to(ROOT)}:{node.lineno}", node
+
+
+def test_no_alarm_lacks_a_part() -> None:
+    """Three parts each; what was seen has a number or names, and what is written out ends a sentence."""
+    found = list(raised())
+    assert len(found) >= 10
+    for where, call in found:
+        if any(keyword.arg is None for keyword in call.keywords):
+            continue  # Read from a checkpoint.
+        assert len(call.args) == 3 and not call.keywords, where
+        seen, *rest = call.args
+        assert isinstance(seen, ast.Name) or any(isinstance(n, ast.FormattedValue) for n in ast.walk(seen)), (
+            f"{where} says what was seen without a number"
+        )
+        for part in (seen, *rest):
+            if isinstance(part, ast.JoinedStr | ast.Constant):
+                assert ast.unparse(part).rstrip("'\"").endswith("."), f"{where} does not end a sentence"
+
+
+@pytest.mark.parametrize("parts", [("", "b", "c"), ("a", " ", "c"), ("a", "b", "")])
+def test_an_empty_part_is_refused(parts: tuple[str, str, str]) -> None:
+    """So what comes from elsewhere cannot lack one either."""
+    with pytest.raises(ValueError, match="three parts"):
+        Alarm(*parts)
+
+
+def test_causes_of_a_residual_have_all_parts() -> None:
+    """Every cause that can be diagnosed says what it looks like, what it means and what to do."""
+    for cause, (looks, means, do) in LOOKS.items():
+        assert looks and means.endswith(".") and do.endswith(".") and "{}" in do, cause
+
+
+def test_an_alarm_is_one_line_where_one_line_is_wanted() -> None:
+    """And long lists of names are cut."""
+    assert (
+        str(Alarm("3 mm of play.", "The gear is worn.", "Mend it."))
+        == "3 mm of play. The gear is worn. Mend it."
+    )
+    assert listed(["a", "b"]) == "a, b"
+    assert listed([str(k) for k in range(9)]) == "0, 1, 2, 3, 4, 5 and 3 more"
