@@ -104,19 +104,19 @@ class OutputErrorSettings:
         return next((words for words in self.priors if words and name.endswith(words)), "")
 
 
+@dataclass(frozen=True)
 class OutputErrorFits(Fits):
     """Searches, fits predictions, and takes what cross-validation says predicts best.
 
-    Args:
+    Attributes:
         settings: How.
     """
 
-    def __init__(self, settings: OutputErrorSettings | None = None) -> None:
-        self._settings = settings or OutputErrorSettings()
+    settings: OutputErrorSettings = field(default_factory=OutputErrorSettings)
 
     def best(self, run: CalibrationRun) -> Outcome:
         """Search, fit all candidates, take the one that predicts best. See :meth:`Fits.best`."""
-        settings, problem = self._settings, run.problem
+        settings, problem = self.settings, run.problem
         if run.settings.folds:
             problem = _whole(problem)
         run.say("residual", "fits short windows from the model's own values")
@@ -171,16 +171,16 @@ class OutputErrorFits(Fits):
 
     def _reduced(self, problem: Problem, first: HorizonFit) -> Problem:
         """Return the search's problem: part of the recordings, and residuals as large as a first fit's."""
-        parts = [p for e in problem.episodes for p in stretches(e, self._settings.stretch_s)]
+        parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
         std = problem.known_std
         if std is None:
             std = problem.noise_std.copy()
             std[problem.channels] = np.maximum(std[problem.channels], first.scale)
-        return problem.on(spread([p for p in parts if p.usable.any()], self._settings.search_s), std)
+        return problem.on(spread([p for p in parts if p.usable.any()], self.settings.search_s), std)
 
     def _choose(self, run: CalibrationRun, problem: Problem, seed: int) -> Choice:
         """Fit every candidate to the data without each fold and compare what they predict of it."""
-        settings, before = self._settings, problem.steps
+        settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = (
             time_masks(problem, settings.folds)
@@ -220,7 +220,7 @@ class OutputErrorFits(Fits):
             searched: The search's result.
             only: Name of the one candidate that is wanted; None for all.
         """
-        settings = self._settings
+        settings = self.settings
         horizons_s = settings.horizons_s if run.settings.folds else (settings.long_s,)
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
         rmse = prediction_rmse(problem, [found["search"], short], settings.compared_s)
@@ -254,7 +254,7 @@ class OutputErrorFits(Fits):
                     fit.theta,
                     fit.latency_s,
                     recipe,
-                    iterations=self._settings.half_iterations,
+                    iterations=self.settings.half_iterations,
                     central=True,
                 )
             except InsufficientDataError as err:
@@ -268,7 +268,7 @@ class OutputErrorFits(Fits):
     def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
         if chi2 <= MISMATCH.chi2:
             return ()
-        return (mismatch(chi2, f" over {self._settings.mismatch_s:g} s from fitted start states"),)
+        return (mismatch(chi2, f" over {self.settings.mismatch_s:g} s from fitted start states"),)
 
 
 def open_loop(search: CalibrationMethod[Problem] | None = None) -> Calibration:

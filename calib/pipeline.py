@@ -207,19 +207,19 @@ class Calibration(CalibrationMethod[Problem]):
         )
 
 
+@dataclass(frozen=True)
 class Refinement(Fits):
     """A search and its refinement; searched again from other draws while the residual is unexplained.
 
-    Args:
+    Attributes:
         restarts: When.
     """
 
-    def __init__(self, restarts: RestartSettings | None = None) -> None:
-        self._restarts = restarts or RestartSettings()
+    restarts: RestartSettings = field(default_factory=RestartSettings)
 
     def best(self, run: CalibrationRun) -> Outcome:
         """Search, refine, let cross-validation say whether the refinement helps. See :meth:`Fits.best`."""
-        settings, left = self._restarts, run.budget.generations
+        settings, left = self.restarts, run.budget.generations
         best: tuple[CalibrationResult, Polished] | None = None
         attempt = 0
         for attempt in range(1 + settings.restarts):
@@ -244,7 +244,7 @@ class Refinement(Fits):
     def _better(self, a: Polished, b: Polished) -> bool:
         """Say whether ``a`` explains more: a longer window only counts where both are explained."""
         if (
-            all(fit.chi2 < self._restarts.explained for fit in (a, b))
+            all(fit.chi2 < self.restarts.explained for fit in (a, b))
             and a.shooting.length != b.shooting.length
         ):
             return a.shooting.length > b.shooting.length
@@ -261,7 +261,7 @@ class Refinement(Fits):
         # Drawn after all searches, so that a resumed run draws the same.
         seed = int(run.rng.integers(2**32))
         # A fold needs no more generations than the whole did.
-        generations = max(len(searched.trace), self._restarts.fewest_generations)
+        generations = max(len(searched.trace), self.restarts.fewest_generations)
         less = dataclasses.replace(run.budget, generations=generations)
         return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
 
