@@ -15,12 +15,16 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
+<<<<<<< HEAD
 from deal_hw.calib.design.experiment_design import Experiment, MakeBehaviour, Prediction
 from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
+=======
+from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior
+from deal_hw.calib.uncertainty.intervals import IDENTIFIABLE_STD, WEAK_SHARE
+>>>>>>> h_data
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
-    ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
     largest_factor,
@@ -28,7 +32,7 @@ from deal_hw.control.excitation_plan import (
     words,
 )
 from deal_hw.description import RobotDescription, SensorModel
-from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import Episode
@@ -167,7 +171,7 @@ def advise(
     """
     space, K = result.space, len(result.space)
     known = result.distribution()
-    before = np.sqrt(np.diag(known.covariance)) if known.covariance is not None else np.full(K, np.inf)
+    before = np.full(K, np.inf) if known.covariance is None else np.sqrt(np.diag(known.covariance))
     # An interval that was cut off at the range says less than its width.
     before = np.minimum(before, space.width / np.sqrt(12.0))
     open_ = [k for k in range(K) if not _told(space, k, float(before[k])) or _said_weak(result, k)]
@@ -175,7 +179,7 @@ def advise(
         return ()
     designs = menu_designs(robot.description, balance is not None, settings)
     menu = {name: make_plan(robot.description, design) for name, design in designs.items()}
-    predictions = predict_menu(robot, known, before, menu, balance=balance, threads=threads)
+    predictions = predict_menu(robot, known, menu, balance=balance, threads=threads)
     # What the model lacks will be in the next recording, too: it widens that interval like this one.
     widened = result.provenance.get("clustered", {}).get("widened", {})
     found = []
@@ -190,41 +194,32 @@ def advise(
 def predict_menu(
     robot: RobotModel,
     known: ParameterDistribution,
-    before: FloatArray,
     menu: Mapping[str, ExcitationPlan],
     *,
     balance: Callable[[], Behaviour] | None = None,
     threads: int | None = None,
-) -> dict[str, Prediction]:
+) -> dict[str, ExpectedInformation]:
     """Predict at the estimate what each excitation adds to what is known.
 
     Args:
         robot: The nominal model.
         known: What is known; its mean is where is simulated.
-        before: Standard deviations that are known, in each parameter's own scale, (K,).
-        menu: Excitations.
+        menu: Excitations of one length.
         balance: Makes the policy that balances.
         threads: Simulation threads.
     """
-    lengths = {plan.seconds for plan in menu.values()}
-    if len(lengths) != 1:
-        raise ConfigurationError(f"a menu of excitations has one length, not {sorted(lengths)} s")
+    space, one = known.space, np.eye(len(known.space))
+    # The range bounds what the recordings leave open.
+    flat = np.linalg.inv(np.diag(space.width**2 / 12.0))
+    seen = 0.0 * one if known.covariance is None else np.linalg.inv(known.covariance + 1e-12 * one)
+    bounded = np.asarray(np.linalg.inv(seen + flat), dtype=float)
+    prior = Prior.of(dataclasses.replace(known, covariance=bounded))
     # One member at the estimate: the linearised posterior is about this one robot.
-    space = known.space
-    covariance = known.covariance if known.covariance is not None else np.diag(before**2)
-    floor = np.diag(space.width**2 / 12.0)
-    bounded = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * np.eye(len(space))) + np.linalg.inv(floor))
-    centre = ParameterDistribution(
-        space=space, mean=known.mean, covariance=1e-18 * np.eye(len(space)), latency_s=known.latency_s
-    )
-    experiment = Experiment(robot, centre, lengths.pop(), 1, np.random.default_rng(0), threads=threads)
-    experiment.assume(bounded)
-    description = robot.description
-
-    def maker(plan: ExcitationPlan) -> MakeBehaviour:
-        return lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None)
-
-    return {name: experiment.predict(maker(plan)) for name, plan in menu.items()}
+    there = dataclasses.replace(known, covariance=1e-18 * one)
+    seconds = max(plan.seconds for plan in menu.values())
+    rng = np.random.default_rng(0)
+    experiment = Experiment(robot, there, seconds, 1, rng, threads=threads, prior=prior)
+    return {name: experiment.predict(experiment.playing(plan, balance)) for name, plan in menu.items()}
 
 
 def _said_weak(result: CalibrationResult, k: int) -> bool:
@@ -239,7 +234,7 @@ def _advice(
     space: ParameterSpace,
     k: int,
     before: float,
-    predictions: Mapping[str, Prediction],
+    predictions: Mapping[str, ExpectedInformation],
     widened: float,
     worth: float,
 ) -> Advice:

@@ -10,11 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from deal_hw.calib.design.experiment_design import Experiment, MakeBehaviour, Prediction
+from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, MakeBehaviour
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
     FAMILIES,
-    ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
     Family,
@@ -69,8 +68,8 @@ class Optimum:
 
     design: ExcitationDesign
     plan: ExcitationPlan
-    prediction: Prediction
-    references: Mapping[str, Prediction]
+    prediction: ExpectedInformation
+    references: Mapping[str, ExpectedInformation]
     tried: int
     tripped: Mapping[str, int]
     trace: tuple[float, ...]
@@ -109,13 +108,12 @@ def search_excitation(
     designs = designer.usual() + [designer.draw(rng) for _ in range(wanted.candidates)]
     total = len(designs) + wanted.rounds + (wanted.confirmed if confirmation is not None else 0)
 
-    def predict(design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment) -> Prediction:
+    def predict(
+        design: ExcitationDesign, bar: float = -np.inf, on: Experiment = experiment
+    ) -> ExpectedInformation:
         nonlocal tried
-        plan = make_plan(description, design)
-        found = on.predict(
-            lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None),
-            lambda bound: score(bound, wanted) > bar,
-        )
+        make = on.playing(make_plan(description, design), balance)
+        found = on.predict(make, lambda bound: score(bound, wanted) > bar)
         tried += 1
         tripped.update(filter(None, [found.tripped]))
         if notify is not None:
@@ -123,7 +121,7 @@ def search_excitation(
             notify(tried, total, f"{design.family}: {outcome}")
         return found
 
-    finals: list[tuple[Prediction, ExcitationDesign]] = []
+    finals: list[tuple[ExpectedInformation, ExcitationDesign]] = []
     for design in designs:
         full = len(finals) >= wanted.finalists
         found = predict(design, score(finals[-1][0], wanted) if full else -np.inf)
@@ -173,7 +171,7 @@ def search_excitation(
     )
 
 
-def score(prediction: Prediction, settings: SearchSettings) -> float:
+def score(prediction: ExpectedInformation, settings: SearchSettings) -> float:
     """Return what the search maximises; minus infinity for what is not usable."""
     if not prediction.usable:
         return -np.inf

@@ -18,6 +18,7 @@ from deal_hw.calib.design.closed_loop import Scenario, Trial, TrialRunner
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationPlan
 from deal_hw.description import RobotDescription
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
@@ -50,7 +51,7 @@ SETTINGS = ExperimentSettings()
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class ExpectedInformation:
     """What an excitation is predicted to tell.
 
     Attributes:
@@ -160,6 +161,7 @@ class Experiment:
             again, for no excitation could. None to take the first draws.
         threads: Simulation threads.
         settings: How members are drawn and tried.
+        prior: What is known before; the distribution by default.
 
     Raises:
         CalibrationError: Hardly any draw can be run.
@@ -175,10 +177,11 @@ class Experiment:
         rest: MakeBehaviour | None = None,
         threads: int | None = None,
         settings: ExperimentSettings = SETTINGS,
+        prior: Prior | None = None,
     ) -> None:
         self.robot, self.space, self.known, self.settings = robot, known.space, known, settings
         self.seconds, self.threads = seconds, threads
-        self.prior = Prior.of(known)
+        self.prior = prior or Prior.of(known)
         self.refused = 0
         """Draws that could not be run."""
         self._runner: TrialRunner | None = None
@@ -204,15 +207,19 @@ class Experiment:
 
     def afresh(self, draws: int, rng: np.random.Generator) -> Experiment:
         """Return the same experiment on other members: what was chosen on some is judged on others."""
+        rest, threads, settings = self._rest, self.threads, self.settings
         return Experiment(
-            self.robot, self.known, self.seconds, draws, rng, self._rest, self.threads, self.settings
+            self.robot, self.known, self.seconds, draws, rng, rest, threads, settings, self.prior
         )
 
-    def assume(self, covariance: FloatArray) -> None:
-        """Take this covariance, (K, K), as what is known before, instead of the distribution's."""
-        self.prior = Prior.of(dataclasses.replace(self.known, covariance=covariance))
+    def playing(self, plan: ExcitationPlan, balance: MakeBehaviour | None) -> MakeBehaviour:
+        """Return what makes a plan's behaviour, which begins with what balances the robot, if anything."""
+        description = self.robot.description
+        return lambda: ExcitationBehaviour(plan, description, balance() if balance is not None else None)
 
-    def predict(self, make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
+    def predict(
+        self, make: MakeBehaviour, bar: Callable[[ExpectedInformation], bool] | None = None
+    ) -> ExpectedInformation:
         """Predict what a behaviour tells.
 
         Args:
@@ -226,7 +233,7 @@ class Experiment:
             self._runner = self._on(self.scenario)
         trials = self._runner.run([make() for _ in range(D)], until_trip=True)
         clipped = sum(trial.clipped for trial in trials)
-        nothing = Prediction(np.full(K, np.nan), -np.inf, clipped=clipped)
+        nothing = ExpectedInformation(np.full(K, np.nan), -np.inf, clipped=clipped)
         tripped = next((trial.tripped for trial in trials if trial.tripped), "")
         if tripped:
             return dataclasses.replace(nothing, tripped=tripped)
@@ -246,7 +253,7 @@ class Experiment:
             # Covariances are averaged, not gains: what leaves no trace on one robot in eight must not be made
             # up for by what is a little sharper on the other seven.
             mean = np.mean(covariances, axis=0)
-            found = Prediction(np.sqrt(np.diag(mean)), self.prior.gain(mean), clipped=clipped)
+            found = ExpectedInformation(np.sqrt(np.diag(mean)), self.prior.gain(mean), clipped=clipped)
             if bar is not None and not bar(found):
                 return dataclasses.replace(nothing, beaten=True)
         dark = np.einsum("nkk,kk->n", covariances, self.prior.information[:K, :K])

@@ -16,9 +16,9 @@ from deal_hw.calib.design.advice import AdviceSettings, advise, menu_designs, ne
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.design.excitation_search import SearchSettings, score, search_excitation
 from deal_hw.calib.design.experiment_design import (
+    ExpectedInformation,
     Experiment,
     MakeBehaviour,
-    Prediction,
     Prior,
     default_knowledge,
     information,
@@ -193,7 +193,9 @@ def recording(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> list[M
     seen: list[MakeBehaviour] = []
     plain = experiment.predict
 
-    def predict(make: MakeBehaviour, bar: Callable[[Prediction], bool] | None = None) -> Prediction:
+    def predict(
+        make: MakeBehaviour, bar: Callable[[ExpectedInformation], bool] | None = None
+    ) -> ExpectedInformation:
         seen.append(make)
         return plain(make, bar)
 
@@ -298,8 +300,7 @@ def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:
     said = f"record {advice.excitation}: slide.effort_limit goes from 60 % to {100 * advice.after:.2g} %"
     assert advice.sentence == said
     # The figures are those of the excitation alone, too.
-    spread = np.array([0.02, 0.05, 0.6])
-    alone = predict_menu(servo, found.distribution(), spread, menu, threads=1)
+    alone = predict_menu(servo, found.distribution(), menu, threads=1)
     assert advice.after == min(p.std[2] for p in alone.values() if p.usable)
     assert sum(p.std[2] > 0.5 for p in alone.values()) > 1
 
