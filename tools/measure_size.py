@@ -192,7 +192,10 @@ def measure(
         row |= _run([sys.executable, *program, *arguments, *more], folder, limit_s)
         if row["exit_code"] not in (0, 130):
             row["error"] = f"deal-hw calibrate ended with {row['exit_code']}: {row['said'][-1:]}"
-        found = folder / f"out/calibration/{'so_far/' if row['stopped'] else ''}result.json"
+        found = folder / "out/calibration/result.json"
+        row["stopped"] = not found.exists()
+        if row["stopped"]:
+            found = folder / "out/calibration/so_far/result.json"
         if found.exists():
             row |= against_truth(robot, json.loads(found.read_text(encoding="utf-8")))
     row["load_after"] = os.getloadavg()[0]
@@ -219,8 +222,6 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
         "exit_code": process.returncode,
-        # Under cProfile an interrupted program ends with 0.
-        "stopped": time.monotonic() - began > limit_s,
         "seconds": time.monotonic() - began,
         "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
         # Of the largest child so far, which is this one: [KiB] on Linux.
@@ -295,6 +296,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--profile", type=Path, help="file for cProfile's figures; the last run's are kept")
     parser.add_argument("--out", type=Path, help="file of the rows (JSON)")
     given = parser.parse_args(arguments)
+    # A shell starts background jobs with Ctrl-C ignored, and so would be the calibration's limit.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     rows = []
     for joints in given.joints:
         for seed in given.seeds:
