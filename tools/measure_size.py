@@ -193,7 +193,7 @@ def measure(
         if row["exit_code"] not in (0, 130):
             row["error"] = f"deal-hw calibrate ended with {row['exit_code']}: {row['said'][-1:]}"
         found = folder / "out/calibration/result.json"
-        row["stopped"] = not found.exists()
+        row["stopped"] = not row["error"] and not found.exists()
         if row["stopped"]:
             found = folder / "out/calibration/so_far/result.json"
         if found.exists():
