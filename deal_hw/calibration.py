@@ -208,7 +208,8 @@ class CalibrationResult:
             ConfigurationError: A field is of another kind or shape; the message names it.
         """
         if values.get("format") != RESULT_FORMAT:
-            raise ConfigurationError(f"not a calibration result: format is {shown(values.get('format'))}")
+            found = shown(values.get("format"))
+            raise ConfigurationError(f"not a calibration result: format is {found}, not {RESULT_FORMAT!r}")
         space = ParameterSpace.from_json(values["space"])
         K = len(space)
         rows = [object_of(values["parameters"][name], f"parameter {shown(name)}") for name in space.names]

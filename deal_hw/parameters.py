@@ -22,6 +22,8 @@ from deal_hw.schema import FINITE, from_values
 from deal_hw.types import FloatArray
 
 Scale = Literal["log", "linear"]
+FORMAT = "deal_hw.parameter_distribution/1"
+"""Names the layout of a distribution's JSON."""
 LONGEST_LATENCY_S = 1.0
 """No robot is later [s]."""
 _LARGEST_VARIANCE = 1e100
@@ -311,7 +313,7 @@ class ParameterDistribution:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         return {
-            "format": "deal_hw.parameter_distribution/1",
+            "format": FORMAT,
             "space": self.space.to_json(),
             "mean": dict(zip(self.space.names, map(float, self.mean), strict=True)),
             "covariance": None if self.covariance is None else self.covariance.tolist(),
@@ -325,8 +327,9 @@ class ParameterDistribution:
         Raises:
             ConfigurationError: A field cannot give draws that are finite; the message names it.
         """
-        if values.get("format") != "deal_hw.parameter_distribution/1":
-            raise ConfigurationError(f"not a parameter distribution: format is {shown(values.get('format'))}")
+        if values.get("format") != FORMAT:
+            found = shown(values.get("format"))
+            raise ConfigurationError(f"not a parameter distribution: format is {found}, not {FORMAT!r}")
         space = ParameterSpace.from_json(values["space"])
         K = len(space)
         covariance = values["covariance"]

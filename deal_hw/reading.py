@@ -60,7 +60,8 @@ def reading(
 
     Parsers of damaged bytes raise nearly anything (`struct.error`, `zlib.error`, `RecursionError`,
     `MemoryError`, ...), and so does code that walks values of another structure than expected. Errors of our
-    own keep their class and get the path in front. ``--traceback`` shows where it came from.
+    own keep their class and get the path in front and the advice behind. ``--traceback`` shows where it came
+    from.
 
     Args:
         path: The file, as messages call it.
@@ -76,7 +77,8 @@ def reading(
     except DealHwError as err:
         text = str(err) if str(path) in str(err) else f"{path}: {err}"
         # What is ours may list the names that a file holds.
-        err.args = (short(text, LISTED + len(str(path))),)
+        text = short(text, LISTED + len(str(path)))
+        err.args = (text if advice in text else text + then,)
         raise
     except FileNotFoundError as err:
         raise error(f"{path} cannot be read: there is no such file{then}") from err

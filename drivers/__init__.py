@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from deal_hw.clock import Clock
@@ -109,7 +109,9 @@ def make_robot(
     try:
         made: Robot = robot(link if can_send else listen_only(link), clock, **(settings or {}))
     except TypeError as error:
-        raise ConfigurationError(f"robot {name!r} has no setting of {', '.join(settings or ())}") from error
+        raise ConfigurationError(
+            f"{_options(settings or ())} would have no effect: robot {name!r} has no such setting"
+        ) from error
     return made
 
 
@@ -158,7 +160,11 @@ def make_transport(
         return make_topic_transport(transport_name, port, clock, options)
     transport = _find("transport", TRANSPORTS, transport_name)
     if options is not None and options != WireOptions():
-        raise ConfigurationError(f"transport {transport_name!r} knows none of the network's options")
+        default = WireOptions().to_json()
+        given = [name for name, value in options.to_json().items() if value != default[name]]
+        raise ConfigurationError(
+            f"{_options(given)} would have no effect: transport {transport_name!r} is no network"
+        )
     made: Transport = transport(port, clock=clock)
     return made
 
@@ -262,6 +268,11 @@ def default_transport(name: str) -> str:
     """
     _driver(name)
     return REACHED_BY[name][0]
+
+
+def _options(names: Iterable[str]) -> str:
+    """Return settings as they are typed."""
+    return ", ".join("--" + name.replace("_", "-") for name in names)
 
 
 def _check_reach(name: str, transport_name: str) -> None:

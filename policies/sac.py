@@ -78,7 +78,9 @@ class SacConfig:
                 f"hidden must name at least one layer of at least one unit, got {self.hidden!r}"
             )
         if not 0 <= self.warmup < self.steps:
-            raise ConfigurationError(f"warmup must lie in [0, steps = {self.steps}), got {self.warmup}")
+            raise ConfigurationError(
+                f"{self.steps} steps: give more than the {self.warmup} steps of warmup, which are random"
+            )
 
 
 class NetworkPolicy:

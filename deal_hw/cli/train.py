@@ -126,6 +126,8 @@ def train_policy(
         raise UnknownNameError("robot with a training environment", robot, ROBOTS)
     config = SacConfig() if steps is None else dataclasses.replace(SacConfig(), steps=steps)
     env = CartPoleEnv(robot_description(robot), distribution, members or MEMBERS, sensor=sensor)
+    # Where it cannot be written that is known now and not after the training.
+    path.parent.mkdir(parents=True, exist_ok=True)
     started, cpu = time.monotonic(), time.process_time()
     policy = make_trainer("sac").train(env, config, np.random.default_rng(seed), progress)
     record = {

@@ -170,7 +170,8 @@ class ReplayBehaviour:
         if trajectory.actuated != description.actuated or trajectory.joint_names != description.joint_names:
             raise ConfigurationError(
                 f"the recording is of joints {trajectory.joint_names}, actuated {trajectory.actuated}; "
-                f"robot {description.name!r} has {description.joint_names}, actuated {description.actuated}"
+                f"robot {description.name!r} has {description.joint_names}, actuated {description.actuated}; "
+                "replay it on the robot that was recorded"
             )
         if not trajectory.sent_s.size:
             raise DatasetError("the recording holds no command to replay")

@@ -65,5 +65,5 @@ def test_the_drivers_own_settings_are_carried_where_they_were_given() -> None:
     assert settings == {"support_check": False, "state_check": "length"}
     clock = VirtualClock()
     assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, settings).info is None  # type: ignore[attr-defined]
-    with pytest.raises(ConfigurationError, match="no setting of support_check, state_check"):
+    with pytest.raises(ConfigurationError, match="--support-check, --state-check would have no effect"):
         make_robot("cartpole", "serial", "/dev/ttyUSB0", clock, None, settings)

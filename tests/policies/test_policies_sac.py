@@ -67,7 +67,7 @@ class TestSac(TrainerSuite):
         ({"steps": 0}, "steps must be positive, got 0"),
         ({"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
         ({"hidden": ()}, "hidden must name at least one layer"),
-        ({"steps": 100, "warmup": 100}, r"warmup must lie in \[0, steps = 100\), got 100"),
+        ({"steps": 100, "warmup": 100}, r"100 steps: give more than the 100 steps of warmup"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(settings: dict[str, object], message: str) -> None:

@@ -47,7 +47,7 @@ def read_channels(path: Path) -> list[Channels]:
             f"{path} is a folder but no LeRobot dataset (it has no meta/info.json); name a file"
         )
     if not path.exists():
-        raise DatasetError(f"{path} does not exist")
+        raise DatasetError(f"{path} does not exist; check its name")
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise DatasetError(
