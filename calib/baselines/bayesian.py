@@ -327,7 +327,7 @@ class _Bo(ScoredStepper):
         self._search.tell(fitness)
         _give_back()
         found = self._search.best
-        self.note(
+        self.log.note(
             f"best {found:.3g} of {self._search.scored} points",
             members,
             {

@@ -193,7 +193,7 @@ class _Cma(ScoredStepper):
             self._best.tell(unit, fitness, restarts, keep=self.stationary)
             if self.finished or self._scored + self._search.population > share:
                 break
-        self.note(
+        self.log.note(
             f"run {restarts + 1} of {len(unit)} members: step {sigma:.2g} of the range",
             members,
             {

@@ -156,7 +156,7 @@ class _Easi(ScoredStepper):
         fitness, values = self.score(members)
         self._search.tell(fitness)
         spread = float(self._search.std.mean())
-        self.note(f"spread {spread:.3g} of the range", members, {**values, "spread": spread})
+        self.log.note(f"spread {spread:.3g} of the range", members, {**values, "spread": spread})
 
     def found(self) -> tuple[Members, Members]:
         """Return the Gaussian's mean and its last sample."""

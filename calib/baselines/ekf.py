@@ -164,9 +164,8 @@ class _Passes(Stepper):
         members = self._members(self._value[None])
         self.log.note(
             f"innovations {self._misfit:.3g} times their variance, {self._lost} steps lost",
-            members.theta,
+            members,
             {"misfit": self._misfit, "lost": float(self._lost)},
-            members.latency_s,
         )
 
     def _filter(self) -> ExtendedKalman:

@@ -223,7 +223,7 @@ class _MultiStart(Stepper):
 
     def _note(self, message: str, members: Members) -> None:
         values = {"stage": float(self._stage), "chi2": float(np.min(self._chi2))}
-        self.log.note(message, members.theta, values, members.latency_s)
+        self.log.note(message, members, values)
 
     def result(self) -> CalibrationResult:
         """Return the best start, with intervals from the normal equations there."""

@@ -96,25 +96,27 @@ class OneShot(Stepper):
 
     def step(self) -> None:
         """Run the optimiser to its end."""
-        found = self._solve(self.log, self.rng)
-        self._found = found
-        self.log.note(
-            f"{found.iterations} iterations: {found.message}",
-            found.theta[None],
-            {"iterations": float(found.iterations)},
-        )
+        self._found = found = self._solve(self.log, self.rng)
+        words = f"{found.iterations} iterations: {found.message}"
+        self.log.note(words, self._members(found), {"iterations": float(found.iterations)})
+
+    def _members(self, found: Found) -> Members:
+        return Members(found.theta[None], np.array([self.coordinates.clip_latency(found.latency_s)]))
 
     def result(self) -> CalibrationResult:
         """Return what the optimiser found."""
-        found, problem = self._found, self.problem
+        found = self._found
         if found is None:
             raise InsufficientDataError("the optimiser has not run yet; call step() first")
-        latency = self.coordinates.clip_latency(found.latency_s)
-        centre = Members(found.theta[None], np.array([latency]))
+        interval = found.interval
+        if interval is None:
+            interval = intervals(self.problem.space, found.theta, found.covariance)
+        centre = self._members(found)
+        chi2 = explained(self.problem, centre, self.EXPLAINED_TICKS)
         return self.log.result(
             centre,
             centre,
-            chi2=explained(problem, centre, self.EXPLAINED_TICKS),
+            chi2=chi2,
             alarms=found.alarms,
             extra={
                 "interval": found.source,
@@ -122,9 +124,7 @@ class OneShot(Stepper):
                 "stopped": found.message,
                 "assumed_latency_s": found.latency_s,
             },
-            interval=found.interval
-            if found.interval is not None
-            else intervals(problem.space, found.theta, found.covariance),
+            interval=interval,
             covariance=found.covariance,
             steps=self.log.steps + found.steps,
         )

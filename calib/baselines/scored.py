@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, cast
 
@@ -74,11 +73,6 @@ class ScoredStepper(Stepper):
             "diverged": float(np.sum(~usable)),
             **self._fitness.values,
         }
-
-    def note(self, message: str, members: Members, values: Mapping[str, float]) -> None:
-        """Write one generation into the trace; see :meth:`SearchLog.note`."""
-        searched = self.coordinates.fixed_latency_s is None
-        self.log.note(message, members.theta, values, members.latency_s if searched else None)
 
     def result(self) -> CalibrationResult:
         """See :meth:`Stepper.result`; there is an alarm where too many members had no score."""

@@ -41,7 +41,7 @@ class _Draw(Stepper):
 
     def step(self) -> None:
         """Note the draw."""
-        self.log.note("no data is read", self.coordinates.members(self._unit).theta, {})
+        self.log.note("no data is read", self.coordinates.members(self._unit), {})
 
     def result(self) -> CalibrationResult:
         middle = self.coordinates.clip_latency(0.5 * sum(self.problem.latency_range_s))
@@ -127,7 +127,7 @@ class _Random(Stepper):
         order = np.argsort(scores, kind="stable")[: max(self.settings.elite, 2)]
         self._unit, self._score = units[order], scores[order]
         values = {"best": float(score.min())}
-        self.log.note(f"best {self._score[0]:.3g}", members.theta, values, members.latency_s)
+        self.log.note(f"best {self._score[0]:.3g}", members, values)
 
     def result(self) -> CalibrationResult:
         elite = self.coordinates.members(self._unit)

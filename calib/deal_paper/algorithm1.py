@@ -111,7 +111,7 @@ class _DealPaper(Stepper):
         finite = fitness[np.isfinite(fitness)]
         self.log.note(
             f"effective size {step.effective_size:.0f} of {len(fitness)}",
-            members.theta,
+            members,
             {
                 "fitness": float(finite.mean()) if finite.size else float("nan"),
                 **self._fitness.values,
@@ -121,7 +121,6 @@ class _DealPaper(Stepper):
                 "sigma": step.sigma,
                 "clamped": float(step.clamped),
             },
-            members.latency_s,
         )
 
     def result(self) -> CalibrationResult:

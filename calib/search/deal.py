@@ -106,9 +106,8 @@ class _Deal(KalmanStepper):
         self._spread = step.spread
         self.log.note(
             f"statistics misfit {step.misfit:.3g}, spread {step.spread:.3g}",
-            members.theta,
+            members,
             {"misfit": step.misfit, "spread": step.spread, "inflation": step.inflation, "wasserstein": gap},
-            members.latency_s,
         )
         self._skip_empty_stages()
 

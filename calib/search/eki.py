@@ -84,7 +84,7 @@ class _Eki(KalmanStepper):
         ticks = self._lengths[self._stage]
         self.log.note(
             f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",
-            members.theta,
+            members,
             {
                 "ticks": float(ticks),
                 "misfit": step.misfit,
@@ -92,7 +92,6 @@ class _Eki(KalmanStepper):
                 "inflation": step.inflation,
                 "tempering": self.kalman.tempering,
             },
-            members.latency_s,
         )
         while self._stage_over and not self._over:
             if self._stage + 1 < len(self._lengths):

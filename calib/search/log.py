@@ -11,8 +11,12 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.problem import Problem
+<<<<<<< HEAD
 from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.types import FloatArray
+=======
+from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
+>>>>>>> h_search
 
 Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
@@ -45,26 +49,20 @@ class SearchLog:
         self._start = time.perf_counter()
         self._earlier_steps, self._earlier_seconds = 0, 0.0
 
-    def note(
-        self,
-        message: str,
-        population: FloatArray,
-        values: Mapping[str, float],
-        latency_s: FloatArray | None = None,
-    ) -> None:
+    def note(self, message: str, members: Members, values: Mapping[str, float]) -> None:
         """Write one generation into the trace and call the callback, which may raise to stop the run.
 
         Args:
             message: One short line.
-            population: What was simulated, (N, K) physical values.
+            members: What was simulated.
             values: For the trace.
-            latency_s: Total latency of each member, (N,) [s], where it is searched.
         """
         self.trace.append({"generation": float(len(self.trace)), **values})
         if self._progress is not None:
             total = max(self.budget.generations, len(self.trace))
-            mean = None if latency_s is None else float(np.mean(latency_s))
-            self._progress(Progress("search", len(self.trace), total, message, population, mean, values))
+            latency_s = float(np.mean(members.latency_s))
+            progress = Progress("search", len(self.trace), total, message, members.theta, latency_s, values)
+            self._progress(progress)
 
     @property
     def steps(self) -> int:
