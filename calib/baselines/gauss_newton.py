@@ -19,7 +19,6 @@ import numpy as np
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.contacts import damped_step
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, Stepper
 from deal_hw.calib.search.log import Run
@@ -378,3 +377,51 @@ class _MultiStart(Stepper):
         self._drawn = state["drawn"]
         self._values, self._cost = state["values"], state["cost"]
         self._best = (state["best"][0], state["best"][1])
+
+
+def damped_step(
+    value: FloatArray,
+    gradient: FloatArray,
+    hessian: FloatArray,
+    damping: float,
+    low: FloatArray,
+    high: FloatArray,
+    fixed_latency: bool,
+    *,
+    step_limit: float = 0.7,
+    latency_step_limit_s: float = 0.005,
+) -> FloatArray:
+    """Return the Levenberg-Marquardt step inside the range, (K + 1,).
+
+    Args:
+        value: Parameters in their own scale, then the latency [s], (K + 1,).
+        gradient: Half the cost's gradient there, (K + 1,).
+        hessian: Half its Gauss-Newton Hessian, (K + 1, K + 1).
+        damping: How much shorter than the Gauss-Newton step.
+        low: Least values, (K + 1,).
+        high: Greatest values, (K + 1,).
+        fixed_latency: Keep the latency.
+        step_limit: Largest step of a parameter in its own scale (about a factor two).
+        latency_step_limit_s: Largest step of the latency [s].
+    """
+    free = np.ones(len(value), dtype=bool)
+    free[-1] = not fixed_latency
+    # A parameter at its bound that wants to leave the range stays; the others are solved without it.
+    free &= ~((value <= low) & (gradient > 0)) & ~((value >= high) & (gradient < 0))
+    step = np.zeros(len(value))
+    if not free.any():
+        return step
+    scale = np.append(np.ones(len(step) - 1), 100.0)  # 10 ms of latency count like a factor e.
+    limit = np.append(np.full(len(step) - 1, step_limit), latency_step_limit_s)
+    H = hessian[np.ix_(free, free)]
+    # Levenberg's damping in units of the parameters' scale beside Marquardt's relative one: a parameter
+    # that the data cannot see (a limit never reached) must not run away.
+    weight = np.diag(H) + np.max(np.diag(H) / scale[free] ** 2) * 1e-9 * scale[free] ** 2 + scale[free] ** 2
+    step[free] = -np.linalg.solve(H + damping * np.diag(weight), gradient[free])
+    shrink = np.max(np.abs(step) / limit)
+    if shrink > 1:
+        step = step / shrink
+    moved = np.asarray(np.clip(value + step, low, high) - value)
+    if fixed_latency:
+        moved[-1] = 0.0
+    return moved
