@@ -15,13 +15,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-<<<<<<< HEAD
-from deal_hw.calib.design.experiment_design import Experiment, MakeBehaviour, Prediction
-from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
-=======
 from deal_hw.calib.design.experiment_design import ExpectedInformation, Experiment, Prior
-from deal_hw.calib.uncertainty.intervals import IDENTIFIABLE_STD, WEAK_SHARE
->>>>>>> h_data
+from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (

@@ -114,7 +114,6 @@ class Shooting:
     Args:
         problem: The problem.
         length: Samples a window predicts.
-        offset: First sample that may start a window.
         data: The windows, where they are not all that the recordings hold.
         given: Take the smoothed start states as they are; otherwise each is an unknown of its own. Exact
             states are always given.
@@ -126,7 +125,6 @@ class Shooting:
         self,
         problem: Problem,
         length: int,
-        offset: int = 0,
         data: Sequence[WindowData] | None = None,
         *,
         given: bool = False,
@@ -135,7 +133,7 @@ class Shooting:
         self.problem = problem
         self.given = given or problem.exact
         self.prior_share = prior_share
-        self.data: Sequence[WindowData] = problem.windows(length, offset=offset) if data is None else data
+        self.data: Sequence[WindowData] = problem.windows(length) if data is None else data
         self.length = length
         space = problem.space
         mean, std = space.prior
@@ -171,20 +169,16 @@ class Shooting:
             latency_s: Total latency [s].
             states: Where to take the windows' start states from; the smoothed ones by default.
         """
-        value = np.append(self.problem.space.to_scale(theta), latency_s)
         source = states or self.smoothed()
         return Point(
-            value,
-            tuple(x[d.windows.start] for d, (x, _) in zip(self.data, self._of_data(source), strict=True)),
-            tuple(v[d.windows.start] for d, (_, v) in zip(self.data, self._of_data(source), strict=True)),
+            np.append(self.problem.space.to_scale(theta), latency_s),
+            tuple(source[d.episode][0][d.windows.start] for d in self.data),
+            tuple(source[d.episode][1][d.windows.start] for d in self.data),
         )
 
     def smoothed(self) -> States:
         """Return the smoothed states of all episodes."""
         return [(s.position, s.velocity) for s in self.problem.starts]
-
-    def _of_data(self, states: States) -> States:
-        return [states[d.episode] for d in self.data]
 
     def states(self, point: Point) -> States:
         """Return the fitted states at every sample of every episode; smoothed ones outside the windows."""
@@ -277,16 +271,8 @@ class Shooting:
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
             count += W * int(data.prior_counts.sum()) - W * 2 * C
-        return Normal(
-            cost,
-            count,
-            hessian,
-            gradient,
-            tuple(back),
-            tuple(residuals),
-            self.prior_information,
-            tuple(rows),
-        )
+        all_of = tuple(back), tuple(residuals), self.prior_information, tuple(rows)
+        return Normal(cost, count, hessian, gradient, *all_of)
 
     def followed(self, point: Point, normal: Normal, step: FloatArray) -> Point:
         """Return the point after a parameter step, (K + 1,), each window's start state moved as suits it.
@@ -303,13 +289,24 @@ class Shooting:
             follow = gain @ step
             ways = -np.stack([np.zeros_like(shift), shift, follow, shift + follow])
             chosen.append(
-                self._best(e, value, point.position[e] + ways[..., :C], point.velocity[e] + ways[..., C:])
+                self.best_starts(
+                    e, value, point.position[e] + ways[..., :C], point.velocity[e] + ways[..., C:]
+                )
             )
         position, velocity = zip(*chosen, strict=True)
         return Point(value, position, velocity)
 
-    def _best(self, e: int, value: FloatArray, x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return each window's cheapest start state, (W, C) twice, of those given, (D, W, C) twice."""
+    def best_starts(
+        self, e: int, value: FloatArray, x: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return each window's start state, (W, C) twice, that costs least of several.
+
+        Args:
+            e: Which of the episodes.
+            value: Parameters and latency, (K + 1,).
+            x: Start positions to choose from, (D, W, C).
+            v: Their velocities, likewise.
+        """
         costs = self._window_costs(e, np.repeat(value[None], len(x), axis=0), x, v)
         best = np.argmin(costs, axis=0)
         window = np.arange(x.shape[1])
@@ -408,7 +405,7 @@ class Shooting:
             x, v = point.position[e] + draw[..., :C], point.velocity[e] + draw[..., C:]
             x[1::2] = data.start_position + draw[1::2, :, :C]
             v[1::2] = data.start_velocity + draw[1::2, :, C:]
-            chosen.append(self._best(e, point.value, x, v))
+            chosen.append(self.best_starts(e, point.value, x, v))
         position, velocity = zip(*chosen, strict=True)
         return Point(point.value, position, velocity)
 

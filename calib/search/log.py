@@ -11,12 +11,7 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Coordinates, Members
 from deal_hw.calib.data.problem import Problem
-<<<<<<< HEAD
 from deal_hw.calibration import Alarm, Budget, CalibrationResult, Progress, ProgressCallback
-from deal_hw.types import FloatArray
-=======
-from deal_hw.calibration import Budget, CalibrationResult, Progress, ProgressCallback
->>>>>>> h_search
 
 Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""

@@ -192,22 +192,19 @@ def uncertainty(
     blind = unseen.std > SETTINGS.identifiable_std * _unit(space)
     bound = _at_bound(space, theta, slope[:K]) * ~blind
     free = np.append(bound == 0, not fixed_latency)
-    covariance = _covariance(data / inflation + np.diag(belief), free)
-    cluster = _cluster(rows, covariance / inflation, residuals, tau)
+    precision = data / inflation + np.diag(belief)
+    covariance = _covariance(precision, free)
+    cluster = clustered(rows, covariance / inflation, residuals[0].shape[1], tau) if rows else None
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
     # What the data cannot see stays as wide as the range, however autocorrelated its residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
     factor = np.maximum(factor, 1.0)
     covariance = covariance * np.outer(factor, factor)
     for k in map(int, np.flatnonzero(bound)):
-        covariance[k, k] = (
-            _bound_std(data / inflation + np.diag(belief), free, k, slope[k] / inflation, flat) ** 2
-        )
+        covariance[k, k] = _bound_std(precision, free, k, slope[k] / inflation, flat) ** 2
     std = np.sqrt(np.diag(covariance))
-    latency = (
-        max(latency_s - Z90 * std[K], latency_range_s[0]),
-        min(latency_s + Z90 * std[K], latency_range_s[1]),
-    )
+    reach, (first, last) = Z90 * std[K], latency_range_s
+    latency = (max(latency_s - reach, first), min(latency_s + reach, last))
     if fixed_latency:
         latency = (latency_s, latency_s)
     blind |= std[:K] > SETTINGS.blind_share * np.sqrt(flat[:K])
@@ -261,12 +258,6 @@ def _bound_std(
     # Far out in the tail the law is that of an exponential of the slope, and its quantile not finite.
     exponential = np.log(10.0) / max(abs(slope), 1e-300)
     return (reach if 0 < reach <= width else min(exponential, width)) / Z90
-
-
-def _cluster(
-    rows: Sequence[WindowRows], bread: FloatArray, residuals: tuple[FloatArray, ...], tau: float
-) -> Clustered | None:
-    return clustered(rows, bread, residuals[0].shape[1], tau) if rows else None
 
 
 def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> FloatArray:

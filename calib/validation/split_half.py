@@ -19,6 +19,7 @@ from deal_hw.calib.fit.refinement import Polished, polish_windows
 from deal_hw.calib.fit.residual import Point, Shooting, taken
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, statement, widened_to, with_rows
 from deal_hw.calibration import Alarm, listed
+from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 
@@ -94,12 +95,11 @@ class Halves:
             "steps": self.steps,
         }
 
-    @property
-    def alarms(self) -> tuple[Alarm, ...]:
-        """One that names all that is flagged; none where nothing is."""
+    def alarms(self, space: ParameterSpace) -> tuple[Alarm, ...]:
+        """Return one alarm that names all that is flagged; none where nothing is."""
         if not self.flagged:
             return ()
-        both = {r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g})" for r in self.rows}
+        both = {r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g} {space[r.name].unit})" for r in self.rows}
         return (
             Alarm(
                 "Two halves of the data disagree about "
@@ -188,7 +188,7 @@ def heed(problem: Problem, known: Uncertainty, theta: FloatArray, halves: Halves
         return known
     flagged = np.array([name in halves.flagged for name in problem.space.names])
     wider = widened_to(problem, known, theta, np.where(flagged, halves.reach / Z90, 0.0))
-    return dataclasses.replace(wider, alarms=(*wider.alarms, *halves.alarms))
+    return dataclasses.replace(wider, alarms=(*wider.alarms, *halves.alarms(problem.space)))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:

@@ -54,7 +54,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three
     space, truth = three_unknown(sensed.space, sensed.theta)
     problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1)
     found = polish(
-        problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=5, fixed_latency=True
+        problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=8, fixed_latency=True
     )
     assert found.chi2 < MISMATCH.chi2
     assert not unexplained(found)

@@ -53,7 +53,7 @@ def test_halves_of_a_right_model_agree(problem: Problem, polished: Polished) -> 
     """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
     known = statement(problem, polished, fixed_latency=True)
     halves = compare_halves(problem, polished, known)
-    assert halves.flagged == () and halves.alarms == () and halves.steps > 0
+    assert halves.flagged == () and halves.alarms(problem.space) == () and halves.steps > 0
     assert [r.name for r in halves.rows] == list(problem.space.names)
     assert all(r.first[1] <= r.first[0] <= r.first[2] for r in halves.rows)
     assert set(halves.to_json()["parameters"]) == set(problem.space.names)

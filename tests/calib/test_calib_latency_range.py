@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from deal_hw.calib.baselines.gauss_newton import damped_step
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.contacts import damped_step
 from deal_hw.calib.fit.output_error import SHORT, HorizonFit, fit_horizon
 from deal_hw.calib.fit.refinement import Polished, local_fit, polish
 from deal_hw.calib.validation.verdict import latency_alarms
