@@ -153,8 +153,7 @@ def polish(
         elif shooting.given:
             point, normal, used = _from_exact(shooting, point, iterations, settings.rounds if shake else 0)
         else:
-            solver = SolverSettings(iterations=iterations)
-            point, normal, used = solve(shooting, point, solver, fixed_latency=fixed_latency)
+            point, normal, used = _solved(shooting, point, iterations, fixed_latency)
         done += used
         found = _polished(shooting, point, normal, done, fixed_latency)
         if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
@@ -180,12 +179,16 @@ def polish_windows(
         iterations: Most iterations.
         fixed_latency: Keep the latency.
     """
-    if shooting.contacts:
-        point, normal, used = solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
-    else:
-        solver = SolverSettings(iterations=iterations)
-        point, normal, used = solve(shooting, point, solver, fixed_latency=fixed_latency)
+    point, normal, used = _solved(shooting, point, iterations, fixed_latency)
     return _polished(shooting, point, normal, used, fixed_latency)
+
+
+def _solved(
+    shooting: Shooting, point: Point, iterations: int, fixed_latency: bool
+) -> tuple[Point, Normal, int]:
+    if shooting.contacts:
+        return solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
+    return solve(shooting, point, SolverSettings(iterations=iterations), fixed_latency=fixed_latency)
 
 
 def _polished(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Polished:
@@ -319,13 +322,13 @@ def _with_contacts(
     """Solve; while the residual is unexplained, draw other start states and solve again."""
     settings = SETTINGS
     free = len(shooting.problem.space) + (0 if fixed_latency else 1)
-    point, normal, used = solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
+    point, normal, used = _solved(shooting, point, iterations, fixed_latency)
     for spread in settings.shakes if shake else ():
         if normal.cost / max(normal.count - free, 1) < settings.explained:
             break
         before = normal.cost
         point = shooting.shaken(point, spread, settings.shake_count, rng)
-        point, normal, more = solve_contacts(shooting, point, iterations, fixed_latency=fixed_latency)
+        point, normal, more = _solved(shooting, point, iterations, fixed_latency)
         used += more
         if normal.cost > settings.shaken * before:
             break

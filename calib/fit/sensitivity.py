@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, WindowData, samples_in
+from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.fit.output_error import longest_windows
 from deal_hw.calib.fit.residual import taken
-from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 
@@ -79,7 +80,7 @@ def look(problem: Problem) -> Visibility:
         theta[1 + 2 * k, k], theta[2 + 2 * k, k] = space.low[k], space.high[k]
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     effect = np.zeros(K)
-    for data in _some(_windows(problem)):
+    for data in _some(longest_windows(problem, SETTINGS.window_s)):
         predicted = problem.predict(theta, latency, data).observed
         change = np.abs(predicted[1:] - predicted[:1]) / data.std
         # A member that diverges at the end of its range is seen, to be sure.
@@ -108,7 +109,7 @@ def jumps(problem: Problem) -> dict[str, float]:
     theta = space.from_scale(values)
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     changes = []
-    for data in _some(_windows(problem)):
+    for data in _some(longest_windows(problem, SETTINGS.window_s)):
         predicted = problem.predict(theta, latency, data).observed
         change = np.where(np.isfinite(data.std), np.abs(predicted[1:] - predicted[:1]), 0.0)
         changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
@@ -133,13 +134,6 @@ def require_visible(found: Visibility) -> None:
             "from one end of the range to the other. Remove them from the parameters (or give them with "
             "--known), or record a motion that shows them"
         )
-
-
-def _windows(problem: Problem) -> list[WindowData]:
-    try:
-        return problem.windows(samples_in(problem, SETTINGS.window_s))
-    except InsufficientDataError:
-        return problem.windows(samples_in(problem, 0.0))
 
 
 def _some(windows: list[WindowData]) -> list[WindowData]:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.report.gather import ReportInputs
-from deal_hw.calib.uncertainty.intervals import ended_at_bound
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import published_together, write_json
@@ -128,10 +127,10 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
         100 * np.clip(space.normalize(values), 0, 1)
         for values in (result.interval[:, 0], result.interval[:, 1], space.nominal, result.estimate)
     ]
-    ended = ended_at_bound(space, result.estimate)
     rows = []
     for k, p in enumerate(space):
-        bound = ("upper" if at[3][k] > 50 else "lower") if ended[k] else ""
+        # To the share of the range to which the alarm looks.
+        bound = {0.0: "lower", 100.0: "upper"}.get(round(float(at[3][k]), 4), "")
         prior = ""
         if p.prior_mean is not None and p.prior_std is not None:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"

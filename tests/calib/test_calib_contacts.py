@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.contacts import settle
+from deal_hw.calib.fit.contacts import Sticking, settle
 from deal_hw.calib.fit.refinement import polish
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.uncertainty.intervals import MISMATCH, correlation_time
@@ -93,6 +93,26 @@ def test_backward_differences_agree_with_forward_ones(small_problem: Callable[..
     forward, backward = shooting.normal(point), shooting.normal(point, stretch=-1.0)
     assert backward.cost == pytest.approx(forward.cost)
     np.testing.assert_allclose(backward.gradient[:-1], forward.gradient[:-1], rtol=0.02)
+
+
+def test_strategy_keeps_the_best_point_and_hands_the_solver_its_residual(
+    small_problem: Callable[..., Problem],
+) -> None:
+    """The residual's square is the cost of its point; a worse value moves nothing that is kept."""
+    problem = small_problem()
+    shooting = Shooting(problem, 10)
+    start = shooting.start(problem.space.nominal, 0.0)
+    fit = Sticking(shooting, start, 1.0)
+    residual = fit.residual(start.value)
+    assert fit.best_cost == pytest.approx(residual @ residual)
+    assert fit.best_cost <= shooting.costs([start])[0]
+    jacobian = fit.jacobian(start.value)
+    assert jacobian.shape == (len(residual), len(start.value))
+    step = np.append(0.3 * np.linalg.lstsq(jacobian[:, :-1], residual, rcond=None)[0], 0.0)
+    better = fit.residual(start.value - step)
+    assert better @ better < residual @ residual and fit.best_cost == pytest.approx(better @ better)
+    fit.residual(start.value + 5 * step)
+    np.testing.assert_array_equal(fit.best.value, start.value - step)
 
 
 def test_costs_are_the_sums_of_windows(small_problem: Callable[..., Problem]) -> None:

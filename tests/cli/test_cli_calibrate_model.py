@@ -200,7 +200,7 @@ def test_latency_at_the_end_of_its_range(
     assert any(
         "latency ended at 4 ms" in a["seen"] and "--latency-range 0 0.008" in a["do"] for a in found["alarms"]
     )
-    assert "alarm: the latency ended at 4 ms" in capsys.readouterr().out.replace("\n", " ")
+    assert "alarm: The latency ended at 4 ms" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_parameters_are_written_and_read(
