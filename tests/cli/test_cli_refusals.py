@@ -176,6 +176,7 @@ SETTINGS: Lines = [
     ("replay run/dataset/episodes/000000.mcap --port p --robot go2", "the recording is of joints"),
     ("excite cartpole --out o.json --low-hz 5 --high-hz 1", "--low-hz 5 must be below --high-hz 1"),
     ("excite cartpole --out o.json --family multisine --low-hz 0.9 --high-hz 1", "widen the band"),
+    ("excite go2 --out o.json --family sway --high-hz 900", "which carry up to 25 Hz"),
     ("excite go2 --out o.json", "robots on a stand (such as go2_suspended)"),
     ("inspect run/dataset/episodes/000000.mcap --calibration empty.json --web", "not a calibration result"),
     ("inspect run/dataset/episodes/000000.mcap --save folder", "name a file, such as folder/episode.rrd"),
