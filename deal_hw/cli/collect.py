@@ -11,8 +11,8 @@ import tyro
 
 from deal_hw.calibration import SHORTEST_S
 from deal_hw.cli.episode_report import RunReport
-from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
-from deal_hw.cli.options import Checked, Range, RunSeconds, Seed, given, refuse
+from deal_hw.cli.link import RunOptions, plan_options
+from deal_hw.cli.options import Range, RunSeconds, Seed, given, refuse
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
@@ -26,27 +26,11 @@ SHORT_S = 1.5 * SHORTEST_S
 
 
 @dataclass(frozen=True, kw_only=True)
-class Collect(Checked):
+class Collect(RunOptions):
     """Record the robot while it moves in a way that tells much."""
 
     robot: tyro.conf.Positional[str]
     """The robot, such as cartpole."""
-
-    port: str
-    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
-    as tcp/127.0.0.1:7447 (zenoh)."""
-
-    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
-    """How the robot is reached, beyond the port."""
-
-    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
-    """What a robot with legs needs to be told."""
-
-    out: Path | None = None
-    """Run folder; the episodes go to OUT/dataset."""
-
-    dataset: Path | None = None
-    """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
 
     profile: Literal["rich", "chirp", "balance", "hold"] = "rich"
     """rich: balance, then random set-points; chirp: a sine sweep (for held-out data); balance: the policy all
@@ -78,9 +62,6 @@ class Collect(Checked):
 
     rich: tyro.conf.Suppress[RichConfig] = field(default_factory=RichConfig)
     """Settings of the profile `rich`; its length is SECONDS."""
-
-    quiet: bool = False
-    """Print nothing but errors."""
 
 
 def collect(config: Collect) -> RunReport:

@@ -2,44 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from deal_hw.cli.episode_report import RunReport
-from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
-from deal_hw.cli.options import Checked, Range, RunSeconds, Seed
+from deal_hw.cli.link import RunOptions, plan_options
+from deal_hw.cli.options import Range, RunSeconds, Seed
 from deal_hw.cli.run_plan import RunPlan, shipped_policy
 from deal_hw.cli.supervised import dataset_folder, run_episodes
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deploy(Checked):
+class Deploy(RunOptions):
     """Run a policy on the robot behind the safety filter, and record it."""
 
     robot: tyro.conf.Positional[str]
     """The robot, such as cartpole."""
 
-    port: str
-    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
-    as tcp/127.0.0.1:7447 (zenoh)."""
-
-    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
-    """How the robot is reached, beyond the port."""
-
-    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
-    """What a robot with legs needs to be told."""
-
     policy: Path | None = None
     """The policy (.onnx); by default the one shipped for the robot."""
-
-    out: Path | None = None
-    """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET nothing is recorded."""
-
-    dataset: Path | None = None
-    """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
 
     seconds: RunSeconds = 10.0
     """Length of an episode [s]."""
@@ -55,9 +39,6 @@ class Deploy(Checked):
 
     dry_run: bool = False
     """Compute everything and send nothing: the robot is neither homed nor armed."""
-
-    quiet: bool = False
-    """Print nothing but errors."""
 
 
 def deploy(config: Deploy) -> RunReport:

@@ -146,6 +146,12 @@ def excite(config: Excite) -> ExciteReport:
             f"--family {config.family} is not searched; use --family optimal",
         )
     description = recorded_description(config.robot)
+    most_hz = description.control_rate_hz / 2
+    if config.family in ("multisine", "chirp", "sway") and config.high_hz > most_hz:
+        raise ConfigurationError(
+            f"--high-hz {config.high_hz:g}: {config.robot} takes {description.control_rate_hz:g} commands a "
+            f"second, which carry up to {most_hz:g} Hz"
+        )
     balance = balancer(description, config.policy)
     optimum = None
     if config.family == "optimal":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
-from deal_hw.cli.options import given, refuse
+from deal_hw.cli.options import Checked, given, refuse
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
@@ -55,6 +56,31 @@ class LinkOptions:
 
     wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
     """More about a network."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(Checked):
+    """What every verb that runs a robot needs to be told."""
+
+    port: str
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
+    as tcp/127.0.0.1:7447 (zenoh)."""
+
+    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
+    """How the robot is reached, beyond the port."""
+
+    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
+    """What a robot with legs needs to be told."""
+
+    out: Path | None = None
+    """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET nothing is recorded; collect needs
+    one of the two."""
+
+    dataset: Path | None = None
+    """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
+
+    quiet: bool = False
+    """Print nothing but errors."""
 
 
 def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:

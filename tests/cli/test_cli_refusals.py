@@ -37,9 +37,11 @@ ARM = """
     <body name="upper">
       <joint name="elbow" axis="0 1 0" damping="0.2" armature="0.01" frictionloss="0.01"/>
       <geom name="rod" type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3"/>
+      <body name="tip"/>
     </body>
     <body name="cart" pos="1 0 0">
-      <joint name="rail" type="slide" axis="1 0 0" damping="0.2"/><geom name="box" size="0.1" mass="1"/>
+      <joint name="rail" type="slide" axis="1 0 0" damping="0.2"/>
+      <geom name="box" size="0.1" mass="1" solref="-900 -9"/>
     </body>
   </worldbody>
   <actuator>
@@ -81,7 +83,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     csv(folder / "rec.csv", **columns)
     csv(folder / "positions.csv", **{name: v for name, v in columns.items() if name[-4:] != "_cmd"})
     csv(folder / "one.csv", **{name: v for name, v in columns.items() if name != "rail_cmd"})
-    still = {name: 0 * v if name.endswith("_cmd") else v for name, v in columns.items()}
+    still = {name: 0.1 * (time_s > 3) if name.endswith("_cmd") else v for name, v in columns.items()}
     csv(folder / "still.csv", **still)
     csv(folder / "two.csv", **{name: v[[0, 0, 1]] for name, v in columns.items()})
     other = {name.replace("elbow", "knee").replace("rail", "foot"): v for name, v in columns.items()}
@@ -109,6 +111,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Dataset.create_or_open(folder / "blank", DESCRIPTION).close()
     facts = {**DESCRIPTION.to_json(), "state_rate_hz": 50}
     (folder / "cartpole.json").write_text(json.dumps(facts))
+    other_facts = {**facts, "joint_names": ["elbow", "rail"], "actuated": ["elbow"]}
+    (folder / "arm.json").write_text(json.dumps(other_facts))
     write_distributions(folder)
     plan = make_plan(DESCRIPTION, ExcitationDesign(family="steps", seconds=4.0)).to_json()
     (folder / "long.json").write_text(json.dumps({**plan, "seconds": 1e9}))
@@ -164,6 +168,7 @@ SETTINGS: Lines = [
     (f"{MODEL} rec.csv --feet toe", "this one's base is fixed"),
     (f"{MODEL} one.csv", "actuators of the model without recorded commands: belt"),
     (f"{MODEL} positions.csv", "name them as `target` in the column map"),
+    (f"{MODEL} still.csv --force", "record more motion"),
     ("calibrate --model velocity.xml --data rec.csv", "neither a position servo"),
     ("collect cartpole --port p", "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
     ("collect cartpole --port p --out a --dataset b", "give --out RUN or --dataset DIR, not both"),
@@ -176,6 +181,7 @@ SETTINGS: Lines = [
     ("replay run/dataset/episodes/000000.mcap --port p --robot go2", "the recording is of joints"),
     ("excite cartpole --out o.json --low-hz 5 --high-hz 1", "--low-hz 5 must be below --high-hz 1"),
     ("excite cartpole --out o.json --family multisine --low-hz 0.9 --high-hz 1", "widen the band"),
+    ("excite go2 --out o.json --family sway --high-hz 900", "which carry up to 25 Hz"),
     ("excite go2 --out o.json", "robots on a stand (such as go2_suspended)"),
     ("inspect run/dataset/episodes/000000.mcap --calibration empty.json --web", "not a calibration result"),
     ("inspect run/dataset/episodes/000000.mcap --save folder", "name a file, such as folder/episode.rrd"),
@@ -199,13 +205,19 @@ DATA: Lines = [
     ("data import two.csv --out o --force", "2 samples at different times; that is no recording"),
     ("data import other.csv --out o --model arm.xml", "which channels are the joints' positions"),
     ("data import rec.csv --out o --description cartpole.json", "which channels are the joints' positions"),
+    ("data import rec.csv --out o --description arm.json", "(commands: elbow); correct the column map"),
     ("data import lerobot --out o", "is the dataset downloaded whole?"),
     ("data import stopped --out o", "field fps is 0.0; allowed: 0.001 to 1e6 Hz"),
 ]
 ENTRIES: Lines = [
     ("{kind: dof_damping, elements: [elbow, rail], group: together, name: d}", "groups hinges with slides"),
     ("{kind: geom_friction_restitution, elements: rod}", "unknown parameter kind"),
-    ("{kind: body_scale, elements: 'z*'}", "unknown MuJoCo body 'z*'; known: upper, cart"),
+    ("{kind: geom_restitution, elements: box}", "geom 'box' gives stiffness and damping directly"),
+    (
+        "{kind: body_mass, elements: tip, nominal: 1, range: [0.5, 2]}",
+        "body 'tip' has no mass in the model: there is nothing to scale",
+    ),
+    ("{kind: body_scale, elements: 'z*'}", "unknown MuJoCo body 'z*'; known: upper, tip, cart"),
     ("{kind: servo_effort_limit, elements: '*'}", "'*' matches nothing that can have servo_effort_limit"),
     ("{kind: dof_damping, elements: elbow, group: some}", "unknown group 'some'; known: each, together"),
 ]

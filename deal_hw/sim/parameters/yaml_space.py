@@ -159,6 +159,10 @@ def _usable_ones(names: list[str], kind: Kind, model: Any, pattern: str) -> list
 def _parameter(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], model: Any) -> Parameter:
     name = _text(entry, "name") if "name" in entry else f"{elements[0]}.{kind.quantity}"
     scale = _SCALES[_choice(entry, "scale", tuple(_SCALES), kind.scale)]
+    if kind.usable is not None:
+        # Before anything is computed from the element: what cannot have the parameter may have no such value.
+        for element in elements:
+            kind.usable(model, element_id(model, kind.element, element), element)
     known, value = _known(entry, name)
     nominal = _nominal(entry, kind, elements, model, name) if value is None else value
     low, high = _range(entry, kind, scale, nominal, name, known=known)

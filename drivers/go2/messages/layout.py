@@ -18,7 +18,8 @@ LOW_COMMAND_BYTES: Final = 812
 LOW_STATE_BYTES: Final = 1180
 
 
-def _dtype(size: int, fields: Mapping[str, tuple[Any, int]]) -> np.dtype[np.void]:
+def packed(size: int, fields: Mapping[str, tuple[Any, int]]) -> np.dtype[np.void]:
+    """Return the layout of a message of so many bytes, each field with its kind and its first byte."""
     return np.dtype(
         {
             "names": list(fields),
@@ -39,12 +40,12 @@ _FRAME: Final = {
     "version": (("<u4", 2), 16),
     "bandwidth": ("<u2", 24),
 }
-_MOTOR_COMMAND: Final = _dtype(
+_MOTOR_COMMAND: Final = packed(
     36,
     {"q": ("<f4", 0), "dq": ("<f4", 4), "tau": ("<f4", 8), "kp": ("<f4", 12), "kd": ("<f4", 16),
      "reserve": (("<u4", 3), 20)},
 )  # fmt: skip
-LOW_COMMAND: Final = _dtype(
+LOW_COMMAND: Final = packed(
     LOW_COMMAND_BYTES,
     {
         **_FRAME,
@@ -63,13 +64,13 @@ LOW_COMMAND: Final = _dtype(
 COMMAND_MODE_AT: Final = np.array([26, *range(60, 60 + 36 * (SLOTS - 1), 36)])
 """Where each motor's mode byte is in a LowCmd, (20,)."""
 
-_MOTOR_STATE: Final = _dtype(
+_MOTOR_STATE: Final = packed(
     48,
     {"q": ("<f4", 0), "dq": ("<f4", 4), "ddq": ("<f4", 8), "tau_est": ("<f4", 12), "q_raw": ("<f4", 16),
      "dq_raw": ("<f4", 20), "ddq_raw": ("<f4", 24), "temperature": ("u1", 28), "lost": ("<u4", 32),
      "reserve": (("<u4", 2), 36)},
 )  # fmt: skip
-LOW_STATE: Final = _dtype(
+LOW_STATE: Final = packed(
     LOW_STATE_BYTES,
     {
         **_FRAME,

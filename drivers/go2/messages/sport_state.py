@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from deal_hw.drivers.go2.messages.layout import packed
 from deal_hw.drivers.go2.messages.wire import CDR_HEADER, FOOT
 from deal_hw.errors import FrameError
 from deal_hw.types import FloatArray, IntArray
@@ -43,21 +44,8 @@ _FIELDS: Final = {
     "foot_speed_body": (("<f4", (4, 3)), 188),
 }
 _PATH: Final = {"path_point": (("<f4", (POINTS, 7)), 236)}
-
-
-def _dtype(size: int, fields: dict[str, tuple[object, int]]) -> np.dtype[np.void]:
-    return np.dtype(
-        {
-            "names": list(fields),
-            "formats": [kind for kind, _ in fields.values()],
-            "offsets": [offset for _, offset in fields.values()],
-            "itemsize": size,
-        }
-    )
-
-
-SHORT: Final = _dtype(SHORT_BYTES, {**_FIELDS})
-LONG: Final = _dtype(LONG_BYTES, {**_FIELDS, **_PATH})
+SHORT: Final = packed(SHORT_BYTES, {**_FIELDS})
+LONG: Final = packed(LONG_BYTES, {**_FIELDS, **_PATH})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
