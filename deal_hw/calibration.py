@@ -233,7 +233,7 @@ class CalibrationResult:
             latency_s=number(values["latency_s"], "latency_s", 0.0, LONGEST_LATENCY_S),
             latency_interval_s=(float(low_s), float(high_s)),
             chi2=float(numbers(values["chi2"], "chi2", (), finite=False)),
-            alarms=tuple(from_values(list[Alarm], values["alarms"])),
+            alarms=tuple(from_values(dict[str, list[Alarm]], {"alarms": values["alarms"]})["alarms"]),
             advice=tuple(object_of(row, "advice") for row in values.get("advice", ())),
             heldout_nrmse={
                 name: float(numbers(value, "heldout_nrmse", (), finite=False))

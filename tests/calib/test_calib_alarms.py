@@ -6,11 +6,14 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import deal_hw.calib
 from deal_hw.calib.validation.diagnosis import LOOKS
-from deal_hw.calibration import Alarm, listed
+from deal_hw.calibration import Alarm, CalibrationResult, listed
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import Parameter, ParameterSpace
 
 ROOT = Path(deal_hw.calib.__file__).resolve().parents[1]
 
@@ -46,6 +49,24 @@ def test_an_empty_part_is_refused(parts: tuple[str, str, str]) -> None:
     """So what comes from elsewhere cannot lack one either."""
     with pytest.raises(ValueError, match="three parts"):
         Alarm(*parts)
+
+
+@pytest.mark.parametrize(
+    ("alarms", "message"),
+    [
+        ("x", "alarms is 'x'"),
+        (["x"], r"alarms\[0\] is 'x'"),
+        ([{"seen": "a", "do": "c"}], r"alarms\[0\]\.means"),
+    ],
+)
+def test_a_damaged_result_names_the_alarm(alarms: object, message: str) -> None:
+    """Of a file that somebody edited the field is named."""
+    space = ParameterSpace([Parameter.around("a", "mass", ["x"], "kg", 1.0)])
+    values = CalibrationResult(
+        method="m", space=space, estimate=space.nominal, interval=np.array([[0.5, 2.0]]), chi2=1.0
+    ).to_json()
+    with pytest.raises(ConfigurationError, match=message):
+        CalibrationResult.from_json({**values, "alarms": alarms})
 
 
 def test_causes_of_a_residual_have_all_parts() -> None:
