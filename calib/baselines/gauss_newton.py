@@ -54,6 +54,11 @@ class GaussNewtonSettings:
     restart_chi2: float = 3.0
 
 
+def members_of(problem: Problem, values: FloatArray) -> Members:
+    """Return parameters in their own scale with the latency, (N, K + 1), in physical units."""
+    return Members(problem.space.from_scale(values[:, :-1]), values[:, -1])
+
+
 class Innovations:
     """Window innovations, whitened around one simulator, of parameters in their own scale and the latency.
 
@@ -69,7 +74,7 @@ class Innovations:
 
     def __init__(self, problem: Problem, ticks: int, centre: FloatArray, *, follow: bool) -> None:
         self.problem, self.windows = problem, cut(problem, ticks)
-        around = self.members(centre[None])
+        around = members_of(problem, centre[None])
         self._whitenings = None
         if not problem.exact:
             self._whitenings = [linearise(problem, around, data) for data in self.windows]
@@ -84,13 +89,9 @@ class Innovations:
         self._expected = np.flatnonzero(np.isfinite(std))
         self._mean, self._std = problem.space.to_scale(mean)[self._expected], std[self._expected]
 
-    def members(self, values: FloatArray) -> Members:
-        """Return values, (N, K + 1), in physical units."""
-        return Members(self.problem.space.from_scale(values[:, :-1]), values[:, -1])
-
     def residuals(self, values: FloatArray) -> FloatArray:
         """Return the whitened residuals of values, (N, K + 1), in one batch: (N, M)."""
-        members = self.members(values)
+        members = members_of(self.problem, values)
         found = whitened_residual(self.problem, members, members, self.windows, whitenings=self._whitenings)
         off = (values[:, self._expected] - self._mean) / self._std
         return np.concatenate([found, off], axis=1)
@@ -174,43 +175,51 @@ class _MultiStart(Stepper):
         self._values, self._chi2 = pool[order], scores[order]
         self._drawn += len(values)
         self._note(f"{self._drawn} draws: best {math.sqrt(self._chi2[0]):.3g}", members)
-        if self._best[0] == math.inf:
-            self._best = (math.inf, self._values[0])
+        self._keep_best()
         share = max(budget.generations // settings.draw_share, 1)
         if self._drawn >= min(settings.draws, share * budget.population):
-            self._stage = 0
+            self._begin_stage(0)
+
+    def _begin_stage(self, stage: int) -> None:
+        self._stage, self._number = stage, 0
+        self._chi2 = np.full(len(self._values), np.inf)
 
     def _refine(self) -> None:
         settings, number = self.settings, self._number
         ticks, follow = self._ticks[self._stage], self._stage > 0
         value, chi2 = self._values[number], math.inf
+        fixed = self.problem.fixed_latency_s is not None
         for _ in range(settings.rounds):
-            innovations = Innovations(self.problem, ticks, value, follow=follow)
-            value, _ = minimise(
-                innovations,
-                value,
-                self._bounds,
-                settings.solver,
-                fixed_latency=self.problem.fixed_latency_s is not None,
-            )
+            try:
+                innovations = Innovations(self.problem, ticks, value, follow=follow)
+            except np.linalg.LinAlgError:
+                # Over windows of this length it diverges.
+                break
+            value, _ = minimise(innovations, value, self._bounds, settings.solver, fixed_latency=fixed)
             before, chi2 = chi2, float(np.mean(innovations.residual(value) ** 2))
             if not chi2 < before * (1 - settings.converged):
                 break
         self._values[number], self._chi2[number] = value, chi2 if math.isfinite(chi2) else math.inf
-        members = innovations.members(self._values)
+        self._keep_best()
         self._note(
-            f"windows of {ticks} ticks: start {number + 1} of {len(self._values)}, chi2 {chi2:.3g}", members
+            f"windows of {ticks} ticks: start {number + 1} of {len(self._values)}, chi2 {chi2:.3g}",
+            members_of(self.problem, self._values),
         )
         self._number += 1
-        last = self._stage == len(self._ticks) - 1
-        if (last or self._best[0] == math.inf) and chi2 <= self._best[0]:
-            self._best = (chi2 if last else math.inf, value)
         # Once a start explains everything there is nothing to wait for in the others.
         explained = chi2 <= settings.restart_chi2
         if explained or self._number == len(self._values):
-            self._end_stage(last, explained)
+            self._end_stage(explained)
 
-    def _end_stage(self, last: bool, explained: bool) -> None:
+    def _keep_best(self) -> None:
+        # Residuals over shorter windows, and scores of draws, do not compare with those of the last stage.
+        at = int(np.argmin(self._chi2))
+        chi2 = float(self._chi2[at]) if self._stage == len(self._ticks) - 1 else math.inf
+        if chi2 <= self._best[0]:
+            self._best = (chi2, self._values[at].copy())
+
+    def _end_stage(self, explained: bool) -> None:
+        last = self._stage == len(self._ticks) - 1
         if last and explained:
             self._explained = True
         elif last:
@@ -218,8 +227,8 @@ class _MultiStart(Stepper):
             self._begin_draws()
         else:
             order = np.argsort(self._chi2[: self._number], kind="stable")[: self.settings.survivors]
-            self._values, self._chi2 = self._values[order], self._chi2[order]
-            self._stage, self._number = self._stage + 1, 0
+            self._values = self._values[order]
+            self._begin_stage(self._stage + 1)
 
     def _note(self, message: str, members: Members) -> None:
         values = {"stage": float(self._stage), "chi2": float(np.min(self._chi2))}
@@ -243,8 +252,8 @@ class _MultiStart(Stepper):
             timing_std_s=problem.noise.timing_std_s,
         )
         return self.log.result(
-            innovations.members(value[None]),
-            innovations.members(self._values if len(self._values) else value[None]),
+            members_of(problem, value[None]),
+            members_of(problem, self._values if len(self._values) else value[None]),
             chi2=chi2,
             alarms=known.alarms,
             extra={"restarts": self._restarts, "interval": "90 %, from the normal equations"},
