@@ -123,6 +123,12 @@ class Fits(abc.ABC):
         """Search, fit, choose, and say what is known."""
 
 
+DIVERGED = (
+    "simulations diverge at the model's own values, so the search begins without them; check those values, "
+    "or shorten the physics step (--physics-step)"
+)
+
+
 class Calibration(CalibrationMethod[Problem]):
     """A calibration in stages, ordered by what they cost.
 
@@ -173,6 +179,8 @@ class Calibration(CalibrationMethod[Problem]):
         )
         if local is not None:
             run.offer("local fit", local)
+        elif self.settings.local_first:
+            run.say(BEFORE_SEARCH, DIVERGED)
         if local is not None and conclusive(problem, local):
             found = to_the_noise(run, without_search(problem, budget, local), local)
         else:
@@ -342,7 +350,7 @@ def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> N
     if blind and not words:
         words = [f"nothing is seen of {', '.join(blind)}"]
     if words:
-        progress(Progress(BEFORE_SEARCH, 1, 1, "; ".join(words)))
+        progress(Progress(BEFORE_SEARCH, 1, 1, f"the data cannot tell: {'; '.join(words)}"))
 
 
 def conclusive(problem: Problem, fit: Polished) -> bool:

@@ -131,6 +131,10 @@ class Whitening:
         return np.asarray(np.clip(found, -limit, limit))
 
 
+_MOST_SPREAD = 1e6
+"""What start states leave uncertain counts up to so many times the noise [-]; a factorisation bears 1e7."""
+
+
 def linearise(
     problem: Problem, centre: Members, data: WindowData, offset: FloatArray | None = None
 ) -> Whitening:
@@ -157,15 +161,20 @@ def linearise(
         state[2 + 2 * s, :, c] -= 0.5 * std[s]
     members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
     predicted = predict(problem, members, data, position, velocity).observed
-    predicted = np.where(np.isfinite(predicted), predicted, predicted[:1])
+    # A window in which the centre diverges says nothing of its start state: the recording stands in for it.
+    reference = np.where(np.isfinite(predicted[0]), predicted[0], data.measured)
+    predicted = np.where(np.isfinite(predicted), predicted, reference)
     flat = predicted.reshape(count, W, -1)
     root = np.moveaxis(flat[1::2] - flat[2::2], 0, -1)
+    noise = data.std.reshape(W, -1)
+    # Where predictions nearly diverge the noise would vanish beside them in double precision.
+    most = np.abs(root).max(axis=(1, 2)) / noise.min(axis=1)
+    root = root / np.maximum(most / _MOST_SPREAD, 1.0)[:, None, None]
     sigma = root @ np.swapaxes(root, 1, 2)
-    noise = data.std.reshape(W, -1) ** 2
     diagonal = np.arange(noise.shape[1])
-    sigma[:, diagonal, diagonal] += noise
+    sigma[:, diagonal, diagonal] += noise**2
     factor = np.linalg.inv(np.linalg.cholesky(sigma))
-    return Whitening(predicted[0], factor, root, std, around)
+    return Whitening(reference, factor, root, std, around)
 
 
 def whitened_residual(

@@ -100,7 +100,9 @@ def minimise(
     def jacobian(step: FloatArray) -> FloatArray:
         nonlocal used
         used += 1
-        return np.concatenate([fit.jacobian(at(step))[:, free] * unit[free], hold * np.eye(len(step))])
+        # Next to parameters whose simulation diverges a difference may not be finite: it shows no way.
+        rows = np.nan_to_num(fit.jacobian(at(step))[:, free] * unit[free], nan=0.0, posinf=0.0, neginf=0.0)
+        return np.concatenate([rows, hold * np.eye(len(step))])
 
     # The trust region begins with radius 1 because the start is at 0. A rectangular one (dogbox) follows
     # parameters that end at their bound without slowing down before it, as an interior method does.

@@ -202,7 +202,7 @@ def calibrate_episodes(
             report(p)
             best(p)
             if p.stage == BEFORE_SEARCH and not quiet:
-                print(f"{BEFORE_SEARCH}: the data cannot tell: {p.message}", file=sys.stderr)
+                print(f"{BEFORE_SEARCH}: {p.message}", file=sys.stderr)
             if watch is not None:
                 watch(p)
 
@@ -452,6 +452,11 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for alarm in result.alarms:
         console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
         console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
+    step = result.provenance.get("physics_step", {})
+    if "note" in step:
+        console.print(
+            f"physics step of {1e3 * step['step_s']:g} ms, whether it is fine enough: {step['note']}"
+        )
     if not result.heldout_nrmse:
         console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
         return
