@@ -182,7 +182,10 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
     low, high = problem.latency_range_s
     weak = 12.0 / (SETTINGS.wide * np.append(space.width, high - low)) ** 2
     precision = information + np.diag(weak)
-    kinds = {kind: [k for k, p in enumerate(space) if p.kind == kind] for kind in {p.kind for p in space}}
+    kinds = {
+        kind: [k for k, p in enumerate(space) if p.kind == kind]
+        for kind in dict.fromkeys(p.kind for p in space)
+    }
     if problem.fixed_latency_s is None:
         kinds[LATENCY] = [len(space)]
     # Latency first, so that a pair with it is said from its side.
