@@ -275,7 +275,7 @@ def open_loop(search: CalibrationMethod[Problem] | None = None) -> Calibration:
     """Return `open-loop`: output-error fits by cross-validation, after the local fit and a search.
 
     Args:
-        search: The search; `weki` by default.
+        search: The search; `eki` by default.
     """
     return Calibration(search or Eki(), "open-loop", fits=OutputErrorFits())
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 import tyro
 
 from deal_hw.cli.emulate_common import (
-    cut_on_signal,
     happenings,
     read_truth,
     realtime_priority,
     reveal,
     run_until,
-    stop_on_signals,
+    signalled,
 )
 from deal_hw.cli.emulate_go2 import emulate_go2
 from deal_hw.cli.emulate_settings import CARTPOLE_XI, Emulate
@@ -30,8 +30,13 @@ def emulate(config: Emulate) -> int:
 
     The first line on standard output is ``port PATH``.
     """
-    if config.robot == "go2":
-        return emulate_go2(config)
+    with signalled() as (stop, cut):
+        if config.robot == "go2":
+            return emulate_go2(config, stop, cut)
+        return _emulate_cartpole(config, stop, cut)
+
+
+def _emulate_cartpole(config: Emulate, stop: threading.Event, cut: threading.Event) -> int:
     try:
         from deal_hw.drivers.cartpole.device import CartpoleDevice
         from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
@@ -39,7 +44,6 @@ def emulate(config: Emulate) -> int:
         if error.name in ("mujoco", "scipy"):
             raise MissingExtraError(error.name, "sim") from error
         raise
-    stop, cut = stop_on_signals(), cut_on_signal()
     truth = _truth(config)
     emulator = CartpoleEmulator(CartpoleDevice(truth), link=config.link, hazards=_hazards(config))
     try:

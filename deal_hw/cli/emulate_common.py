@@ -23,21 +23,22 @@ _FIFO_PRIORITY = 40
 """Below that of a control process: the host must not wait for the emulator."""
 
 
-def stop_on_signals() -> threading.Event:
-    """Return an event that SIGINT and SIGTERM set."""
-    stop = threading.Event()
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-    return stop
+@contextlib.contextmanager
+def signalled() -> Iterator[tuple[threading.Event, threading.Event]]:
+    """Yield an event that SIGINT and SIGTERM set, and one that SIGUSR1 sets: the wire is to be cut now.
 
-
-def cut_on_signal() -> threading.Event:
-    """Return an event that SIGUSR1 sets: the wire is to be cut now."""
-    cut = threading.Event()
+    A Python program that emulates has its own handlers back afterwards.
+    """
+    stop, cut = threading.Event(), threading.Event()
+    before = {}
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGUSR1, lambda *_: cut.set())
-    return cut
+        for number, event in ((signal.SIGINT, stop), (signal.SIGTERM, stop), (signal.SIGUSR1, cut)):
+            before[number] = signal.signal(number, lambda *_, event=event: event.set())
+    try:
+        yield stop, cut
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

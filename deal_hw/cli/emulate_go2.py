@@ -6,17 +6,16 @@ import gc
 import re
 import socket
 import sys
+import threading
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.cli.emulate_common import (
-    cut_on_signal,
     happenings,
     read_truth,
     realtime_priority,
     reveal,
     run_until,
-    stop_on_signals,
 )
 from deal_hw.cli.emulate_settings import DEFAULT_PORTS, Emulate
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
@@ -45,10 +44,15 @@ def make_transport(name: str, port: str, options: WireOptions) -> TopicTransport
     return drivers.make_topic_transport(name, port, MonotonicClock(), options)
 
 
-def emulate_go2(config: Emulate) -> int:
-    """Run the emulator until a signal or the time given; return the exit status.
+def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) -> int:
+    """Run the emulator until it is stopped or the time given; return the exit status.
 
     The first line on standard output is ``port PORT``.
+
+    Args:
+        config: What to emulate.
+        stop: Ends it.
+        cut: Cuts the wire.
     """
     try:
         from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
@@ -56,7 +60,6 @@ def emulate_go2(config: Emulate) -> int:
         if error.name == "mujoco":
             raise MissingExtraError(error.name, "sim") from error
         raise
-    stop, cut = stop_on_signals(), cut_on_signal()
     truth = _truth(config)
     device = _device(config, truth)
     transport = config.transport or "dds"

@@ -15,12 +15,12 @@ from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameErr
 from deal_hw.sim.recordings.sysid_adapter import require_sysid
 from deal_hw.testing.plain_robots import PlainRobot, write
 
-SHORT = FirstAnswerSettings(window_s=0.8, sysid_window_s=0.8, sysid_iterations=10, seconds=2.0)
+SHORT = FirstAnswerSettings(window_s=0.8, sysid_window_s=0.8, sysid_iterations=10, seconds=2.5)
 
 
 @pytest.mark.slow
 def test_both_answer_on_the_double_pendulum() -> None:
-    """Recordings of 2 s: both end near the noise, the first answer not after the end, and the row says so."""
+    """Both end near the noise, the first answer not after the end, and the row says so."""
     try:
         require_sysid()
     except MissingExtraError as error:
