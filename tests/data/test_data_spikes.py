@@ -55,6 +55,11 @@ def test_what_a_spike_is(values: dict[int, float], expected: list[tuple[int, ...
     assert rows(changed(values)) == expected
 
 
+def test_a_unit_that_is_none_is_left_alone() -> None:
+    """A damaged recording may name any unit: no threshold is known for it, and nothing is raised."""
+    assert rows(changed({50: 3.0}), unit="-") == []
+
+
 def test_threshold_is_the_fastest_motion_times_the_ratio() -> None:
     """A joint moves 0.02 rad a sample, so 0.1 rad is five times that: 0.105 is a spike, 0.095 is not.
 

@@ -80,7 +80,8 @@ def find_spikes(
     Args:
         time_s: Stamps, (T,) [s]. Samples with the stamp of the one before are not looked at.
         position: Measured positions, (T, J); samples with one that is not finite are not looked at.
-        units: "rad" or "m" of each joint, (J,).
+        units: "rad" or "m" of each joint, (J,); joints of a damaged recording with another unit are not
+            looked at.
         settings: What counts.
     """
     rows = np.flatnonzero(np.isfinite(time_s) & np.isfinite(position).all(axis=1))
@@ -90,6 +91,7 @@ def find_spikes(
     found = [
         Spike(tuple(int(rows[k]) for k in one.rows), joint, one.size)
         for joint, unit in enumerate(units)
+        if unit in settings.least
         for one in _of_joint(time_s[rows], position[rows, joint], unit, settings)
     ]
     return tuple(sorted(found, key=lambda spike: (spike.rows, spike.joint)))
