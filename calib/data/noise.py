@@ -13,7 +13,7 @@ from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
-_MAD_TO_STD = 1.4826022185056018
+MAD_TO_STD = 1.4826022185056018
 """Of a normal distribution: standard deviation over median absolute deviation."""
 
 
@@ -115,7 +115,7 @@ def white_noise_std(values: FloatArray, settings: DataSettings = SETTINGS) -> Fl
 
 def _spread(difference: FloatArray, order: int) -> FloatArray:
     centred = np.abs(difference - np.median(difference, axis=0))
-    return np.asarray(_MAD_TO_STD * np.median(centred, axis=0) / math.sqrt(math.comb(2 * order, order)))
+    return np.asarray(MAD_TO_STD * np.median(centred, axis=0) / math.sqrt(math.comb(2 * order, order)))
 
 
 def noise_model(

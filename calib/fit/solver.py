@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import least_squares
 
+from deal_hw.calib.data.noise import MAD_TO_STD
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
@@ -208,10 +209,6 @@ class _Following:
         if self._normal is None or point is not self._here:
             self._normal, self._here = self._shooting.normal(point, keep=True), point
         return self._normal
-
-
-MAD_TO_STD = 1.4826022185056018
-"""Standard deviation of normal noise over the median of its absolute values."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -195,15 +195,18 @@ class _Table:
 
 
 def _methods(config: Bench, default: Sequence[str]) -> tuple[str, ...]:
-    return tuple(m.strip() for m in config.methods.split(",") if m.strip()) or tuple(default)
+    return _names(config.methods) or tuple(default)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _first_answer(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import first_answer
 
-    problems = [name.strip() for name in config.problems.split(",") if name.strip()]
     cells = first_answer.cells(
-        problems or tuple(first_answer.PROBLEMS), parse_seeds(config.seeds), real=config.real,
+        _names(config.problems) or tuple(first_answer.PROBLEMS), parse_seeds(config.seeds), real=config.real,
         budget=_budget(config), threads=config.threads,
     )  # fmt: skip
     return _Table(
