@@ -84,7 +84,12 @@ class Go2Options:
         ]
 
 
-TRANSPORTS = {"cartpole": ("serial",), "go2": tuple(DEFAULT_PORTS)}
+CARTPOLE_EMULATORS = {
+    "serial": "deal_hw.drivers.cartpole.emulator:serial_emulator",
+}
+"""Wires of the cart-pole -> "module:function"; the function is called as
+``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
+TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
 """Robots to emulate and the wires that each speaks on; the first is the default."""
 CARTPOLE_XI = 5.0
 
@@ -97,7 +102,8 @@ class Emulate:
     """The robot to emulate."""
 
     transport: str | None = None
-    """The wire to speak on. Cart-pole: "serial", a pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
+    """The wire to speak on. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a
+    pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
 
     port: str | None = None
     """Go2: network interface or its address (dds), or end point to listen at (zenoh; number 0: a free

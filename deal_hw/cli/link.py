@@ -45,7 +45,8 @@ class LinkOptions:
     """How the robot is reached, beyond the port."""
 
     transport: str = ""
-    """How the robot is reached: serial, dds or zenoh; by default the robot's usual way."""
+    """How the robot is reached. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the
+    default) or zenoh."""
 
     state_check: Literal["strict", "length"] = "strict"
     """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or

@@ -12,6 +12,7 @@ from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
 
@@ -219,6 +220,11 @@ class CartpoleEmulator:
             self.dropped += 1
             return
         self._unsent = data[written:]
+
+
+def serial_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
+    """Return an emulated cart-pole with a serial port."""
+    return CartpoleEmulator(CartpoleDevice(truth), link, hazards)
 
 
 def _passed(limit_s: float | None, time_s: float) -> bool:
