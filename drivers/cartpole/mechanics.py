@@ -47,17 +47,19 @@ class Mechanics:
     Args:
         truth: Hidden parameters, latency, profile and seed.
         start_angle_rad: Where the hand sets the pole [rad]; None: within +-0.03 rad, by the seed.
+        read_rate_hz: How often :meth:`read` is called.
     """
 
-    def __init__(self, truth: Truth, *, start_angle_rad: float | None = None) -> None:
+    def __init__(
+        self, truth: Truth, *, start_angle_rad: float | None = None,
+        read_rate_hz: float = DESCRIPTION.state_rate_hz,
+    ) -> None:  # fmt: skip
         self.homing = self.held = False
         self._profile = find_profile(truth.profile)
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0xCA47]).spawn(4)]
         self._hand_rng, sensor_rng, self._jitter_rng, self._drop_rng = streams
         self._sim = build_simulation(truth.parameters)
-        self._sensor = Sensor(
-            self._profile, truth.sensing_ticks, round(DESCRIPTION.state_rate_hz), sensor_rng
-        )
+        self._sensor = Sensor(self._profile, truth.sensing_ticks, round(read_rate_hz), sensor_rng)
         self._actuation_ticks = truth.actuation_ticks
         self._friction_n = truth.parameters["cart.frictionloss"]
         self._start_angle_rad = start_angle_rad

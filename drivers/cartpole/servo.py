@@ -22,14 +22,16 @@ class Servo:
     Args:
         parameters: What the servo parameters of the description's default command really are, by name.
         period_s: Control period [s].
+        reach_m: No target outside plus or minus this is accepted [m].
     """
 
-    def __init__(self, parameters: Mapping[str, float], period_s: float) -> None:
+    def __init__(self, parameters: Mapping[str, float], period_s: float, reach_m: float = RAIL_M) -> None:
         self._stiffness_factor = parameters["servo.stiffness"] / STIFFNESS_N_M
         self._damping_factor = parameters["servo.damping"] / DAMPING_NS_M
         self._effort_factor = parameters["servo.effort_limit"] / EFFORT_LIMIT_N
         self._speed_factor = parameters["servo.speed_limit"] / SPEED_LIMIT_M_S
         self._period_s = period_s
+        self._reach_m = reach_m
         self.setpoint = 0.0
         self.reset(0.0)
 
@@ -42,7 +44,7 @@ class Servo:
 
     def accept(self, target: Target) -> None:
         """Let a target act from now on."""
-        self._target = min(max(target.position_um / 1e6, -RAIL_M), RAIL_M)
+        self._target = min(max(target.position_um / 1e6, -self._reach_m), self._reach_m)
         self._sent_stiffness = target.stiffness_mn_m / 1e3
         self._sent_damping = target.damping_mns_m / 1e3
         self._sent_limit = target.effort_limit_mn / 1e3

@@ -1,1 +1,1 @@
-"""The cart-pole on two Dynamixel X-series servos: one drives the belt, one with its torque off reads the pole."""
+"""The cart-pole on two Dynamixel X-series servos: one drives the belt, one without torque reads the pole."""

@@ -1,7 +1,7 @@
 """The part of the X-series control table that driver and emulator use.
 
-Source: ROBOTIS e-Manual, control tables of XL330-M077-T and the other X models, which agree in these addresses
-(``dynamixel_easy_sdk`` carries the same tables; a test compares).
+Source: ROBOTIS e-Manual, control tables of XL330-M077-T and the other X models, which agree in these
+addresses (``dynamixel_easy_sdk`` carries the same tables; a test compares).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ RETURN_DELAY_TIME = Register(9, 1, "Return Delay Time")
 DRIVE_MODE = Register(10, 1, "Drive Mode")
 OPERATING_MODE = Register(11, 1, "Operating Mode")
 PROTOCOL_TYPE = Register(13, 1, "Protocol Type")
+PWM_LIMIT = Register(36, 2, "PWM Limit")
 CURRENT_LIMIT = Register(38, 2, "Current Limit")
 TORQUE_ENABLE = Register(64, 1, "Torque Enable")
 LED = Register(65, 1, "LED")

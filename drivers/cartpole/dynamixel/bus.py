@@ -1,0 +1,345 @@
+"""Dynamixel packets over a byte stream: ROBOTIS' SDK makes and reads them, our transport carries them.
+
+The SDK's own port waits in a busy loop on the wall clock, and 34 ms for a servo that is absent. Here its
+packet handler is given a port of ours: waiting is done in the transport, against a monotonic clock, and an
+answer has its time on the wire plus an allowance. A group's answer is taken without blocking: bytes are
+collected as they come, and the SDK sees them once the last packet is whole.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.cartpole.dynamixel.registers import Register
+from deal_hw.errors import FrameError, ProtocolError, TransportTimeoutError
+from deal_hw.transport import Message, Transport
+
+HEADER: Final = b"\xff\xff\xfd\x00"
+_BROADCAST: Final = 0xFE
+_SYNC_READ, _FAST_SYNC_READ, _STATUS = 0x82, 0x8A, 0x55
+_STATUS_BYTES = 11
+"""A status packet without data: header 4, id, length 2, instruction, error, CRC 2."""
+_BITS_PER_BYTE = 10
+_QUEUE = 4096
+_ALERT = 0x80
+
+
+class Answer(NamedTuple):
+    """A servo's answer to a ping."""
+
+    model: int
+    firmware: int
+
+
+class _Port:
+    """What the SDK's packet handler needs of a port."""
+
+    is_using = property(lambda self: False, lambda self, value: None)
+    """The SDK's lock stays taken where a read raises; this bus has one user."""
+
+    def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
+        self.baud_rate, self.answer_s = baud_rate, answer_s
+        self.wire: deque[Message] = deque(maxlen=_QUEUE)
+        self.buffer = bytearray()
+        self.written = bytearray()
+        self.heard = self.stamp_ns = 0
+        self._transport, self._clock = transport, clock
+        self._deadline_ns = 0
+
+    # The names below are the SDK's.
+
+    def clearPort(self) -> None:  # noqa: N802
+        """Leave what came: :meth:`drop` forgets it where a new answer is asked for."""
+
+    def getBaudRate(self) -> int:  # noqa: N802
+        """Return the bits per second."""
+        return self.baud_rate
+
+    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
+        """Keep a packet until :meth:`flush`."""
+        self.written += bytes(packet)
+        return len(packet)
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Return up to that many bytes, waiting for the first until the deadline."""
+        self.flush()
+        if not self.buffer and length > 0:
+            self.receive(self._deadline_ns)
+        # A corrupt length field makes the SDK ask for fewer than none.
+        length = max(length, 0)
+        taken = bytes(self.buffer[:length])
+        del self.buffer[:length]
+        return taken
+
+    def setPacketTimeout(self, length: int) -> None:  # noqa: N802
+        """Begin to wait for an answer of that many bytes."""
+        self._deadline_ns = self._clock.now_ns() + self.answer_ns(length)
+
+    def setPacketTimeoutMillis(self, milliseconds: float) -> None:  # noqa: N802
+        """Begin to wait so long."""
+        self._deadline_ns = self._clock.now_ns() + round(milliseconds * 1e6)
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        """Say whether nothing more may come: the time is over, and what came is read."""
+        return not self.buffer and self._clock.now_ns() >= self._deadline_ns
+
+    # What the bus adds.
+
+    def answer_ns(self, length: int) -> int:
+        """Return how long an answer of that many bytes may take [ns]."""
+        return round((length * _BITS_PER_BYTE / self.baud_rate + self.answer_s) * 1e9)
+
+    def expire(self) -> None:
+        """Wait no longer: the SDK reads what is in the buffer."""
+        self._deadline_ns = 0
+
+    def flush(self) -> None:
+        """Send what was written as one message."""
+        if self.written:
+            data, self.written = bytes(self.written), bytearray()
+            message = Message("tx", data, self._clock.now_ns())
+            self._transport.send(Message("", data, message.stamp_ns))
+            self.wire.append(message)
+
+    def receive(self, deadline_ns: int) -> bool:
+        """Wait for bytes; return whether some came."""
+        try:
+            message = self._transport.receive(max(0, deadline_ns - self._clock.now_ns()) / 1e9)
+        except TransportTimeoutError:
+            return False
+        self.buffer += message.payload
+        self.heard += len(message.payload)
+        self.stamp_ns = message.stamp_ns
+        self.wire.append(Message("rx", message.payload, message.stamp_ns))
+        return True
+
+    def drop(self) -> None:
+        """Forget what came too late for the answer before."""
+        while self.receive(0):
+            pass
+        self.buffer.clear()
+
+
+class Bus:
+    """Reads and writes servos' registers.
+
+    Attributes:
+        errors: Answers that were corrupt or stayed away so far.
+        heard: Bytes that came so far, whatever they were.
+
+    Args:
+        transport: A byte stream, open.
+        clock: The clock of its stamps.
+        baud_rate: Of the bus, for the time that bytes take.
+        answer_s: What an answer may take beyond that [s].
+    """
+
+    def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
+        self.errors = 0
+        self._clock = clock
+        self._port = _Port(transport, clock, baud_rate, answer_s)
+        self._sdk: Any = PacketHandler(2.0)
+        self._ids: tuple[int, ...] = ()
+        self._size = 0
+        self._fast = False
+        self._until_ns = 0
+
+    @property
+    def heard(self) -> int:
+        """Bytes that came so far, whatever they were."""
+        return self._port.heard
+
+    @property
+    def stamp_ns(self) -> int:
+        """When the newest bytes came [ns]."""
+        return self._port.stamp_ns
+
+    @property
+    def wire(self) -> deque[Message]:
+        """Messages sent and received; the newest few thousand."""
+        return self._port.wire
+
+    def ping(self, servo: int) -> Answer:
+        """Return model and firmware of a servo.
+
+        Raises:
+            TransportTimeoutError: It is silent.
+            FrameError: Its answer is corrupt.
+        """
+        self._port.drop()
+        packet = [0, 0, 0, 0, servo, 3, 0, 1, 0, 0]
+        answer, result, _ = self._sdk.txRxPacket(self._port, packet)
+        self._check(servo, result)
+        # Error, model (2), firmware.
+        return Answer(answer[9] | answer[10] << 8, answer[11])
+
+    def ping_protocol_1(self, servo: int) -> bool:
+        """Say whether a servo answers in the older protocol 1.0."""
+        self._port.drop()
+        _, result, _ = PacketHandler(1.0).ping(self._port, servo)
+        return bool(result == COMM_SUCCESS)
+
+    def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
+        """Return all servos that answer a ping to everybody within a time [s]."""
+        self._port.drop()
+        self._sdk.txPacket(self._port, [0, 0, 0, 0, _BROADCAST, 3, 0, 1, 0, 0])
+        self._port.flush()
+        self._port.setPacketTimeoutMillis(1e3 * seconds)
+        found: dict[int, Answer] = {}
+        while not self._port.isPacketTimeout():
+            # One packet after the other: the SDK's own waits for all 252 servos, 1.3 s.
+            packet, result = self._sdk.rxPacket(self._port, False)
+            if result == COMM_SUCCESS and len(packet) >= 14:
+                found[packet[4]] = Answer(packet[9] | packet[10] << 8, packet[11])
+            elif result != COMM_SUCCESS and packet:
+                self.errors += 1
+        return found
+
+    def read(self, servo: int, register: Register) -> int:
+        """Return a register, without sign; raises as :meth:`ping`."""
+        self._port.drop()
+        data, result, _ = self._sdk.readTxRx(self._port, servo, register.address, register.size)
+        self._check(servo, result, len(data) == register.size)
+        return int.from_bytes(bytes(data), "little")
+
+    def write(self, servo: int, register: Register, value: int) -> None:
+        """Write a register and wait for the servo's word that it did; raises as :meth:`ping`.
+
+        Raises:
+            ProtocolError: The servo refuses the value.
+        """
+        self._port.drop()
+        data = list((value % (1 << 8 * register.size)).to_bytes(register.size, "little"))
+        result, error = self._sdk.writeTxRx(self._port, servo, register.address, register.size, data)
+        self._check(servo, result)
+        if error & ~_ALERT:
+            said = self._sdk.getRxPacketError(error & ~_ALERT).removeprefix("[RxPacketError] ")
+            raise ProtocolError(
+                f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {said}"
+            )
+
+    def reboot(self, servo: int) -> None:
+        """Restart a servo, which also clears its hardware errors; raises as :meth:`ping`."""
+        self._port.drop()
+        result, _ = self._sdk.reboot(self._port, servo)
+        self._check(servo, result)
+
+    def post(self, writes: Sequence[tuple[int, Mapping[int, bytes]]]) -> int:
+        """Write registers in one message and wait for nothing; return when it went [ns].
+
+        Args:
+            writes: Sync writes, in order: an address, and the bytes that each servo gets there.
+        """
+        for address, values in writes:
+            size = len(next(iter(values.values())))
+            params = [byte for servo, data in values.items() for byte in (servo, *data)]
+            self._sdk.syncWriteTxOnly(self._port, address, size, params, len(params))
+        now_ns = self._clock.now_ns()
+        self._port.flush()
+        return now_ns
+
+    def ask(self, servos: Sequence[int], address: int, size: int, *, fast: bool) -> int:
+        """Ask servos for the same registers, in one message; return when it went [ns].
+
+        Args:
+            servos: Their ids.
+            address: The first register.
+            size: How many bytes of each.
+            fast: Whether they answer in one packet (Fast Sync Read) or each in its own.
+        """
+        self._port.drop()
+        self._ids, self._size, self._fast = tuple(servos), size, fast
+        self._sdk.syncReadTx(self._port, address, size, list(servos), len(servos), fast)
+        now_ns = self._clock.now_ns()
+        self._port.flush()
+        self._until_ns = now_ns + self._port.answer_ns(self.answer_bytes(len(servos), size, fast) + 16)
+        return now_ns
+
+    @staticmethod
+    def answer_bytes(servos: int, size: int, fast: bool) -> int:
+        """Return how many bytes a group's answer has."""
+        return 8 + servos * (size + 4) if fast else servos * (size + _STATUS_BYTES)
+
+    def take(self, deadline_ns: int) -> dict[int, bytes] | None:
+        """Return the group's registers by id, waiting for them until a deadline at most.
+
+        Returns:
+            None: nothing whole came until the deadline, but still may.
+
+        Raises:
+            TransportTimeoutError: The servos are silent.
+            FrameError: The answer is corrupt.
+        """
+        while not self._whole():
+            if self._clock.now_ns() >= self._until_ns:
+                self.errors += 1
+                if self._port.buffer:
+                    raise FrameError(f"the answer of servos {self._ids} is corrupt or incomplete")
+                raise TransportTimeoutError(f"servos {self._ids} do not answer")
+            if not self._port.receive(min(deadline_ns, self._until_ns)) and (
+                self._clock.now_ns() >= deadline_ns
+            ):
+                return None
+        self._port.expire()
+        try:
+            found = self._fast_answer() if self._fast else self._answers()
+        except (IndexError, FrameError) as error:
+            self.errors += 1
+            raise FrameError(f"the answer of servos {self._ids} is corrupt") from error
+        return found
+
+    def _whole(self) -> bool:
+        """Say whether the buffer holds as many packets as were asked for; the SDK judges what is in them."""
+        at, wanted = 0, 1 if self._fast else len(self._ids)
+        while wanted:
+            at = self._port.buffer.find(HEADER, at)
+            if at < 0 or len(self._port.buffer) < at + 7:
+                return False
+            at += 7 + int.from_bytes(self._port.buffer[at + 5 : at + 7], "little")
+            if len(self._port.buffer) < at:
+                return False
+            wanted -= 1
+        return True
+
+    def _fast_answer(self) -> dict[int, bytes]:
+        packet, result = self._sdk.rxPacket(self._port, True)
+        if result != COMM_SUCCESS or packet[4] != _BROADCAST or packet[7] != _STATUS:
+            raise FrameError("no sound packet")
+        if len(packet) > self.answer_bytes(len(self._ids), self._size, True):
+            # The SDK takes such answers as unstuffed; a servo that stuffs them is known by the length.
+            packet = self._sdk.removeStuffing(packet)
+        found = {}
+        for k, servo in enumerate(self._ids):
+            at = 8 + k * (self._size + 4)
+            if packet[at + 1] != servo:
+                raise FrameError("another servo's answer")
+            found[servo] = bytes(packet[at + 2 : at + 2 + self._size])
+        return self._sized(found)
+
+    def _answers(self) -> dict[int, bytes]:
+        found = {}
+        for servo in self._ids:
+            packet, result = self._sdk.rxPacket(self._port, False)
+            if result != COMM_SUCCESS or packet[4] != servo:
+                raise FrameError("no sound packet")
+            found[servo] = bytes(packet[9 : 9 + self._size])
+        return self._sized(found)
+
+    def _sized(self, found: dict[int, bytes]) -> dict[int, bytes]:
+        if any(len(data) != self._size for data in found.values()):
+            raise FrameError("too short")
+        return found
+
+    def _check(self, servo: int, result: int, whole: bool = True) -> None:
+        if result == COMM_SUCCESS and whole:
+            return
+        self.errors += 1
+        said = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ")
+        if "no status packet" in said:
+            raise TransportTimeoutError(f"servo {servo} does not answer")
+        raise FrameError(f"servo {servo}: {said or 'a short answer'}")

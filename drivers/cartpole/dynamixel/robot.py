@@ -1,0 +1,426 @@
+"""The cart-pole on two Dynamixel servos: the belt's follows targets, the pole's is an encoder."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.dynamixel.bus import Bus
+from deal_hw.drivers.cartpole.dynamixel.examine import DynamixelInfo, Examination
+from deal_hw.drivers.cartpole.dynamixel.homing import Homing
+from deal_hw.drivers.cartpole.dynamixel.registers import (
+    PROFILE_ONGOING,
+    RAD_S_PER_COUNT,
+    WATCHDOG_TRIPPED,
+    Block,
+    explain_hardware_error,
+)
+from deal_hw.drivers.cartpole.dynamixel.samples import SampleGrid, TickClock
+from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
+from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
+from deal_hw.robot import Robot
+from deal_hw.schema import from_values
+from deal_hw.transport import Message, Transport
+from deal_hw.types import JointCommand, RobotState, Status
+
+_QUEUE = 4096
+_MISSES = 3
+"""Samples in a row without answer before the servos are asked one by one, and before one is absent."""
+_AFTER_COMMAND_NS = 1_000_000
+_COMMANDS = 64
+_FIRST_ROUND_TRIP_NS = 2_000_000
+_CLEAR_NS = 500_000_000
+_AT_STOP_M = 0.001
+
+
+def _hardware_error(servo: int, block: Block) -> str:
+    return (
+        f"servo {servo} reports: {explain_hardware_error(block.hardware_error)}; it gives no torque until it "
+        "is switched off and on, or restarted with Dynamixel Wizard"
+    )
+
+
+class _Sent(NamedTuple):
+    """A command that went out."""
+
+    sequence: int
+    sent_ns: int
+    goal: Goal
+
+
+class DynamixelCartpole(Robot):
+    """A cart-pole on two X-series servos (docs/dynamixel.md).
+
+    Servos say nothing unless asked, so :meth:`read_state` asks them, ``state_rate_hz`` times a second,
+    beginning 1 ms after each command's time: question, answer and command do not meet on the half-duplex
+    wire. A state needs both servos. What the belt servo was told comes back with every sample: a command
+    counts as in force once the servo shows it.
+
+    There are two watchdogs: the belt servo's own (Bus Watchdog) stops it when this computer falls silent, and
+    the driver switches the torque off when states are read but commands stay away.
+
+    Attributes:
+        info: What was found on the bus; None before ``connect``.
+
+    Args:
+        transport: A byte stream at the servos' baud rate.
+        clock: The clock of the transport's stamps.
+        settings: Wiring and gearing, as plain values or made.
+    """
+
+    description: ClassVar[RobotDescription] = DESCRIPTION
+    watchdog_s: ClassVar[float] = WATCHDOG_S
+
+    def __init__(
+        self,
+        transport: Transport,
+        clock: Clock,
+        settings: DynamixelSettings | Mapping[str, Any] | None = None,
+    ) -> None:
+        if settings is None or isinstance(settings, Mapping):
+            settings = from_values(DynamixelSettings, dict(settings or {}))
+        self.settings = settings
+        self.info: DynamixelInfo | None = None
+        self._transport, self._clock = transport, clock
+        self._period_ns = round(1e9 / self.description.state_rate_hz)
+        self._servos = (settings.cart_id, settings.pole_id)
+        self._turns = dict.fromkeys(self._servos, 0)
+        self._bus = Bus(transport, clock, settings.baud_rate, settings.answer_s)
+        self.servos = Servos(self._bus, clock, settings)
+        self._forget()
+
+    def _forget(self) -> None:
+        servos = (self.settings.cart_id, self.settings.pole_id)
+        self._ticks = {servo: TickClock() for servo in servos}
+        self._grid = SampleGrid(round(self._period_ns / 1e6))
+        self._states: deque[RobotState] = deque(maxlen=_QUEUE)
+        self._sent: deque[_Sent] = deque(maxlen=_COMMANDS)
+        self._in_force: tuple[int, int] | None = None
+        self._written: Goal | None = None
+        self._sequence = self._missed_command = -1
+        self._next_ns = self._asked_ns = self._alive_ns = 0
+        self._round_trip_ns = _FIRST_ROUND_TRIP_NS
+        self._asked: tuple[int, ...] = ()
+        self._pair_misses = 0
+        self._misses = dict.fromkeys(servos, 0)
+        self._zero = 0
+        self._pole = PoleAngle(self.settings)
+        self._homed = self._homing = self._armed = self._anchored = self._watchdog = self._stopped = False
+        self._fault = ""
+        self._lost_commands, self._errors_before = 0, self._bus.errors
+
+    def connect(self) -> None:
+        """Open the transport, find both servos, check how they are set up, and switch their torque off."""
+        if self.info is not None:
+            return
+        if not self._transport.can_send:
+            raise ConfigurationError(
+                "servos say nothing unless asked: a dry run, which sends nothing, cannot listen to them"
+            )
+        self._transport.open()
+        try:
+            where = str(getattr(self._transport, "port", type(self._transport).__name__))
+            examination = Examination(self._bus, self.settings, self._clock, where)
+            info = examination.run(self.description.state_rate_hz)
+            self._forget()
+            self.info = info
+            self.servos.fast, self.servos.most_effort = info.fast_sync_read, info.effort_limit
+        except BaseException:
+            self._transport.close()
+            raise
+
+    def disconnect(self) -> None:
+        """Close the transport."""
+        self._transport.close()
+        self.info = None
+
+    def reopen(self) -> None:
+        """Open the port again where it vanished."""
+        self._transport.reopen()
+        self._asked = ()
+
+    def home(self, timeout_s: float) -> None:
+        """Find the middle of the rail, move the cart there, then wait until a hand has set the pole upright.
+
+        The pole servo's LED is lit while the hand is waited for. The torque is off afterwards.
+
+        Raises:
+            TransportTimeoutError: The pole was not set, or the servos fell silent.
+            SafetyError: The rail is not as long as the settings say, or a servo reports an error.
+        """
+        self._homed = False
+        self.passive()
+        self._clear_faults()
+        self._homing = True
+        try:
+            self._zero = Homing(self.servos, self._clock, self.settings, self.description).run(timeout_s)
+        finally:
+            self._homing = False
+            self.passive()
+        self._pole.restart()
+        self._homed = True
+
+    def arm(self, timeout_s: float) -> None:
+        """Switch the belt servo's torque on, without gains until the first command; watchdogs run from now.
+
+        Raises:
+            SafetyError: It was never homed, or a servo reports an error.
+        """
+        if not self._homed:
+            raise SafetyError("cartpole: it was not homed since the servos were found; call home() first")
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        self._clear_faults()
+        cart, _ = self.servos.read(deadline_ns)
+        self.servos.torque_on(Goal(0, 0, 0, 1, cart.present_position), deadline_ns)
+        self._written = None
+        self._states.clear()
+        self._asked, self._stopped = (), False
+        while Status.ARMED not in (state := self.read_state(self._left_s(deadline_ns))).status:
+            continue
+        self._states.append(state)
+        self._armed, self._anchored, self._alive_ns = True, False, self._clock.now_ns()
+
+    def _left_s(self, deadline_ns: int) -> float:
+        return max(0, deadline_ns - self._clock.now_ns()) / 1e9
+
+    def _clear_faults(self) -> None:
+        """Begin anew after a fault, where the servos report none now."""
+        deadline_ns = self._clock.now_ns() + _CLEAR_NS
+        for servo, block in zip(self._servos, self.servos.read(deadline_ns), strict=True):
+            if block.hardware_error:
+                raise SafetyError(_hardware_error(servo, block))
+        self._fault, self._watchdog = "", False
+        for clock in self._ticks.values():
+            clock.restarted = False
+        self._grid.begin()
+
+    def read_state(self, timeout_s: float) -> RobotState:
+        """Return the next state; ask for it where one is due and the answer fits the time.
+
+        Args:
+            timeout_s: How long to wait [s]; 0 takes what has come and asks nothing.
+        """
+        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while not self._states:
+            if self._asked:
+                self._take(deadline_ns)
+            elif max(self._clock.now_ns(), self._next_ns) + self._round_trip_ns <= deadline_ns:
+                self._clock.sleep_until_ns(self._next_ns)
+                self._ask()
+            else:
+                self._clock.sleep_until_ns(deadline_ns)
+            if not self._states and self._clock.now_ns() >= deadline_ns:
+                why = (
+                    self._fault or f"are both servos powered, is the cable good ({self.link_errors} errors)?"
+                )
+                raise TransportTimeoutError(f"cartpole: no state within {timeout_s:g} s; {why}")
+        return self._states.popleft()
+
+    def _ask(self) -> None:
+        now_ns = self._clock.now_ns()
+        if self._armed and now_ns - self._alive_ns > round(self.watchdog_s * 1e9):
+            # Our own questions keep the servo's watchdog quiet: who only reads states must not keep it going.
+            self.passive()
+            self._watchdog = True
+        self._asked = self._servos
+        if self._pair_misses >= _MISSES:
+            self._asked = (min(self._servos, key=lambda servo: self._turns[servo]),)
+            self._turns[self._asked[0]] += 1
+        self._asked_ns = self.servos.ask(self._asked)
+        late = max(0, now_ns - self._next_ns) // self._period_ns
+        self._next_ns += (1 + late) * self._period_ns
+
+    def _take(self, deadline_ns: int) -> None:
+        try:
+            blocks = self.servos.take(deadline_ns)
+        except (TransportTimeoutError, FrameError):
+            self._miss()
+            return
+        if blocks is None:
+            return
+        asked, self._asked = self._asked, ()
+        round_trip_ns = self._clock.now_ns() - self._asked_ns
+        self._round_trip_ns += round((1.25 * round_trip_ns - self._round_trip_ns) / 8)
+        for servo in asked:
+            self._misses[servo] = 0
+        if len(asked) == 2 or not any(self._misses.values()):
+            self._pair_misses = 0
+        if len(asked) == 2 or (self._stopped and asked == self._servos[:1]):
+            self._receive(blocks)
+
+    def _miss(self) -> None:
+        asked, self._asked = self._asked, ()
+        if len(asked) == 2:
+            self._pair_misses += 1
+            if self._pair_misses == _MISSES:
+                # Until each has answered alone, none is known to be there.
+                self._misses = dict.fromkeys(self._servos, 1)
+                self._turns = dict.fromkeys(self._servos, 0)
+            return
+        self._misses[asked[0]] += 1
+        if self._misses[asked[0]] > _MISSES:
+            role = "belt" if asked == self._servos[:1] else "pole"
+            self._latch(
+                f"servo {asked[0]} ({role}) does not answer any more: check its cable and its supply, then "
+                "start again"
+            )
+
+    def _latch(self, fault: str) -> None:
+        self._fault = self._fault or fault
+
+    def _receive(self, blocks: Mapping[int, Block]) -> None:
+        times = {servo: self._ticks[servo].read(b.tick_ms, self._asked_ns) for servo, b in blocks.items()}
+        self._judge(blocks)
+        cart, time_ms = blocks[self._servos[0]], times[self._servos[0]]
+        shift_ms = self._grid.place(time_ms)
+        if shift_ms is None:
+            return
+        device_ns = (time_ms + shift_ms) * 1_000_000
+        self._follow(cart, time_ms * 1_000_000, device_ns)
+        s = self.settings
+        cart_m_s = cart.present_velocity * s.metres_s_per_count * s.cart_direction
+        cart_m = (cart.present_position - self._zero) * s.metres_per_pulse + cart_m_s * shift_ms * 1e-3
+        pole = blocks.get(self._servos[1])
+        # Only a robot that was made passive gets here without its pole: what counts then is the torque.
+        pole_rad = pole_rad_s = math.nan
+        if pole is not None:
+            pole_rad_s = pole.present_velocity * RAD_S_PER_COUNT * s.pole_direction
+            pole_rad = self._pole.read(pole.present_position) + pole_rad_s * shift_ms * 1e-3
+        effort = (
+            cart.present_current * s.effort_per_current * s.cart_direction if s.mode == "current" else 0.0
+        )
+        sequence, received_ns = self._in_force or (-1, 0)
+        self._states.append(
+            RobotState(
+                position=np.array([cart_m, pole_rad]),
+                velocity=np.array([cart_m_s, pole_rad_s]),
+                effort=np.array([effort, 0.0]),
+                receive_ns=self.servos.stamp_ns,
+                device_ns=device_ns,
+                sequence=self._grid.number,
+                command_sequence=sequence,
+                command_age_ns=device_ns - received_ns if self._in_force else -1,
+                status=self._status(cart, cart_m),
+            )
+        )
+
+    def _judge(self, blocks: Mapping[int, Block]) -> None:
+        """Latch what a servo reports or did."""
+        for servo, block in blocks.items():
+            if block.hardware_error:
+                self._latch(_hardware_error(servo, block))
+            if self._ticks[servo].restarted:
+                self._lose_position(
+                    f"servo {servo} restarted: its torque is off and its position is lost. Check the supply "
+                    "(a motor that starts may pull it down) and start again, which homes anew"
+                )
+        if self._armed and not blocks[self._servos[0]].torque_enable:
+            self._lose_position(
+                f"servo {self._servos[0]} has no torque any more: it restarted, or another program uses "
+                "the bus"
+            )
+
+    def _lose_position(self, fault: str) -> None:
+        self._homed = self._armed = False
+        self._latch(fault)
+
+    def _follow(self, cart: Block, sampled_ns: int, device_ns: int) -> None:
+        """Find the command that the belt servo follows, and when it got it on its own clock."""
+        goal = self.settings.read_goal(cart)
+        asked = [sent for sent in self._sent if sent.sent_ns <= self._asked_ns]
+        if not asked:
+            return
+        found = next((sent for sent in reversed(asked) if sent.goal == goal), None)
+        if found is not asked[-1] and asked[-1].sequence != self._missed_command:
+            self._missed_command = asked[-1].sequence
+            self._lost_commands += 1
+            self._written = None
+        if found is None or (self._in_force is not None and self._in_force[0] == found.sequence):
+            return
+        received_ns = min(sampled_ns - (self._asked_ns - found.sent_ns), device_ns)
+        self._in_force = (found.sequence, received_ns)
+        while self._sent[0] is not found:
+            self._sent.popleft()
+
+    def _status(self, cart: Block, cart_m: float) -> Status:
+        flags = {
+            Status.ARMED: cart.torque_enable,
+            Status.HOMED: self._homed,
+            Status.HOMING: self._homing,
+            Status.WATCHDOG: self._watchdog or cart.bus_watchdog == WATCHDOG_TRIPPED,
+            Status.EFFORT_CLAMPED: self.settings.mode == "current"
+            and 0 < cart.goal_current <= abs(cart.present_current),
+            Status.SPEED_CLAMPED: cart.torque_enable and cart.moving_status & PROFILE_ONGOING,
+            Status.AT_END_STOP: self._homed and abs(cart_m) >= 0.5 * self.settings.rail_m - _AT_STOP_M,
+            Status.FAULT: self._fault,
+        }
+        status = Status.NONE
+        for flag, is_set in flags.items():
+            status |= flag if is_set else Status.NONE
+        return status
+
+    def send_command(self, command: JointCommand) -> JointCommand:
+        """Send a position target; velocity target and feed-forward effort are not in the registers.
+
+        Raises:
+            SafetyError: A value is not finite.
+        """
+        goal = self.settings.to_goal(command, self._zero, self.servos.most_effort)
+        sent_ns = self.servos.send(goal, self._written)
+        self._written, self._alive_ns = goal, sent_ns
+        self._sequence += 1
+        self._sent.append(_Sent(self._sequence, sent_ns, goal))
+        if self._armed and not self._anchored:
+            # Questions keep this distance from all commands that follow at the control rate.
+            self._anchored = True
+            self._grid.begin()
+            self._next_ns = sent_ns + _AFTER_COMMAND_NS
+        return self.settings.from_goal(goal, self._zero)
+
+    def passive(self) -> None:
+        """Switch the torque of both servos off; sent once, never waits.
+
+        States that were received before are forgotten, and so is an answer that is still under way.
+        """
+        self._states.clear()
+        self._armed, self._stopped = False, True
+        if self._asked:
+            self._asked, self._next_ns = (), self._clock.now_ns() + self._round_trip_ns
+        self.servos.torque_off()
+
+    @property
+    def fault(self) -> str:
+        """What a servo reported or did that forbids going on; "" for nothing. Latched until armed again."""
+        return self._fault
+
+    @property
+    def last_sequence(self) -> int:
+        """Number of the last command sent; -1 before the first."""
+        return self._sequence
+
+    @property
+    def link_errors(self) -> int:
+        """Answers that were corrupt or stayed away, and commands that the servo did not show, so far."""
+        return self._bus.errors - self._errors_before + self._lost_commands
+
+    def fileno(self) -> int:
+        """Return the descriptor of the transport."""
+        fileno = getattr(self._transport, "fileno", None)
+        if fileno is None:
+            raise io.UnsupportedOperation(f"{type(self._transport).__name__} has no file descriptor")
+        return int(fileno())
+
+    def take_wire(self) -> list[Message]:
+        """Return and forget the raw messages since the last call; if many, only the newest."""
+        wire = list(self._bus.wire)
+        self._bus.wire.clear()
+        return wire
