@@ -49,14 +49,16 @@ TRANSPORTS: Final = {
 }
 TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
 """Transports without a descriptor to inherit: each process opens its own."""
-MAKERS: Final[Mapping[tuple[str, str], str]] = {}
+MAKERS: Final[Mapping[tuple[str, str], str]] = {
+    ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
+}
 """Robots whose driver on a wire is another than that of :data:`ROBOTS`, (robot, wire) -> "module:function".
 
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
 descriptor of the port that a parent process opened. It does no I/O.
 """
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
-    "cartpole": ("serial",),
+    "cartpole": ("serial", "can"),
     "go2": TOPIC_TRANSPORTS,
     "go2_hung": TOPIC_TRANSPORTS,
 }
@@ -138,7 +140,9 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
 
         port = f"{find_interface(port).name}, domain {options.domain}"
     else:
-        port = os.path.realpath(port)
+        # Settings after the path of a port do not make it another port.
+        prefix, colon, path = port.partition("?")[0].rpartition(":")
+        port = prefix + colon + (os.path.realpath(path) if "/" in path else path)
     return f"{transport_name} on {port}"
 
 

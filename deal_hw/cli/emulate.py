@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import sys
 import threading
@@ -18,7 +19,7 @@ from deal_hw.cli.emulate_common import (
     signalled,
 )
 from deal_hw.cli.emulate_go2 import emulate_go2
-from deal_hw.cli.emulate_settings import CARTPOLE_EMULATORS, CARTPOLE_XI, Emulate
+from deal_hw.cli.emulate_settings import CARTPOLE_EMULATORS, CARTPOLE_XI, ON_CAN, Emulate
 from deal_hw.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -114,8 +115,11 @@ def _truth(config: Emulate) -> Truth:
 def _hazards(config: Emulate) -> Hazards:
     import numpy as np
 
-    from deal_hw.drivers.cartpole.emulator import Hazards
+    from deal_hw.drivers.cartpole.emulator import CanFaults, Hazards
     from deal_hw.testing.faults import FaultRates, FrameFaults
+
+    # A frame of a serial CAN adapter is a line.
+    end = b"\r" if config.transport in ON_CAN else b"\0"
 
     rates = FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate)
     return Hazards(
@@ -124,9 +128,10 @@ def _hazards(config: Emulate) -> Hazards:
         cut_s=config.cut_s,
         vanish_after_s=config.vanish_after_s,
         return_after_s=config.return_after_s,
-        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]))
+        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]), end)
         if rates != FaultRates()
         else None,
+        can=CanFaults(**dataclasses.asdict(config.can)),
     )
 
 

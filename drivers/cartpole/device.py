@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.drivers.cartpole.controller import Controller, Firmware, Link, Mode
+from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
+from deal_hw.drivers.cartpole.link import Link
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.servo import Servo
 from deal_hw.drivers.cartpole.truth import Truth

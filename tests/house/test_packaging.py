@@ -32,6 +32,8 @@ BASE_MODULES = (
     "deal_hw.drivers.cartpole.description",
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
+    "deal_hw.drivers.cartpole.can_robot",
+    "deal_hw.drivers.transports.slcan_transport",
     "deal_hw.drivers.go2.doctor",
     "deal_hw.drivers.go2.descriptions.driver",
     "deal_hw.drivers.go2.descriptions.on_stand",
