@@ -51,6 +51,7 @@ TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
 """Transports without a descriptor to inherit: each process opens its own."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
     ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
+    ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.connect:dynamixel_robot",
 }
 """Robots whose driver on a wire is another than that of :data:`ROBOTS`, (robot, wire) -> "module:function".
 
@@ -58,7 +59,7 @@ The function is called as ``function(port, clock, fd=None, can_send=True)`` and 
 descriptor of the port that a parent process opened. It does no I/O.
 """
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
-    "cartpole": ("serial", "can"),
+    "cartpole": ("serial", "can", "dynamixel"),
     "go2": TOPIC_TRANSPORTS,
     "go2_hung": TOPIC_TRANSPORTS,
 }

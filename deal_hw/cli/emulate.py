@@ -115,12 +115,12 @@ def _truth(config: Emulate) -> Truth:
 def _hazards(config: Emulate) -> Hazards:
     import numpy as np
 
-    from deal_hw.drivers.cartpole.emulator import CanFaults, Hazards
+    from deal_hw.drivers.cartpole.emulator import CanFaults, Hazards, ServoFaults
     from deal_hw.testing.faults import FaultRates, FrameFaults
 
-    # A frame of a serial CAN adapter is a line.
-    end = b"\r" if config.transport in ON_CAN else b"\0"
-
+    # A frame of a serial CAN adapter is a line; servos send a packet at a time.
+    end = b"\r" if config.transport in ON_CAN else None if config.transport == "dynamixel" else b"\0"
+    servo = {name.removeprefix("servo_"): value for name, value in dataclasses.asdict(config.servo).items()}
     rates = FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate)
     return Hazards(
         freeze_after_s=config.freeze_after_s,
@@ -132,6 +132,7 @@ def _hazards(config: Emulate) -> Hazards:
         if rates != FaultRates()
         else None,
         can=CanFaults(**dataclasses.asdict(config.can)),
+        servo=ServoFaults(**servo),
     )
 
 

@@ -122,9 +122,39 @@ class CanOptions:
         check_ranges(self)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ServoOptions:
+    """Emulated Dynamixel servos and what goes wrong with them, so long after the motor was first armed."""
+
+    servo_baud_rate: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 1000000
+    """Dynamixel: baud rate of both servos; they do not hear a port of another one."""
+
+    servo_duplicate_id: bool = False
+    """Dynamixel: both servos have id 1."""
+
+    servo_wrong_mode: bool = False
+    """Dynamixel: the belt servo is in velocity mode."""
+
+    servo_protocol: Literal[1, 2] = 2
+    """Dynamixel: protocol of the pole servo."""
+
+    servo_reboot_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Dynamixel: the belt servo restarts [s]."""
+
+    servo_overload_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Dynamixel: the belt servo switches itself off for overload [s]."""
+
+    servo_absent_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Dynamixel: the pole servo falls silent for good [s]."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
 CARTPOLE_EMULATORS = {
     "serial": "deal_hw.drivers.cartpole.emulator:serial_emulator",
     "can": "deal_hw.drivers.cartpole.can_emulator:can_emulator",
+    "dynamixel": "deal_hw.drivers.cartpole.dynamixel.emulator:dynamixel_emulator",
 }
 """Wires of the cart-pole -> "module:function"; the function is called as
 ``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
@@ -213,6 +243,9 @@ class Emulate:
     can: tyro.conf.OmitArgPrefixes[CanOptions] = field(default_factory=CanOptions)
     """The CAN bus of a cart-pole."""
 
+    servo: tyro.conf.OmitArgPrefixes[ServoOptions] = field(default_factory=ServoOptions)
+    """The servos of a cart-pole."""
+
     go2: tyro.conf.OmitArgPrefixes[Go2Options] = field(default_factory=Go2Options)
     """Options of the Go2 alone."""
 
@@ -234,13 +267,14 @@ class Emulate:
 
     def _foreign(self) -> list[str]:
         """Return the flags given that belong to another robot."""
-        bus = given(self.can, CanOptions())
+        bus, servos = given(self.can, CanOptions()), given(self.servo, ServoOptions())
         if self.robot == "cartpole":
-            foreign = bus if self.transport not in ON_CAN else []
+            foreign = [] if self.transport in ON_CAN else bus
+            foreign += [] if self.transport == "dynamixel" else servos
             return foreign + self.go2.given() + (["--port"] if self.port is not None else [])
         own = {
             "--link": self.link,
             "--vanish-after-s": self.vanish_after_s,
             "--return-after-s": self.return_after_s,
         }
-        return bus + [flag for flag, value in own.items() if value is not None]
+        return bus + servos + [flag for flag, value in own.items() if value is not None]

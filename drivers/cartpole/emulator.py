@@ -53,6 +53,29 @@ class CanFaults:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ServoFaults:
+    """How emulated servos are set up, and what goes wrong, counted from the first arming.
+
+    Attributes:
+        baud_rate: Of both.
+        duplicate_id: Both have the belt servo's id.
+        wrong_mode: The belt servo is in velocity mode.
+        protocol: Version that the pole servo speaks.
+        reboot_after_s: The belt servo restarts [s]; None for never.
+        overload_after_s: The belt servo switches itself off for overload [s].
+        absent_after_s: The pole servo falls silent for good [s].
+    """
+
+    baud_rate: int = 1_000_000
+    duplicate_id: bool = False
+    wrong_mode: bool = False
+    protocol: int = 2
+    reboot_after_s: float | None = None
+    overload_after_s: float | None = None
+    absent_after_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Hazards:
     """What goes wrong on purpose, counted from the moment the motor is first armed.
 
@@ -66,6 +89,7 @@ class Hazards:
             and the emulator ends.
         faults: What happens to frames from the device.
         can: A CAN bus and its faults.
+        servo: Dynamixel servos and their faults.
     """
 
     freeze_after_s: float | None = None
@@ -75,6 +99,7 @@ class Hazards:
     return_after_s: float | None = None
     faults: FrameFaults | None = None
     can: CanFaults = CanFaults()
+    servo: ServoFaults = ServoFaults()
 
 
 class PtyDevice(Protocol):

@@ -50,7 +50,9 @@ class SerialTransport(Transport):
         self._fd = -1
 
     @classmethod
-    def from_fd(cls, fd: int, clock: Clock | None = None, port: str = "") -> SerialTransport:
+    def from_fd(
+        cls, fd: int, clock: Clock | None = None, port: str = "", baud_rate: int = 1_000_000
+    ) -> SerialTransport:
         """Return a transport over a port that a parent process opened; it closes ``fd`` when closed.
 
         It is made for the process with the deadlines, so it reads ahead in a thread.
@@ -59,8 +61,9 @@ class SerialTransport(Transport):
             fd: The descriptor.
             clock: Gives the stamps.
             port: Path of the port, for :meth:`reopen`; "": it cannot be opened again.
+            baud_rate: For :meth:`reopen`; the descriptor's stays as it is.
         """
-        transport = cls(port or f"inherited descriptor {fd}", clock=clock)
+        transport = cls(port or f"inherited descriptor {fd}", baud_rate, clock)
         transport._adopted = fd
         return transport
 

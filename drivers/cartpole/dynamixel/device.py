@@ -7,7 +7,6 @@ import math
 from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,7 +25,9 @@ from deal_hw.drivers.cartpole.dynamixel.packets import (
     status,
 )
 from deal_hw.drivers.cartpole.dynamixel.registers import (
+    ID,
     MOVING_STATUS,
+    OPERATING_MODE,
     PRESENT_CURRENT,
     PRESENT_POSITION,
     PRESENT_VELOCITY,
@@ -36,6 +37,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     Block,
 )
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.cartpole.emulator import ServoFaults
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.sensor import Motor
@@ -44,24 +46,10 @@ from deal_hw.drivers.cartpole.truth import Truth
 
 OVERLOAD = 1 << 5
 _BITS_PER_BYTE = 10
+_VELOCITY_MODE = 1
 _NO_LIMIT_M_S = 1000.0
 _FREE_M = 10.0
 """A servo knows no rail: its goals may lie beyond the stops."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServoFaults:
-    """What goes wrong with a servo on purpose, counted from when the pole was first let go under torque.
-
-    Attributes:
-        reboot_after_s: The belt servo restarts [s]; None for never.
-        overload_after_s: The belt servo switches itself off for overload [s].
-        absent_after_s: The pole servo falls silent for good [s].
-    """
-
-    reboot_after_s: float | None = None
-    overload_after_s: float | None = None
-    absent_after_s: float | None = None
 
 
 class DynamixelDevice:
@@ -123,6 +111,7 @@ class DynamixelDevice:
         self._sense(motor)
         for servo in self.servos:
             self._forget_turns(servo)
+        self._set_up_badly()
 
     @property
     def device_ns(self) -> int:
@@ -201,6 +190,14 @@ class DynamixelDevice:
         """Restart a servo, as after a dip of its supply."""
         servo.reboot(self._now_ns)
         self._forget_turns(servo)
+
+    def _set_up_badly(self) -> None:
+        f = self._faults
+        if f.duplicate_id:
+            self._pole.put(ID, self._cart.id)
+        if f.wrong_mode:
+            self._cart.put(OPERATING_MODE, _VELOCITY_MODE)
+        self._pole.protocol = f.protocol
 
     # What the mechanics do.
 
@@ -299,17 +296,14 @@ class DynamixelDevice:
         if self._first_ns is None:
             return
         passed_s = (self._now_ns - self._first_ns) / 1e9
-        due = {
-            name: value is not None and passed_s > value
-            for name, value in dataclasses.asdict(self._faults).items()
-        }
-        if any(due.values()):
-            self._faults = dataclasses.replace(self._faults, **{name: None for name in due if due[name]})
-        if due["reboot_after_s"]:
+        f = self._faults
+        if f.reboot_after_s is not None and passed_s > f.reboot_after_s:
+            self._faults = f = dataclasses.replace(f, reboot_after_s=None)
             self.reboot(self._cart)
-        if due["overload_after_s"]:
+        if f.overload_after_s is not None and passed_s > f.overload_after_s:
+            self._faults = f = dataclasses.replace(f, overload_after_s=None)
             self._cart.fail(OVERLOAD)
-        if due["absent_after_s"]:
+        if f.absent_after_s is not None and passed_s > f.absent_after_s:
             self._pole.present = False
 
     # What the host asks for.

@@ -1,0 +1,48 @@
+"""Two emulated servos on a pseudo-terminal: ``deal-hw emulate cartpole --transport dynamixel``."""
+
+from __future__ import annotations
+
+import termios
+from pathlib import Path
+from typing import Final
+
+from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
+from deal_hw.drivers.cartpole.dynamixel.registers import BAUD_RATES
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.truth import Truth
+
+_SPEEDS: Final = {
+    code: rate for rate in BAUD_RATES if (code := getattr(termios, f"B{rate}", None)) is not None
+}
+_OUTPUT_SPEED = 5
+
+
+class ServoEmulator(CartpoleEmulator):
+    """Runs servos behind a pty; they hear noise where the host's port has another baud rate than theirs.
+
+    Args:
+        device: The servos.
+        link: A symbolic link to make to the port; None for none.
+        hazards: What goes wrong on purpose.
+    """
+
+    def __init__(
+        self, device: DynamixelDevice, link: Path | None = None, hazards: Hazards | None = None
+    ) -> None:
+        super().__init__(device, link, hazards)
+        self._servos = device
+
+    def _read(self, wait_s: float) -> bytes:
+        data = super()._read(wait_s)
+        if data:
+            speed = termios.tcgetattr(self._master)[_OUTPUT_SPEED]
+            self._servos.host_baud_rate = _SPEEDS.get(speed, 0)
+        return data
+
+
+def dynamixel_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> ServoEmulator:
+    """Return an emulated cart-pole on two servos."""
+    settings = DynamixelSettings(baud_rate=hazards.servo.baud_rate)
+    device = DynamixelDevice(truth, settings, hazards.servo)
+    return ServoEmulator(device, link, hazards)
