@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
 import sys
@@ -16,12 +17,17 @@ import tyro
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.cli.options import Range, check_ranges
-from deal_hw.clock import MonotonicClock
+from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
 
+WIRE_EXAMINERS = {
+    ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.doctor:examine_servos",
+}
+"""What looks at a wire before the robot on it is connected to, (robot, wire) -> "module:function"; called as
+``function(port, clock)``, it yields findings."""
 _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: "FAIL"}
 
 
@@ -121,6 +127,7 @@ def _examine(config: Doctor) -> Iterator[Finding]:
     clock = MonotonicClock()
     try:
         if name not in TOPIC_TRANSPORTS:
+            yield from _examine_wire(config.robot, name, config.port, clock)
             robot = make_robot(config.robot, name, config.port, clock, config.wire)
             yield from examine_robot(config.robot, robot, clock, config.seconds)
             return
@@ -130,6 +137,12 @@ def _examine(config: Doctor) -> Iterator[Finding]:
         yield from Doctor(link, clock, config.seconds, config.state_check).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
+
+
+def _examine_wire(robot: str, transport: str, port: str, clock: Clock) -> Iterator[Finding]:
+    if (robot, transport) in WIRE_EXAMINERS:
+        module, _, function = WIRE_EXAMINERS[robot, transport].partition(":")
+        yield from getattr(importlib.import_module(module), function)(port, clock)
 
 
 def _interfaces(port: str) -> Iterator[Finding]:

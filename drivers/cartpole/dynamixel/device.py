@@ -65,6 +65,7 @@ class DynamixelDevice:
     Attributes:
         received_bytes: How many have come from the host.
         servos: Belt servo and pole servo.
+        fast_read: Whether they know Fast Sync and Bulk Read; older firmware does not.
         host_baud_rate: What the host's port is set to; a servo of another rate hears noise. None: the same.
 
     Args:
@@ -83,6 +84,7 @@ class DynamixelDevice:
         keep_truth: bool = False,
     ) -> None:
         self.received_bytes = 0
+        self.fast_read = True
         self.host_baud_rate: int | None = None
         self._settings = s = settings or DynamixelSettings()
         self._faults = faults or ServoFaults()
@@ -394,7 +396,7 @@ class DynamixelDevice:
 
     def _read_group(self, packet: Packet, wanted: Sequence[tuple[int, int, int]]) -> None:
         fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
-        if self._loses(*wanted[0][1:]):
+        if self._loses(*wanted[0][1:]) or (fast and not self.fast_read):
             return
         parts: list[tuple[int, int, bytes]] = []
         speaker = None

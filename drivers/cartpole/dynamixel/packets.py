@@ -138,7 +138,8 @@ class PacketParser:
             return self._broken()
         size = 7 + length
         if len(buffer) < size:
-            return None
+            # Stuffing keeps headers out of bodies: one here begins the next packet; this one was cut short.
+            return self._broken() if buffer.find(HEADER, len(HEADER)) > 0 else None
         whole = bytes(buffer[:size])
         if crc(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
             return self._broken()
