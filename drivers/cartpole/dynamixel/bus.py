@@ -8,8 +8,9 @@ collected as they come, and the SDK sees them once the last packet is whole.
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
@@ -24,6 +25,7 @@ _BROADCAST: Final = 0xFE
 _SYNC_READ, _FAST_SYNC_READ, _STATUS = 0x82, 0x8A, 0x55
 _STATUS_BYTES = 11
 """A status packet without data: header 4, id, length 2, instruction, error, CRC 2."""
+_PING_BYTES = _STATUS_BYTES + 3
 _BITS_PER_BYTE = 10
 _QUEUE = 4096
 _ALERT = 0x80
@@ -125,6 +127,15 @@ class _Port:
         self.buffer.clear()
 
 
+@contextlib.contextmanager
+def _short_is_corrupt(servo: int) -> Iterator[None]:
+    """Raise FrameError where the SDK reaches beyond the end of an answer that passed its CRC."""
+    try:
+        yield
+    except IndexError as error:
+        raise FrameError(f"servo {servo}: a short answer") from error
+
+
 class Bus:
     """Reads and writes servos' registers.
 
@@ -173,15 +184,19 @@ class Bus:
         """
         self._port.drop()
         packet = [0, 0, 0, 0, servo, 3, 0, 1, 0, 0]
-        answer, result, _ = self._sdk.txRxPacket(self._port, packet)
-        self._check(servo, result)
-        # Error, model (2), firmware.
+        with _short_is_corrupt(servo):
+            answer, result, _ = self._sdk.txRxPacket(self._port, packet)
+        # Error, model (2), firmware, CRC (2).
+        self._check(servo, result, result != COMM_SUCCESS or len(answer) >= _PING_BYTES)
         return Answer(answer[9] | answer[10] << 8, answer[11])
 
     def ping_protocol_1(self, servo: int) -> bool:
         """Say whether a servo answers in the older protocol 1.0."""
         self._port.drop()
-        _, result, _ = PacketHandler(1.0).ping(self._port, servo)
+        try:
+            _, result, _ = PacketHandler(1.0).ping(self._port, servo)
+        except IndexError:
+            return False
         return bool(result == COMM_SUCCESS)
 
     def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
@@ -193,8 +208,12 @@ class Bus:
         found: dict[int, Answer] = {}
         while not self._port.isPacketTimeout():
             # One packet after the other: the SDK's own waits for all 252 servos, 1.3 s.
-            packet, result = self._sdk.rxPacket(self._port, False)
-            if result == COMM_SUCCESS and len(packet) >= 14:
+            try:
+                packet, result = self._sdk.rxPacket(self._port, False)
+            except IndexError:
+                self.errors += 1
+                continue
+            if result == COMM_SUCCESS and len(packet) >= _PING_BYTES:
                 found[packet[4]] = Answer(packet[9] | packet[10] << 8, packet[11])
             elif result != COMM_SUCCESS and packet:
                 self.errors += 1
@@ -203,7 +222,8 @@ class Bus:
     def read(self, servo: int, register: Register) -> int:
         """Return a register, without sign; raises as :meth:`ping`."""
         self._port.drop()
-        data, result, _ = self._sdk.readTxRx(self._port, servo, register.address, register.size)
+        with _short_is_corrupt(servo):
+            data, result, _ = self._sdk.readTxRx(self._port, servo, register.address, register.size)
         self._check(servo, result, len(data) == register.size)
         return int.from_bytes(bytes(data), "little")
 
@@ -215,19 +235,14 @@ class Bus:
         """
         self._port.drop()
         data = list((value % (1 << 8 * register.size)).to_bytes(register.size, "little"))
-        result, error = self._sdk.writeTxRx(self._port, servo, register.address, register.size, data)
+        with _short_is_corrupt(servo):
+            result, error = self._sdk.writeTxRx(self._port, servo, register.address, register.size, data)
         self._check(servo, result)
         if error & ~_ALERT:
             said = self._sdk.getRxPacketError(error & ~_ALERT).removeprefix("[RxPacketError] ")
             raise ProtocolError(
                 f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {said}"
             )
-
-    def reboot(self, servo: int) -> None:
-        """Restart a servo, which also clears its hardware errors; raises as :meth:`ping`."""
-        self._port.drop()
-        result, _ = self._sdk.reboot(self._port, servo)
-        self._check(servo, result)
 
     def post(self, writes: Sequence[tuple[int, Mapping[int, bytes]]]) -> int:
         """Write registers in one message and wait for nothing; return when it went [ns].

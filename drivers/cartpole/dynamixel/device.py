@@ -396,7 +396,7 @@ class DynamixelDevice:
 
     def _read_group(self, packet: Packet, wanted: Sequence[tuple[int, int, int]]) -> None:
         fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
-        if self._loses(*wanted[0][1:]) or (fast and not self.fast_read):
+        if not wanted or self._loses(*wanted[0][1:]) or (fast and not self.fast_read):
             return
         parts: list[tuple[int, int, bytes]] = []
         speaker = None
@@ -407,6 +407,8 @@ class DynamixelDevice:
                 break
             speaker = listeners[0]
             error, data = speaker.read(address, size)
+            if error:
+                return
             parts.append((servo, error | speaker.alert, data))
         if speaker is None:
             return
