@@ -119,6 +119,9 @@ class Emulate:
     truth_from: Path | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
+    firmware: Literal["python", "host"] = "python"
+    """Cart-pole: the firmware in Python, or its C core compiled for this host (docs/firmware.md)."""
+
     link: Path | None = None
     """Make a symbolic link to the port here."""
 
@@ -186,6 +189,7 @@ class Emulate:
         if self.robot == "cartpole":
             return self.go2.given() + (["--port"] if self.port is not None else [])
         own = {
+            "--firmware": None if self.firmware == "python" else self.firmware,
             "--link": self.link,
             "--vanish-after-s": self.vanish_after_s,
             "--return-after-s": self.return_after_s,
