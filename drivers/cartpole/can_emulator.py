@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink
-from deal_hw.drivers.cartpole.device import CartpoleDevice, python_firmware, unique_id
+from deal_hw.drivers.cartpole.device import CartpoleDevice, python_firmware
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import Truth, unique_id
 from deal_hw.drivers.transports.slcan_transport import (
     BITRATES,
     BUS_ERROR,

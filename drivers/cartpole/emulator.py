@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.firmwares import device_of
 from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
@@ -291,9 +291,15 @@ class CartpoleEmulator:
         self._unsent = data[written:]
 
 
-def serial_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
-    """Return an emulated cart-pole with a serial port."""
-    return CartpoleEmulator(CartpoleDevice(truth), link, hazards)
+def serial_emulator(
+    truth: Truth, *, link: Path | None, hazards: Hazards, firmware: str = "python"
+) -> CartpoleEmulator:
+    """Return an emulated cart-pole with a serial port.
+
+    Raises:
+        ConfigurationError: Its firmware needs a compiler, which is missing.
+    """
+    return CartpoleEmulator(device_of(truth, firmware), link, hazards)
 
 
 def _passed(limit_s: float | None, time_s: float) -> bool:
