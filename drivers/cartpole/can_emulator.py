@@ -105,6 +105,15 @@ class SlcanAdapter:
         """Whether the motor was stopped because commands stayed away."""
         return self._devices[0].watchdog
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the bus now."""
+        if self._driven_off:
+            return "bus-off"
+        if self._full:
+            return "transmit buffer full"
+        return "node lost" if self._during(self._faults.lost_node_after_s, float("inf")) else ""
+
     def receive(self, data: bytes) -> None:
         """Take characters from the host; frames reach the devices in their next tick."""
         self.received_bytes += len(data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -74,6 +75,9 @@ class CartpoleDevice:
         self.received_bytes = 0
         self._tick = 0
         self._kept: array[float] | None = array("d") if keep_truth else None
+
+    trouble: ClassVar[str] = ""
+    """What is wrong with its wire; an emulated bus tells more."""
 
     @property
     def device_ns(self) -> int:

@@ -78,9 +78,19 @@ class Hazards:
 
 
 class PtyDevice(Protocol):
-    """What is behind the port: characters in, characters out, in device time."""
+    """What is behind the port: characters in, characters out, in device time.
+
+    Attributes:
+        received_bytes: How many have come from the host.
+        trouble: What is wrong with its wire now; "" for nothing.
+    """
 
     received_bytes: int
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with its wire now."""
+        ...
 
     @property
     def device_ns(self) -> int:
@@ -120,7 +130,7 @@ class CartpoleEmulator:
         slips: Times that this process was stalled and device time stood still.
         dropped: Writes that found no room.
         changes: What the motor and the port did, and when: device ms, host ns, and a mode of the device,
-            "frozen", "cut", "gone" or "back"; the first 2000.
+            "frozen", "cut", "gone" or "back", or what is wrong with a bus; the first 2000.
 
     Args:
         device: The device.
@@ -153,7 +163,7 @@ class CartpoleEmulator:
         self._freeze_after_s, self._frozen = self._hazards.freeze_after_s, False
         self._cut_end_ns, self._gone_ns = 0, -1
         self.changes: list[tuple[int, int, str]] = []
-        self._mode = device.mode
+        self._mode, self._trouble = device.mode, ""
 
     def open(self) -> str:
         """Make the pty; return what a host gives as its port."""
@@ -266,6 +276,9 @@ class CartpoleEmulator:
         if (mode := self._device.mode) != self._mode:
             self._mode = mode
             self._note(now_ns, mode)
+        if (trouble := self._device.trouble) != self._trouble:
+            self._trouble = trouble
+            self._note(now_ns, trouble or "bus well")
 
     def _note(self, now_ns: int, what: str) -> None:
         if len(self.changes) < _MOST_CHANGES:
