@@ -58,6 +58,8 @@ MAKERS: Final[Mapping[tuple[str, str], str]] = {
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
 descriptor of the port that a parent process opened. It does no I/O.
 """
+CAN_NODES: Final[Mapping[str, tuple[int, ...]]] = {"can": (1,)}
+"""Transports over a CAN bus, and the numbers that their devices usually have."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     "cartpole": ("serial", "can", "dynamixel"),
     "go2": TOPIC_TRANSPORTS,
@@ -66,6 +68,7 @@ REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
 """Transports that reach each robot; the first is the default."""
 
 __all__ = [
+    "CAN_NODES",
     "DESCRIPTIONS",
     "MAKERS",
     "REACHED_BY",

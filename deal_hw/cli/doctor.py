@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import shutil
 import sys
@@ -14,20 +13,16 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from deal_hw.cli.doctor_can import examine_can, list_adapters
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.cli.options import Range, check_ranges
-from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
+from deal_hw.clock import MonotonicClock
+from deal_hw.drivers import CAN_NODES, TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
 
-WIRE_EXAMINERS = {
-    ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.doctor:examine_servos",
-}
-"""What looks at a wire before the robot on it is connected to, (robot, wire) -> "module:function"; called as
-``function(port, clock)``, it yields findings."""
 _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: "FAIL"}
 
 
@@ -42,7 +37,7 @@ class Doctor:
     """The robot to listen to, such as go2."""
 
     port: str = ""
-    """Where it is: a network interface (dds), an endpoint (zenoh) or a serial port."""
+    """Where it is: a network interface (dds), an endpoint (zenoh), a serial port or a CAN bus."""
 
     transport: str = ""
     """How it is reached; by default the robot's usual way."""
@@ -120,6 +115,7 @@ def _wrapped(lead: str, text: str) -> str:
 
 def _examine(config: Doctor) -> Iterator[Finding]:
     yield from examine_machine()
+    yield from list_adapters()
     yield from _interfaces(config.port)
     if not config.robot:
         return
@@ -127,7 +123,12 @@ def _examine(config: Doctor) -> Iterator[Finding]:
     clock = MonotonicClock()
     try:
         if name not in TOPIC_TRANSPORTS:
-            yield from _examine_wire(config.robot, name, config.port, clock)
+            if name in CAN_NODES:
+                yield from examine_can(config.port, clock, min(1.0, config.seconds), *CAN_NODES[name])
+            if name == "dynamixel":
+                from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
+
+                yield from examine_servos(config.port, clock)
             robot = make_robot(config.robot, name, config.port, clock, config.wire)
             yield from examine_robot(config.robot, robot, clock, config.seconds)
             return
@@ -137,12 +138,6 @@ def _examine(config: Doctor) -> Iterator[Finding]:
         yield from Doctor(link, clock, config.seconds, config.state_check).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
-
-
-def _examine_wire(robot: str, transport: str, port: str, clock: Clock) -> Iterator[Finding]:
-    if (robot, transport) in WIRE_EXAMINERS:
-        module, _, function = WIRE_EXAMINERS[robot, transport].partition(":")
-        yield from getattr(importlib.import_module(module), function)(port, clock)
 
 
 def _interfaces(port: str) -> Iterator[Finding]:

@@ -75,7 +75,8 @@ def _emulate_cartpole(config: Emulate, stop: threading.Event, cut: threading.Eve
             raise MissingExtraError(error.name, "sim") from error
         raise
     truth = _truth(config)
-    emulator: CartpoleOnAWire = make(truth, link=config.link, hazards=_hazards(config))
+    own = {"firmware": config.firmware} if config.firmware != "python" else {}
+    emulator: CartpoleOnAWire = make(truth, link=config.link, hazards=_hazards(config), **own)
     try:
         print(f"port {emulator.open()}", flush=True)
         print(

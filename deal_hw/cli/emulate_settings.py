@@ -115,7 +115,7 @@ class CanOptions:
     duplicate_node: bool = False
     """CAN: a second device has the same number."""
 
-    dbc_version: Annotated[int, Range(0, 255)] = 1
+    dbc_version: Annotated[int, Range(1, 255)] = 1
     """CAN: version of the protocol that the device speaks."""
 
     def __post_init__(self) -> None:
@@ -196,6 +196,9 @@ class Emulate:
     truth_from: Path | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
+    firmware: Literal["python", "host"] = "python"
+    """Cart-pole: the firmware in Python, or its C core compiled for this host (docs/firmware.md)."""
+
     link: Path | None = None
     """Make a symbolic link to the port here."""
 
@@ -271,8 +274,11 @@ class Emulate:
         if self.robot == "cartpole":
             foreign = [] if self.transport in ON_CAN else bus
             foreign += [] if self.transport == "dynamixel" else servos
+            if self.firmware != "python" and self.transport not in (None, "serial"):
+                foreign = [*foreign, "--firmware"]
             return foreign + self.go2.given() + (["--port"] if self.port is not None else [])
         own = {
+            "--firmware": None if self.firmware == "python" else self.firmware,
             "--link": self.link,
             "--vanish-after-s": self.vanish_after_s,
             "--return-after-s": self.return_after_s,

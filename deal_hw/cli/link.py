@@ -64,8 +64,9 @@ class RunOptions(Checked):
     """What every verb that runs a robot needs to be told."""
 
     port: str
-    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
-    as tcp/127.0.0.1:7447 (zenoh)."""
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
+    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
+    tcp/127.0.0.1:7447 (zenoh)."""
 
     link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
     """How the robot is reached, beyond the port."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink
-from deal_hw.drivers.cartpole.device import CartpoleDevice, python_firmware, unique_id
+from deal_hw.drivers.cartpole.device import CartpoleDevice, python_firmware
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import Truth, unique_id
 from deal_hw.drivers.transports.slcan_transport import (
     BITRATES,
     BUS_ERROR,
@@ -105,6 +105,15 @@ class SlcanAdapter:
         """Whether the motor was stopped because commands stayed away."""
         return self._devices[0].watchdog
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the bus now."""
+        if self._driven_off:
+            return "bus-off"
+        if self._full:
+            return "transmit buffer full"
+        return "node lost" if self._during(self._faults.lost_node_after_s, float("inf")) else ""
+
     def receive(self, data: bytes) -> None:
         """Take characters from the host; frames reach the devices in their next tick."""
         self.received_bytes += len(data)
@@ -117,14 +126,17 @@ class SlcanAdapter:
         sent = [device.advance_to(device_ns) for device in self._devices]
         if self._armed_ns is None and self.armed:
             self._armed_ns = device_ns
-        # Opening the bus again helps only once what drove it off is over.
-        self._bus_off |= self._during(self._faults.bus_off_after_s, self._faults.bus_off_s)
+        self._bus_off |= self._driven_off
         if not self._hears:
             return answers
         lines = [[_line(f) for f in FRAME.iter_unpack(frames)] for frames in sent]
         # Two devices under one number talk into each other's messages.
         longest = max(map(len, lines))
         return answers + b"".join(own[k] for k in range(longest) for own in lines if k < len(own))
+
+    def tick(self) -> bytes:
+        """Run one tick; return the characters sent in it."""
+        return self.advance_to(self.device_ns)
 
     def _answer(self, line: bytes) -> bytes:
         match line[:1]:
@@ -135,7 +147,9 @@ class SlcanAdapter:
             case b"O" | b"L":
                 self._is_open = True
             case b"C":
-                self._is_open = self._bus_off = False
+                self._is_open = False
+                # Closing and opening helps only once what drove it off the bus is over.
+                self._bus_off = self._driven_off
                 self._waiting = 0
             case b"F":
                 return b"F%02X" % self._flags() + END
@@ -177,6 +191,10 @@ class SlcanAdapter:
         return self._right_bitrate and not lost and not self._faults.no_acknowledge
 
     @property
+    def _driven_off(self) -> bool:
+        return self._during(self._faults.bus_off_after_s, self._faults.bus_off_s)
+
+    @property
     def _full(self) -> bool:
         return self._during(self._faults.tx_full_after_s, self._faults.tx_full_s)
 
@@ -206,6 +224,12 @@ def can_device(truth: Truth, node: int = NODE, version: int = 1, identity: int =
     )
 
 
+def can_devices(truth: Truth, faults: CanFaults) -> list[BusDevice]:
+    """Return the cart-pole on a bus, and what else is there by its faults."""
+    identities = (0, _SECOND_DEVICE) if faults.duplicate_node else (0,)
+    return [can_device(truth, faults.node, faults.dbc_version, identity) for identity in identities]
+
+
 def adapter_emulator(
     devices: list[BusDevice],
     *,
@@ -229,13 +253,12 @@ def adapter_emulator(
 def can_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
     """Return an emulated cart-pole on a CAN bus behind a serial adapter."""
     faults = hazards.can
-    devices: list[BusDevice] = [can_device(truth, faults.node, faults.dbc_version)]
-    if faults.duplicate_node:
-        devices.append(can_device(truth, faults.node, faults.dbc_version, _SECOND_DEVICE))
     settings = [f"bitrate={faults.bitrate}"] if faults.bitrate != CanFaults().bitrate else []
     settings += [f"node={faults.node}"] if faults.node != NODE else []
     query = "?" + "&".join(settings) if settings else ""
-    return adapter_emulator(devices, link=link, hazards=hazards, port=lambda path: path + query)
+    return adapter_emulator(
+        can_devices(truth, faults), link=link, hazards=hazards, port=lambda path: path + query
+    )
 
 
 def _line(frame: tuple[int, int, bytes]) -> bytes:

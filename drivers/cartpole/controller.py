@@ -32,14 +32,17 @@ class Firmware(Protocol):
 
     One tick is :meth:`receive` (where something came), :meth:`control`, and :meth:`report` where one is due.
 
-    Attributes:
-        homings: How often homing began; whoever moves the cart-pole home watches it and ends each with
-            :meth:`finish_homing`.
-        armings: How often the motor was armed; whoever holds the pole lets go then.
     """
 
-    homings: int
-    armings: int
+    @property
+    def homings(self) -> int:
+        """How often homing began; who moves the cart-pole home ends each with :meth:`finish_homing`."""
+        ...
+
+    @property
+    def armings(self) -> int:
+        """How often the motor was armed; whoever holds the pole lets go then."""
+        ...
 
     @property
     def mode(self) -> Mode:

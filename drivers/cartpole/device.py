@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.link import Link
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import Truth, unique_id
 from deal_hw.types import FloatArray
 
 TICK_NS = 1_000_000
@@ -35,11 +36,6 @@ class TrueTrajectory:
     velocity: FloatArray
     force: FloatArray
     setpoint: FloatArray
-
-
-def unique_id(truth: Truth) -> int:
-    """Return the serial number of the device with this truth."""
-    return 0xE000_0000 + truth.seed % 2**28
 
 
 def python_firmware(truth: Truth, mechanics: Mechanics, link: Link | None = None) -> Firmware:
@@ -79,6 +75,9 @@ class CartpoleDevice:
         self.received_bytes = 0
         self._tick = 0
         self._kept: array[float] | None = array("d") if keep_truth else None
+
+    trouble: ClassVar[str] = ""
+    """What is wrong with its wire; an emulated bus tells more."""
 
     @property
     def device_ns(self) -> int:

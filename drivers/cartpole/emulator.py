@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.firmwares import device_of
 from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
@@ -103,9 +103,19 @@ class Hazards:
 
 
 class PtyDevice(Protocol):
-    """What is behind the port: characters in, characters out, in device time."""
+    """What is behind the port: characters in, characters out, in device time.
+
+    Attributes:
+        received_bytes: How many have come from the host.
+        trouble: What is wrong with its wire now; "" for nothing.
+    """
 
     received_bytes: int
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with its wire now."""
+        ...
 
     @property
     def device_ns(self) -> int:
@@ -145,7 +155,7 @@ class CartpoleEmulator:
         slips: Times that this process was stalled and device time stood still.
         dropped: Writes that found no room.
         changes: What the motor and the port did, and when: device ms, host ns, and a mode of the device,
-            "frozen", "cut", "gone" or "back"; the first 2000.
+            "frozen", "cut", "gone" or "back", or what is wrong with a bus; the first 2000.
 
     Args:
         device: The device.
@@ -178,7 +188,7 @@ class CartpoleEmulator:
         self._freeze_after_s, self._frozen = self._hazards.freeze_after_s, False
         self._cut_end_ns, self._gone_ns = 0, -1
         self.changes: list[tuple[int, int, str]] = []
-        self._mode = device.mode
+        self._mode, self._trouble = device.mode, ""
 
     def open(self) -> str:
         """Make the pty; return what a host gives as its port."""
@@ -291,6 +301,9 @@ class CartpoleEmulator:
         if (mode := self._device.mode) != self._mode:
             self._mode = mode
             self._note(now_ns, mode)
+        if (trouble := self._device.trouble) != self._trouble:
+            self._trouble = trouble
+            self._note(now_ns, trouble or "bus well")
 
     def _note(self, now_ns: int, what: str) -> None:
         if len(self.changes) < _MOST_CHANGES:
@@ -316,9 +329,15 @@ class CartpoleEmulator:
         self._unsent = data[written:]
 
 
-def serial_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
-    """Return an emulated cart-pole with a serial port."""
-    return CartpoleEmulator(CartpoleDevice(truth), link, hazards)
+def serial_emulator(
+    truth: Truth, *, link: Path | None, hazards: Hazards, firmware: str = "python"
+) -> CartpoleEmulator:
+    """Return an emulated cart-pole with a serial port.
+
+    Raises:
+        ConfigurationError: Its firmware needs a compiler, which is missing.
+    """
+    return CartpoleEmulator(device_of(truth, firmware), link, hazards)
 
 
 def _passed(limit_s: float | None, time_s: float) -> bool:

@@ -11,7 +11,7 @@ import contextlib
 import re
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Protocol
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.transports.can_transport import NO_ACKNOWLEDGE, CanTransport
@@ -84,6 +84,34 @@ class LineReader:
         return lines
 
 
+class SerialPort(Protocol):
+    """What is needed of a serial port: a :class:`~deal_hw.transport.Transport` with a descriptor."""
+
+    def open(self) -> None:
+        """Open the port."""
+        ...
+
+    def close(self) -> None:
+        """Close the port."""
+        ...
+
+    def reopen(self) -> None:
+        """Open the port again where it was lost."""
+        ...
+
+    def send(self, message: Message) -> None:
+        """Write at once."""
+        ...
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the bytes at hand."""
+        ...
+
+    def fileno(self) -> int:
+        """Return the descriptor of the open port."""
+        ...
+
+
 class SlcanTransport(CanTransport):
     """A serial CAN adapter.
 
@@ -100,6 +128,7 @@ class SlcanTransport(CanTransport):
         accept: See :class:`CanTransport`.
         fd: Descriptor of an adapter that a parent process opened and set up; it is closed by ``close``, and
             the adapter's bus stays open.
+        serial: The serial port; made from ``port`` by default.
 
     Raises:
         ConfigurationError: slcan has no such bit rate.
@@ -111,6 +140,7 @@ class SlcanTransport(CanTransport):
         clock: Clock | None = None,
         accept: Sequence[tuple[int, int]] = (),
         fd: int | None = None,
+        serial: SerialPort | None = None,
     ) -> None:
         super().__init__(port, clock, accept)
         if self.address.bitrate not in BITRATES:
@@ -119,11 +149,13 @@ class SlcanTransport(CanTransport):
                 f"{', '.join(map(str, BITRATES))}"
             )
         path = self.address.channel
-        self._serial = (
-            SerialTransport(path, TTY_BAUD_RATE, self._clock)
-            if fd is None
-            else SerialTransport.from_fd(fd, self._clock, path)
-        )
+        self._serial: SerialPort
+        if serial is not None:
+            self._serial = serial
+        elif fd is None:
+            self._serial = SerialTransport(path, TTY_BAUD_RATE, self._clock)
+        else:
+            self._serial = SerialTransport.from_fd(fd, self._clock, path)
         self._owned = fd is None
         self.refused = self.garbled = 0
         self._is_open = self._in_step = self._full = False

@@ -33,6 +33,7 @@ BASE_MODULES = (
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
     "deal_hw.drivers.cartpole.can_robot",
+    "deal_hw.drivers.cartpole.dynamixel.connect",
     "deal_hw.drivers.transports.slcan_transport",
     "deal_hw.drivers.go2.doctor",
     "deal_hw.drivers.go2.descriptions.driver",

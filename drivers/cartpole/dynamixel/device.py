@@ -25,6 +25,7 @@ from deal_hw.drivers.cartpole.dynamixel.packets import (
     status,
 )
 from deal_hw.drivers.cartpole.dynamixel.registers import (
+    HARDWARE_ERROR,
     ID,
     MOVING_STATUS,
     OPERATING_MODE,
@@ -146,6 +147,15 @@ class DynamixelDevice:
     def watchdog(self) -> bool:
         """Whether the belt servo's watchdog has stopped it."""
         return self._cart.watchdog_tripped
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the servos now; "" for nothing."""
+        if not self._pole.present:
+            return "pole servo absent"
+        if not self._cart.awake(self._now_ns):
+            return "belt servo restarts"
+        return "overload" if self._cart.get(HARDWARE_ERROR) else ""
 
     @property
     def frame_errors(self) -> int:
@@ -329,10 +339,10 @@ class DynamixelDevice:
             case Instruction.WRITE | Instruction.REG_WRITE if len(params) > 2:
                 self._write_one(packet)
             case Instruction.ACTION:
+                # Not answered: the SDK does not wait, and would take the answer for that of its next question.
                 for s in self._listeners(packet.servo):
                     s.act()
                 self._schedule()
-                self._reply(packet, packet.servo, lambda s: (Error.NONE, b""), read=False)
             case Instruction.REBOOT | Instruction.CLEAR:
                 self._reply(packet, packet.servo, lambda s: (Error.NONE, b""), read=False)
                 for s in self._listeners(packet.servo):
