@@ -339,7 +339,7 @@ class DynamixelDevice:
             case Instruction.WRITE | Instruction.REG_WRITE if len(params) > 2:
                 self._write_one(packet)
             case Instruction.ACTION:
-                # Not answered: the SDK does not wait, and would take the answer for that of its next question.
+                # Not answered: the SDK does not wait for it, and would take it for its next answer.
                 for s in self._listeners(packet.servo):
                     s.act()
                 self._schedule()

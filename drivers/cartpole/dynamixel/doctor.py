@@ -29,6 +29,7 @@ from deal_hw.findings import Finding, Level
 
 AREA: Final = "servos"
 _LISTEN_S: Final = 0.1
+"""For all servos to answer a ping to everybody, beyond the allowance for an answer [s]."""
 _SYSFS: Final = Path("/sys/class/tty")
 _LONG_DELAY_US = 250
 _FAST_BAUD = 1_000_000
@@ -59,7 +60,7 @@ def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Fi
             continue
         with transport:
             bus = Bus(transport, clock, rate, settings.answer_s)
-            for servo, answer in sorted(bus.broadcast_ping(_LISTEN_S).items()):
+            for servo, answer in sorted(bus.broadcast_ping(_LISTEN_S + settings.answer_s).items()):
                 found += 1
                 yield from _servo(bus, servo, answer, rate, settings)
             for servo in (settings.cart_id, settings.pole_id):
