@@ -35,7 +35,8 @@ from deal_hw.types import JointCommand, RobotState, Status
 _QUEUE = 4096
 _MISSES = 3
 """Samples in a row without answer before the servos are asked one by one, and before one is absent."""
-_AFTER_COMMAND_NS = 1_000_000
+_MARGIN = 1.25
+"""What is kept free for an answer, over the usual time that one takes."""
 _COMMANDS = 64
 _FIRST_ROUND_TRIP_NS = 2_000_000
 _CLEAR_NS = 500_000_000
@@ -60,10 +61,10 @@ class _Sent(NamedTuple):
 class DynamixelCartpole(Robot):
     """A cart-pole on two X-series servos (docs/dynamixel.md).
 
-    Servos say nothing unless asked, so :meth:`read_state` asks them, ``state_rate_hz`` times a second,
-    beginning 1 ms after each command's time: question, answer and command do not meet on the half-duplex
-    wire. A state needs both servos. What the belt servo was told comes back with every sample: a command
-    counts as in force once the servo shows it.
+    Servos say nothing unless asked, so :meth:`read_state` asks them, ``state_rate_hz`` times a second, the
+    last time so that the answer is there when the caller's time is over: question, answer and command do not
+    meet on the half-duplex wire, and the policy gets a fresh state. A state needs both servos. What the belt
+    servo was told comes back with every sample: a command counts as in force once the servo shows it.
 
     There are two watchdogs: the belt servo's own (Bus Watchdog) stops it when this computer falls silent, and
     the driver switches the torque off when states are read but commands stay away.
@@ -108,7 +109,7 @@ class DynamixelCartpole(Robot):
         self._written: Goal | None = None
         self._sequence = self._missed_command = -1
         self._next_ns = self._asked_ns = self._alive_ns = 0
-        self._round_trip_ns = _FIRST_ROUND_TRIP_NS
+        self._round_trip_ns = self._needed_ns = _FIRST_ROUND_TRIP_NS
         self._asked: tuple[int, ...] = ()
         self._pair_misses = 0
         self._misses = dict.fromkeys(servos, 0)
@@ -188,6 +189,7 @@ class DynamixelCartpole(Robot):
             continue
         self._states.append(state)
         self._armed, self._anchored, self._alive_ns = True, False, self._clock.now_ns()
+        self._sent.clear()
 
     def _left_s(self, deadline_ns: int) -> float:
         return max(0, deadline_ns - self._clock.now_ns()) / 1e9
@@ -210,10 +212,12 @@ class DynamixelCartpole(Robot):
             timeout_s: How long to wait [s]; 0 takes what has come and asks nothing.
         """
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        if self._sent and not self._anchored and timeout_s > 0:
+            self._anchor(deadline_ns)
         while not self._states:
             if self._asked:
                 self._take(deadline_ns)
-            elif max(self._clock.now_ns(), self._next_ns) + self._round_trip_ns <= deadline_ns:
+            elif max(self._clock.now_ns(), self._next_ns) + self._needed_ns <= deadline_ns:
                 self._clock.sleep_until_ns(self._next_ns)
                 self._ask()
             else:
@@ -224,6 +228,14 @@ class DynamixelCartpole(Robot):
                 )
                 raise TransportTimeoutError(f"cartpole: no state within {timeout_s:g} s; {why}")
         return self._states.popleft()
+
+    def _anchor(self, deadline_ns: int) -> None:
+        """Lay the questions of a run so that the last of each control period is answered in time."""
+        self._anchored = True
+        self._needed_ns = self._round_trip_ns
+        left_ns = deadline_ns - self._needed_ns - self._clock.now_ns()
+        self._next_ns = self._clock.now_ns() + max(left_ns, 0) % self._period_ns
+        self._grid.begin()
 
     def _ask(self) -> None:
         now_ns = self._clock.now_ns()
@@ -249,7 +261,7 @@ class DynamixelCartpole(Robot):
             return
         asked, self._asked = self._asked, ()
         round_trip_ns = self._clock.now_ns() - self._asked_ns
-        self._round_trip_ns += round((1.25 * round_trip_ns - self._round_trip_ns) / 8)
+        self._round_trip_ns += round((_MARGIN * round_trip_ns - self._round_trip_ns) / 8)
         for servo in asked:
             self._misses[servo] = 0
         if len(asked) == 2 or not any(self._misses.values()):
@@ -379,11 +391,6 @@ class DynamixelCartpole(Robot):
         self._written, self._alive_ns = goal, sent_ns
         self._sequence += 1
         self._sent.append(_Sent(self._sequence, sent_ns, goal))
-        if self._armed and not self._anchored:
-            # Questions keep this distance from all commands that follow at the control rate.
-            self._anchored = True
-            self._grid.begin()
-            self._next_ns = sent_ns + _AFTER_COMMAND_NS
         return self.settings.from_goal(goal, self._zero)
 
     def passive(self) -> None:
