@@ -37,6 +37,8 @@ _MISSES = 3
 """Samples in a row without answer before the servos are asked one by one, and before one is absent."""
 _MARGIN = 1.25
 """What is kept free for an answer, over the usual time that one takes."""
+_SLACK_NS = 500_000
+"""The last question of a control period goes out so much earlier: periods begin a little late at times."""
 _COMMANDS = 64
 _FIRST_ROUND_TRIP_NS = 2_000_000
 _CLEAR_NS = 500_000_000
@@ -233,7 +235,7 @@ class DynamixelCartpole(Robot):
         """Lay the questions of a run so that the last of each control period is answered in time."""
         self._anchored = True
         self._needed_ns = self._round_trip_ns
-        left_ns = deadline_ns - self._needed_ns - self._clock.now_ns()
+        left_ns = deadline_ns - self._needed_ns - _SLACK_NS - self._clock.now_ns()
         self._next_ns = self._clock.now_ns() + max(left_ns, 0) % self._period_ns
         self._grid.begin()
 

@@ -1,0 +1,120 @@
+#!/usr/bin/env python3
+"""Round trips on a Dynamixel bus: both servos' registers, asked for at a fixed rate.
+
+    python tools/measure_dynamixel_bus.py --seconds 120
+    python tools/measure_dynamixel_bus.py --port /dev/ttyUSB0 --rates 50 200
+
+A round trip is from the question's write to the last byte of both servos' answers, as the driver asks with
+each sample (Fast Sync Read of 72 bytes each); beside it stands the time of these bytes on the wire. Without
+--port two emulated servos answer, which take the wire's time, too. --absent asks a servo that is not there:
+what a dead servo costs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.realtime import become_realtime
+from deal_hw.drivers.cartpole.dynamixel.bus import Bus
+from deal_hw.drivers.cartpole.dynamixel.connect import parse_port
+from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BYTES
+from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
+from deal_hw.drivers.transports.serial_transport import SerialTransport
+from deal_hw.errors import FrameError, TransportTimeoutError
+
+QUESTION_BYTES = 16
+"""Header 4, id, length 2, instruction, address 2, size 2, two ids, CRC 2."""
+ABSENT_ID = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureBus:
+    """Measure round trips on a Dynamixel bus."""
+
+    port: str | None = None
+    """The port, with settings as for `deal-hw`; by default two servos are emulated."""
+
+    rates: tuple[float, ...] = (50.0, 200.0)
+    """Questions a second."""
+
+    seconds: float = 120.0
+    """Length of each row [s]."""
+
+    baud_rate: int = 1_000_000
+    """Of the emulated servos."""
+
+    absent: bool = False
+    """Ask a servo that is not there."""
+
+    out: Path | None = field(default=None)
+    """Write the rows to this JSON file."""
+
+
+def measure(
+    bus: Bus, settings: DynamixelSettings, rate_hz: float, seconds: float, absent: bool
+) -> dict[str, Any]:
+    """Return one row: round trips [ms] at a rate."""
+    clock = MonotonicClock()
+    servos = (ABSENT_ID,) if absent else (settings.cart_id, settings.pole_id)
+    trips, missed, due_ns = [], 0, clock.now_ns()
+    count = round(rate_hz * seconds)
+    for _ in range(count):
+        due_ns += round(1e9 / rate_hz)
+        clock.sleep_until_ns(due_ns)
+        asked_ns = clock.now_ns()
+        bus.ask(servos, BLOCK_ADDRESS, BLOCK_BYTES, fast=not absent)
+        try:
+            while bus.take(asked_ns + 10**9) is None:
+                continue
+        except (TransportTimeoutError, FrameError):
+            missed += 1
+        trips.append((clock.now_ns() - asked_ns) / 1e6)
+    wire_bytes = QUESTION_BYTES + bus.answer_bytes(len(servos), BLOCK_BYTES, not absent)
+    p50, p99 = np.percentile(trips, [50, 99])
+    return {
+        "rate_hz": rate_hz, "questions": count, "missed": missed, "p50_ms": round(float(p50), 3),
+        "p99_ms": round(float(p99), 3), "max_ms": round(max(trips), 3),
+        "wire_ms": round(1e4 * wire_bytes / settings.baud_rate, 3),
+    }  # fmt: skip
+
+
+@contextlib.contextmanager
+def some_port(config: MeasureBus) -> Iterator[str]:
+    """Yield the port given, or that of emulated servos."""
+    if config.port is not None:
+        yield config.port
+        return
+    rate = str(config.baud_rate)
+    with EmulatorProcess(
+        "cartpole", "--transport", "dynamixel", "--nominal", "--profile", "sensor", "--servo-baud-rate", rate
+    ) as emulator:
+        yield f"{emulator.port}?baud_rate={rate}"
+
+
+def main(config: MeasureBus) -> None:
+    """Measure and print each row as it comes."""
+    rows = []
+    with some_port(config) as port:
+        path, settings = parse_port(port)
+        become_realtime()
+        with SerialTransport(path, settings.baud_rate) as transport:
+            bus = Bus(transport, MonotonicClock(), settings.baud_rate, settings.answer_s)
+            for rate_hz in config.rates:
+                rows.append(measure(bus, settings, rate_hz, config.seconds, config.absent))
+                print(json.dumps(rows[-1]), flush=True)
+    if config.out is not None:
+        config.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(MeasureBus, description=__doc__))
