@@ -98,7 +98,8 @@ def examine_can(port: str, clock: Clock, seconds: float, *nodes: int) -> Iterato
     from deal_hw.drivers.transports.can_transport import open_can
 
     address = CanAddress.parse(port)
-    expected = nodes if address.node is None else (address.node, *nodes[1:])
+    given = (address.node, address.encoder)
+    expected = [usual if own is None else own for usual, own in zip(nodes, given, strict=False)]
     yield from listen_to_bus(open_can(port, clock), clock, seconds, *expected)
 
 

@@ -125,6 +125,7 @@ class CanOptions:
 CARTPOLE_EMULATORS = {
     "serial": "deal_hw.drivers.cartpole.emulator:serial_emulator",
     "can": "deal_hw.drivers.cartpole.can_emulator:can_emulator",
+    "odrive": "deal_hw.drivers.cartpole.odrive_emulator:odrive_emulator",
 }
 """Wires of the cart-pole -> "module:function"; the function is called as
 ``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
