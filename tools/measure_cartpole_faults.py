@@ -21,7 +21,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 SECONDS = 1.2
 HOMING, ARMED, IDLE, HELD = "homing", "armed", "idle", "held"
 BY_ITSELF = ("gone", "cut", "frozen", "bus-off", "transmit buffer full", "node lost")
-CAN = ("can",)
+CAN = ("can", "odrive")
 DEPLOY = """
 import sys
 from pathlib import Path
@@ -49,7 +49,7 @@ class CartpoleRig(Rig):
     """A cart-pole that plays a chirp."""
 
     robot = "cartpole"
-    wires = ("serial", "can")
+    wires = ("serial", "can", "odrive")
     longest_s = 1.0
     active = frozenset({ARMED})
     inactive = frozenset({IDLE, HELD})
