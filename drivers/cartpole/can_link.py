@@ -93,7 +93,8 @@ class CanLink:
     """One side of a CAN wire; bytes are whole frames as :data:`FRAME` lays them out.
 
     Attributes:
-        errors: Messages that were torn, corrupt or unknown so far.
+        errors: Messages that were corrupt or unknown so far.
+        torn: Messages that lost a frame so far. A state's number tells a host that it is missing.
         fault: Two devices under one number; "" for nothing.
 
     Args:
@@ -105,7 +106,7 @@ class CanLink:
     resync: ClassVar[bytes] = b""
 
     def __init__(self, node: int = NODE, version: int = protocol.VERSION, unique_id: int = 0) -> None:
-        self.errors = 0
+        self.errors = self.torn = 0
         self.fault = ""
         self._node, self._version, self._unique_id = check_node(node), version, unique_id
         self._names = {frame_id(name, node): name for name in database()}
@@ -171,12 +172,12 @@ class CanLink:
         parts = self._parts.get(group)
         if index == 0:
             # A first frame while others are missing: that message is torn.
-            self.errors += bool(parts)
+            self.torn += bool(parts)
             parts = self._parts[group] = []
         if parts is None:
             return None  # The rest of a message whose beginning is lost or was not heard.
         if len(parts) != index:
-            self.errors += 1
+            self.torn += 1
             self._parts[group] = None
             return None
         parts.append(part)
@@ -221,9 +222,9 @@ class CanLink:
         zero = {"TransmitErrors": 0, "ReceiveErrors": 0}
         heartbeat = {"UniqueIdLow": low, "Version": self._version, "Status": state.status, **zero}
         out = self._frame("Heartbeat", _pack("Heartbeat", heartbeat))
-        if self.errors:
+        if self.errors or self.torn:
             counts = {"ReceiveOverflows": 0, "BusOffs": 0, "TransmitDrops": 0}
-            torn = {"TornMessages": min(self.errors, 0xFFFF), **counts}
+            torn = {"TornMessages": min(self.errors + self.torn, 0xFFFF), **counts}
             out += self._frame("Errors", _pack("Errors", torn))
         return out
 

@@ -123,8 +123,8 @@ def test_a_sample_that_lost_or_mixed_frames_is_refused(first: int, count: int) -
     whole = [STATE] * (count == 0) + [later] * (first + count <= 5)
     assert found == whole
     # What is torn at its beginning was never begun; everything else is counted once.
-    assert host.errors <= 1
-    assert host.errors == (0 if first == 0 or count == 0 else 1)
+    assert host.torn == (0 if first == 0 or count == 0 else 1)
+    assert host.errors == 0
 
 
 def test_frames_of_two_samples_in_the_right_order_fail_the_crc() -> None:
@@ -202,7 +202,7 @@ def test_heartbeats_come_ten_times_a_second_and_tell_two_devices_apart() -> None
 def test_a_device_reports_torn_messages_in_its_errors_frame() -> None:
     """With the heartbeat, once there is one; the host reads past it."""
     device, host = CanLink(), CanLink()
-    device.errors = 3
+    device.errors, device.torn = 1, 2
     data = device.encode(protocol.State(0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
     (_, _, payload) = next(f for f in FRAME.iter_unpack(data) if f[0] == frame_id("Errors", 1))
     assert payload == b"\x03\x00" + bytes(6)
