@@ -85,18 +85,75 @@ def eeprom(settings: Settings, full_force_n: float) -> bytes:
     return data + struct.pack("<H", crc16.ibm_3740(data))
 
 
+class Chip:
+    """An ATmega328P with the firmware's image: pins and bytes, a millisecond a call.
+
+    Attributes:
+        outputs: Mean PWM, lamps and cycles of the last millisecond.
+        longest_step: Most cycles that a control step took so far, interrupts included.
+        asleep: Cycles without anything to do so far.
+        complaints: Errors that the simulator saw so far, such as a byte that came before the last was read.
+
+    Args:
+        memory: What its EEPROM holds, from address 0.
+
+    Raises:
+        ConfigurationError: avr-gcc, a C compiler or simavr is missing, or the image cannot be read.
+    """
+
+    def __init__(self, memory: bytes) -> None:
+        self.outputs = _Outputs()
+        self.longest_step = self.asleep = self.complaints = 0
+        self._library = library()
+        self._board = self._library.board_open(str(native.image()).encode(), memory, len(memory))
+        if not self._board:
+            raise ConfigurationError(f"simavr cannot run {native.image()}; remove that folder and try again")
+        self._out = ctypes.create_string_buffer(1024)
+        self._inbox = b""
+
+    def tick(
+        self, cart_counts: int = 0, pole_counts: int = 0, switches: tuple[bool, bool] = (False, False),
+        data: bytes = b"",
+    ) -> bytes:  # fmt: skip
+        """Run a millisecond; return the bytes sent in it.
+
+        Args:
+            cart_counts: By how much the cart's encoder turns.
+            pole_counts: By how much the pole's does.
+            switches: Whether the left and the right limit switch are closed.
+            data: Bytes from the host; they come as fast as 1 Mbaud carries them, also in later calls.
+
+        Raises:
+            ConfigurationError: The chip's program ended.
+        """
+        outputs, self._inbox = self.outputs, self._inbox + data
+        rx, self._inbox = self._inbox[:_BYTES_PER_TICK], self._inbox[_BYTES_PER_TICK:]
+        length = self._library.board_tick(
+            self._board, cart_counts, pole_counts, *switches, rx, len(rx), self._out, ctypes.byref(outputs)
+        )
+        if outputs.crashed:
+            raise ConfigurationError("the chip's program ended; this is an error of the firmware")
+        self.longest_step = max(self.longest_step, outputs.longest_step)
+        self.asleep += outputs.asleep
+        self.complaints += outputs.complaints
+        return self._out.raw[:length]
+
+    def close(self) -> None:
+        """Give the simulator's memory back."""
+        self._library.board_close(self._board)
+        self._board = None
+
+
 class AvrDevice:
     """A chip on a cart-pole; tick by tick, bytes in and bytes out, like :class:`CartpoleDevice`.
 
-    The chip sees no more than its pins: edges of two quadrature encoders, two limit switches and the UART. Its
+    The chip sees no more than its pins: edges of two quadrature encoders, two limit switches, the UART. Its
     PWM, averaged over each millisecond, is the force on the cart. Noise and jitter of the profile do not act:
     counts are what the encoders count. The whole latency lies between a command and its action.
 
     Attributes:
         received_bytes: How many have come from the host.
-        longest_step: Most cycles that a control step took so far, interrupts included.
-        asleep: Cycles without anything to do so far.
-        complaints: Errors that the simulator saw so far, such as a byte that came before the last was read.
+        chip: The chip.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
@@ -115,20 +172,14 @@ class AvrDevice:
         profile = find_profile(truth.profile)
         jitter = (profile.actuation_jitter_ticks + profile.sensing_jitter_ticks) // 2
         delay = truth.actuation_ticks + truth.sensing_ticks + jitter
-        memory = eeprom(settings_of(truth, delay), build.full_force_n)
-        self._library = library()
-        self._board = self._library.board_open(str(native.image()).encode(), memory, len(memory))
-        if not self._board:
-            raise ConfigurationError(f"simavr cannot run {native.image()}; remove that folder and try again")
-        self._outputs = _Outputs()
-        self._out = ctypes.create_string_buffer(1024)
+        self.chip = Chip(eeprom(settings_of(truth, delay), build.full_force_n))
         self._counted = self._counts()
         self._inbox = b""
         self._tick = 0
         self._setting_pole = False
         self._decoder = protocol.FrameDecoder()
         self._status = Status.NONE
-        self.received_bytes = self.longest_step = self.asleep = self.complaints = 0
+        self.received_bytes = 0
 
     @property
     def device_ns(self) -> int:
@@ -143,7 +194,7 @@ class AvrDevice:
     @property
     def armed(self) -> bool:
         """Whether the motor follows targets: the lamp is on."""
-        return bool(self._outputs.armed)
+        return bool(self.chip.outputs.armed)
 
     @property
     def mode(self) -> str:
@@ -175,39 +226,29 @@ class AvrDevice:
         Raises:
             ConfigurationError: The chip's program ended.
         """
-        mechanics, build, outputs = self._mechanics, self._build, self._outputs
+        mechanics, build, outputs = self._mechanics, self._build, self.chip.outputs
         counts = self._counts()
         cart, _ = mechanics.position
         turns = counts[1] - self._counted[1]
         # The hand sets the pole by the short way; the simulator's angle may jump by whole turns then.
         turns = (turns + build.counts_per_turn // 2) % build.counts_per_turn - build.counts_per_turn // 2
-        rx, self._inbox = self._inbox[:_BYTES_PER_TICK], self._inbox[_BYTES_PER_TICK:]
-        length = self._library.board_tick(
-            self._board, counts[0] - self._counted[0], turns,
-            cart <= -build.switch_m, cart >= build.switch_m, rx, len(rx),
-            self._out, ctypes.byref(outputs),
-        )  # fmt: skip
-        if outputs.crashed:
-            raise ConfigurationError("the chip's program ended; this is an error of the firmware")
+        data, self._inbox = self._inbox, b""
+        switches = (cart <= -build.switch_m, cart >= build.switch_m)
+        out = self.chip.tick(counts[0] - self._counted[0], turns, switches, data)
         self._counted = counts
         self._tick += 1
-        self.longest_step = max(self.longest_step, outputs.longest_step)
-        self.asleep += outputs.asleep
-        self.complaints += outputs.complaints
         if outputs.armed or (mechanics.homing and not outputs.set_pole):
             mechanics.release()
         if outputs.set_pole and not self._setting_pole:
             mechanics.begin_homing()
         self._setting_pole = bool(outputs.set_pole)
         mechanics.step(outputs.pwm / build.pwm_top * build.full_force_n)
-        out = self._out.raw[:length]
         self._listen(out)
         return out
 
     def close(self) -> None:
         """Give the simulator's memory back."""
-        self._library.board_close(self._board)
-        self._board = None
+        self.chip.close()
 
     def _counts(self) -> tuple[int, int]:
         """Return where the encoders are at the end of this millisecond, if nothing pushes meanwhile."""

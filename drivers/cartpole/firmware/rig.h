@@ -16,7 +16,7 @@
 #define RIG_PWM_TOP 799L              /* Motor fully on. */
 
 /* Homing: speed and force of the cart, how near to the middle is near enough, how upright is upright. */
-#define RIG_HOMING_UM_S 200000UL
+#define RIG_HOMING_UM_S 250000UL
 #define RIG_HOMING_MN 3000U
 #define RIG_HOMING_MN_M 80000UL
 #define RIG_HOMING_MNS_M 8000UL

@@ -134,11 +134,21 @@ static avr_cycle_count_t deliver(avr_t *avr, avr_cycle_count_t when, void *param
 
 static void move(board *b, encoder *e, int32_t counts)
 {
-    e->left = counts;
-    if (counts == 0)
+    e->left += counts;
+    if (e->left == 0) {
+        avr_cycle_timer_cancel(b->avr, turn, e);
         return;
-    e->every = CYCLES_PER_MS / (counts < 0 ? -counts : counts);
+    }
+    e->every = CYCLES_PER_MS / (e->left < 0 ? -e->left : e->left);
     avr_cycle_timer_register(b->avr, (avr_cycle_count_t)e->every / 2 + 1, turn, e);
+}
+
+static avr_cycle_count_t wake(avr_t *avr, avr_cycle_count_t when, void *param)
+{
+    (void)avr;
+    (void)when;
+    (void)param;
+    return 0;
 }
 
 static avr_irq_t *pin(avr_t *avr, char port, int bit)
@@ -186,6 +196,7 @@ board *board_open(const char *elf, uint8_t *eeprom, uint32_t length)
     b->right = pin(b->avr, 'D', 7);
     b->uart = avr_io_getirq(b->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
     avr_irq_register_notify(avr_io_getirq(b->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), sent, b);
+    b->cart.at = b->pole.at = 2; /* Both pins high, as the pull-ups have them before the first edge. */
     show(&b->cart);
     show(&b->pole);
     return b;
@@ -212,6 +223,8 @@ uint32_t board_tick(board *b, int32_t cart_counts, int32_t pole_counts, int left
     if (rx_length)
         avr_cycle_timer_register(b->avr, CYCLES_PER_BYTE, deliver, b);
     outputs->crashed = 0;
+    /* A chip that sleeps runs on to the next event, which may lie in the next millisecond. */
+    avr_cycle_timer_register(b->avr, b->end > b->avr->cycle ? b->end - b->avr->cycle : 1, wake, b);
     while (b->avr->cycle < b->end && !outputs->crashed) {
         int state = avr_run(b->avr);
         outputs->crashed = state == cpu_Done || state == cpu_Crashed;
