@@ -167,8 +167,9 @@ class Emulate:
     truth_from: Path | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
-    firmware: Literal["python", "host"] = "python"
-    """Cart-pole: the firmware in Python, or its C core compiled for this host (docs/firmware.md)."""
+    firmware: Literal["python", "host", "avr"] = "python"
+    """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
+    under simavr (docs/firmware.md)."""
 
     link: Path | None = None
     """Make a symbolic link to the port here."""
