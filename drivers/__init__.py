@@ -51,6 +51,7 @@ TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
 """Transports without a descriptor to inherit: each process opens its own."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
     ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
+    ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
     ("cartpole", "dynamixel"): "deal_hw.drivers.cartpole.dynamixel.connect:dynamixel_robot",
 }
 """Robots whose driver on a wire is another than that of :data:`ROBOTS`, (robot, wire) -> "module:function".
@@ -58,10 +59,10 @@ MAKERS: Final[Mapping[tuple[str, str], str]] = {
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
 descriptor of the port that a parent process opened. It does no I/O.
 """
-CAN_NODES: Final[Mapping[str, tuple[int, ...]]] = {"can": (1,)}
+CAN_NODES: Final[Mapping[str, tuple[int, ...]]] = {"can": (1,), "odrive": (0, 2)}
 """Transports over a CAN bus, and the numbers that their devices usually have."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
-    "cartpole": ("serial", "can", "dynamixel"),
+    "cartpole": ("serial", "can", "odrive", "dynamixel"),
     "go2": TOPIC_TRANSPORTS,
     "go2_hung": TOPIC_TRANSPORTS,
 }

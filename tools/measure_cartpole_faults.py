@@ -24,7 +24,7 @@ BY_ITSELF = (
     "gone", "cut", "frozen", "bus-off", "transmit buffer full", "node lost", "belt servo restarts",
     "overload", "pole servo absent",
 )  # fmt: skip
-CAN = ("can",)
+CAN = ("can", "odrive")
 DYNAMIXEL = ("dynamixel",)
 STOPPED = "stopped"
 """A servo that its own watchdog stopped stands still, with torque."""
@@ -55,7 +55,7 @@ class CartpoleRig(Rig):
     """A cart-pole that plays a chirp."""
 
     robot = "cartpole"
-    wires = ("serial", "can", "dynamixel")
+    wires = ("serial", "can", "odrive", "dynamixel")
     longest_s = 1.0
     active = frozenset({ARMED})
     inactive = frozenset({IDLE, HELD, STOPPED})

@@ -47,6 +47,9 @@ class Demo(Checked):
     episodes: Annotated[int, Range(1, 1000)] = 3
     """Deployments of each policy, 10 s each."""
 
+    firmware: Literal["python", "host", "avr"] = "python"
+    """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
+
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps; by default those of the shipped UDR policy."""
 
@@ -111,9 +114,12 @@ def demo(config: Demo) -> DemoReport:
             },
             {"demo": config.seed},
         )
-        options = ("--profile", config.profile, "--seed", str(config.seed), "--reveal-to", str(truth_file))
+        options = (
+            "--transport", config.transport, "--profile", config.profile, "--seed", str(config.seed),
+            "--firmware", config.firmware, "--reveal-to", str(truth_file),
+        )  # fmt: skip
         link = LinkOptions(transport=config.transport)
-        with EmulatorProcess("cartpole", "--transport", config.transport, *options) as emulator:
+        with EmulatorProcess("cartpole", *options) as emulator:
             port = emulator.port
             print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
             with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):

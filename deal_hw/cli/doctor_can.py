@@ -9,19 +9,12 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from serial.tools import list_ports
-
 from deal_hw.clock import Clock
-from deal_hw.drivers.transports.can_transport import CanAddress, CanTransport, can_links
+from deal_hw.drivers.transports.can_transport import CanAddress, CanTransport, can_links, open_can
+from deal_hw.drivers.transports.slcan_transport import serial_adapters
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.findings import Finding, Level
 
-SERIAL_ADAPTERS = {
-    (0xAD50, 0x60C4): "CANable or CANtact (slcan)",
-    (0x16D0, 0x117E): "CANable 2 (slcan)",
-    (0x04D8, 0x000A): "USBtin (slcan)",
-}
-"""USB vendor and product of adapters that speak slcan."""
 _BUSY = 0.7
 """Share of the bus from which on late frames are to be expected."""
 
@@ -31,9 +24,8 @@ def list_adapters() -> Iterator[Finding]:
     details = _ip_details()
     for name in can_links():
         yield _judge_link(name, details.get(name, {}))
-    for entry in list_ports.comports():
-        if (kind := SERIAL_ADAPTERS.get((entry.vid, entry.pid))) is not None:
-            yield Finding("can", Level.OK, f"slcan:{entry.device}: {kind}")
+    for device, kind in serial_adapters():
+        yield Finding("can", Level.OK, f"slcan:{device}: {kind}")
 
 
 def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
@@ -95,10 +87,9 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
 
 def examine_can(port: str, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
     """Yield what is heard on the bus of a port; arguments and errors as :func:`listen_to_bus`."""
-    from deal_hw.drivers.transports.can_transport import open_can
-
     address = CanAddress.parse(port)
-    expected = nodes if address.node is None else (address.node, *nodes[1:])
+    given = (address.node, address.encoder)
+    expected = [usual if own is None else own for usual, own in zip(nodes, given, strict=False)]
     yield from listen_to_bus(open_can(port, clock), clock, seconds, *expected)
 
 

@@ -154,6 +154,7 @@ class ServoOptions:
 CARTPOLE_EMULATORS = {
     "serial": "deal_hw.drivers.cartpole.emulator:serial_emulator",
     "can": "deal_hw.drivers.cartpole.can_emulator:can_emulator",
+    "odrive": "deal_hw.drivers.cartpole.odrive_emulator:odrive_emulator",
     "dynamixel": "deal_hw.drivers.cartpole.dynamixel.emulator:dynamixel_emulator",
 }
 """Wires of the cart-pole -> "module:function"; the function is called as
@@ -196,8 +197,9 @@ class Emulate:
     truth_from: Path | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
-    firmware: Literal["python", "host"] = "python"
-    """Cart-pole: the firmware in Python, or its C core compiled for this host (docs/firmware.md)."""
+    firmware: Literal["python", "host", "avr"] = "python"
+    """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
+    under simavr (docs/firmware.md)."""
 
     link: Path | None = None
     """Make a symbolic link to the port here."""

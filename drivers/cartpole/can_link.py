@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -21,6 +22,27 @@ from deal_hw.errors import ConfigurationError, FrameError
 if TYPE_CHECKING:
     from cantools.database.can import Message as DbcMessage
 
+
+@dataclass(frozen=True, slots=True)
+class Angle:
+    """The pole's encoder alone, where a motor drive has the cart: one sample.
+
+    Attributes:
+        sequence: Low byte of the sample's number.
+        device_us: Low 32 bits of the encoder's time.
+        pole_urad: Pole angle, 0 upright, not wrapped.
+        pole_urad_s: Pole velocity.
+        status: Bits of :class:`deal_hw.types.Status`, of which it knows homing and homed.
+    """
+
+    sequence: int
+    device_us: int
+    pole_urad: int
+    pole_urad_s: int
+    status: int
+
+
+CanMessage = protocol.AnyMessage | Angle
 NODE: Final = 1
 LAST_NODE: Final = 62
 """Numbers are 1 to 62: 0 would take ids that CANopen uses for its network, 63 is a new ODrive's."""
@@ -30,11 +52,12 @@ FRAME: Final = struct.Struct("<IB3x8s")
 _NUMBER_BITS: Final = 5
 _DEVICE_TIME: Final = 2**48 - 1
 _DBC_NODE: Final = 1
-_GROUPS: Final[dict[str, type[protocol.AnyMessage]]] = {
+_GROUPS: Final[dict[str, type[CanMessage]]] = {
     "Stop": protocol.Stop, "Target": protocol.Target, "Arm": protocol.Arm, "Home": protocol.Home,
     "Hello": protocol.Hello, "State": protocol.State, "Ack": protocol.Ack, "Info": protocol.Info,
+    "Angle": Angle,
 }  # fmt: skip
-_LENGTHS: Final = {"Target": 3, "State": 5, "Info": 5}
+_LENGTHS: Final = {"Target": 3, "State": 5, "Info": 5, "Angle": 2}
 
 
 @functools.cache
@@ -70,7 +93,8 @@ class CanLink:
     """One side of a CAN wire; bytes are whole frames as :data:`FRAME` lays them out.
 
     Attributes:
-        errors: Messages that were torn, corrupt or unknown so far.
+        errors: Messages that were corrupt or unknown so far.
+        torn: Messages that lost a frame so far. A state's number tells a host that it is missing.
         fault: Two devices under one number; "" for nothing.
 
     Args:
@@ -82,7 +106,7 @@ class CanLink:
     resync: ClassVar[bytes] = b""
 
     def __init__(self, node: int = NODE, version: int = protocol.VERSION, unique_id: int = 0) -> None:
-        self.errors = 0
+        self.errors = self.torn = 0
         self.fault = ""
         self._node, self._version, self._unique_id = check_node(node), version, unique_id
         self._names = {frame_id(name, node): name for name in database()}
@@ -97,8 +121,8 @@ class CanLink:
             "its firmware have another DBC?"
         )
 
-    def encode(self, message: protocol.AnyMessage) -> bytes:
-        """Return a message's frames; every twentieth state is followed by a heartbeat.
+    def encode(self, message: CanMessage) -> bytes:
+        """Return a message's frames; every twentieth sample is followed by a heartbeat.
 
         Raises:
             FrameError: A value does not fit its field.
@@ -113,12 +137,20 @@ class CanLink:
         if len(parts) > 1:
             parts[-1] = parts[-1][:-2] + self._crc(group, parts).to_bytes(2, "little")
         out = b"".join(self._frame(name, part) for name, part in zip(names, parts, strict=True))
-        if isinstance(message, protocol.State) and message.sequence % STATES_PER_HEARTBEAT == 0:
+        if isinstance(message, protocol.State | Angle) and message.sequence % STATES_PER_HEARTBEAT == 0:
             out += self._status(message)
         return out
 
     def decode(self, data: bytes) -> Iterator[protocol.AnyMessage]:
         """Take frames; return the messages that they complete, and count what is none."""
+        return (message for message in self.decode_all(data) if not isinstance(message, Angle))
+
+    def feasible(self, target: protocol.Target) -> protocol.Target:
+        """Return a target as this wire carries it."""
+        return target
+
+    def decode_all(self, data: bytes) -> Iterator[CanMessage]:
+        """Do the same with messages that only CAN has."""
         if len(data) % FRAME.size:
             self.errors += 1
             return
@@ -133,19 +165,19 @@ class CanLink:
             elif name != "Errors" and (message := self._take(name, payload[:length])) is not None:
                 yield message
 
-    def _take(self, name: str, part: bytes) -> protocol.AnyMessage | None:
+    def _take(self, name: str, part: bytes) -> CanMessage | None:
         group = name.rstrip("0123456789")
         names = _frames_of(group)
         index = names.index(name)
         parts = self._parts.get(group)
         if index == 0:
             # A first frame while others are missing: that message is torn.
-            self.errors += bool(parts)
+            self.torn += bool(parts)
             parts = self._parts[group] = []
         if parts is None:
             return None  # The rest of a message whose beginning is lost or was not heard.
         if len(parts) != index:
-            self.errors += 1
+            self.torn += 1
             self._parts[group] = None
             return None
         parts.append(part)
@@ -158,7 +190,7 @@ class CanLink:
             self.errors += 1
             return None
 
-    def _assemble(self, group: str, names: Sequence[str], parts: list[bytes]) -> protocol.AnyMessage:
+    def _assemble(self, group: str, names: Sequence[str], parts: list[bytes]) -> CanMessage:
         if len(parts) > 1 and self._crc(group, parts) != int.from_bytes(parts[-1][-2:], "little"):
             raise FrameError(f"{group}: its frames do not belong together, or one is corrupt")
         values: dict[str, int] = {}
@@ -185,14 +217,14 @@ class CanLink:
                 "them another number, or take it off the bus"
             )
 
-    def _status(self, state: protocol.State) -> bytes:
+    def _status(self, state: protocol.State | Angle) -> bytes:
         low = self._unique_id & 0xFFFF_FFFF
         zero = {"TransmitErrors": 0, "ReceiveErrors": 0}
         heartbeat = {"UniqueIdLow": low, "Version": self._version, "Status": state.status, **zero}
         out = self._frame("Heartbeat", _pack("Heartbeat", heartbeat))
-        if self.errors:
+        if self.errors or self.torn:
             counts = {"ReceiveOverflows": 0, "BusOffs": 0, "TransmitDrops": 0}
-            torn = {"TornMessages": min(self.errors, 0xFFFF), **counts}
+            torn = {"TornMessages": min(self.errors + self.torn, 0xFFFF), **counts}
             out += self._frame("Errors", _pack("Errors", torn))
         return out
 
@@ -210,7 +242,7 @@ def _pack(name: str, values: dict[str, int]) -> bytes:
     return message.encode({s.name: values[s.name] for s in message.signals}, scaling=False, strict=True)
 
 
-def _to_values(message: protocol.AnyMessage, version: int) -> dict[str, int]:
+def _to_values(message: CanMessage, version: int) -> dict[str, int]:
     match message:
         case protocol.State():
             return {
@@ -220,6 +252,12 @@ def _to_values(message: protocol.AnyMessage, version: int) -> dict[str, int]:
                 "CartVelocity": message.cart_um_s, "PolePosition": message.pole_urad,
                 "PoleVelocity": message.pole_urad_s, "Effort": message.effort_mn,
                 "CommandAge": message.command_age_us, "Crc": 0,
+            }  # fmt: skip
+        case Angle():
+            return {
+                "PoleAngle": message.pole_urad, "PoleRate": message.pole_urad_s,
+                "DeviceTimeLow": message.device_us & 0xFFFF_FFFF, "SequenceByte": message.sequence & 0xFF,
+                "Status": message.status, "Crc": 0,
             }  # fmt: skip
         case protocol.Target():
             return {
@@ -250,7 +288,7 @@ def _to_values(message: protocol.AnyMessage, version: int) -> dict[str, int]:
             return {"Request": message.request, "Version": version}
 
 
-def _from_values(kind: type[protocol.AnyMessage], v: dict[str, int]) -> protocol.AnyMessage:
+def _from_values(kind: type[CanMessage], v: dict[str, int]) -> CanMessage:
     if kind is protocol.State:
         if v["SequenceLow"] != v["Sequence"] & 0xFF:
             raise FrameError("State: its frames have different numbers")
@@ -262,6 +300,8 @@ def _from_values(kind: type[protocol.AnyMessage], v: dict[str, int]) -> protocol
         return protocol.Target(
             v["Sequence"], v["Position"], v["Stiffness"], v["Damping"], v["EffortLimit"], v["SpeedLimit"]
         )
+    if kind is Angle:
+        return Angle(v["SequenceByte"], v["DeviceTimeLow"], v["PoleAngle"], v["PoleRate"], v["Status"])
     if kind is protocol.Info:
         text = v["Kind1"].to_bytes(8, "little") + v["Kind2"].to_bytes(8, "little")
         return protocol.Info(

@@ -85,7 +85,8 @@ def can_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool 
     Raises:
         ConfigurationError: The port means nothing.
     """
-    node = check_node(CanAddress.parse(port).node or NODE)
+    given = CanAddress.parse(port).node
+    node = check_node(NODE if given is None else given)
     frames = CanFrames(open_can(port, clock, accept(node), fd))
     return CartpoleRobot(frames if can_send else listen_only(frames), clock, link=lambda: CanLink(node))
 

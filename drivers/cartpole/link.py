@@ -36,7 +36,14 @@ class HostLink(Link, Protocol):
         hint: What to check where bytes come but no answer.
     """
 
-    fault: str
+    def feasible(self, target: protocol.Target) -> protocol.Target:
+        """Return what of a target this wire carries, as it will be sent next."""
+        ...
+
+    @property
+    def fault(self) -> str:
+        """What was heard that forbids going on."""
+        ...
 
     @property
     def resync(self) -> bytes:
@@ -69,6 +76,10 @@ class SerialLink:
     @errors.setter
     def errors(self, count: int) -> None:
         self._decoder.errors = count
+
+    def feasible(self, target: protocol.Target) -> protocol.Target:
+        """Return what of a target this wire carries: all of it."""
+        return target
 
     def decode(self, data: bytes) -> Iterable[protocol.AnyMessage]:
         """Take bytes; return the messages that they complete, and count what is none."""

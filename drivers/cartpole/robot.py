@@ -129,7 +129,7 @@ class CartpoleRobot(Robot):
             SafetyError: A value is not finite.
         """
         sequence = (self._sequence + 1) % protocol.NO_COMMAND
-        target = to_target(command, sequence)
+        target = self._link.feasible(to_target(command, sequence))
         self._send(self._link.encode(target))
         self._sequence = sequence
         return from_target(target)

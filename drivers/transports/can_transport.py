@@ -29,7 +29,9 @@ from deal_hw.errors import (
 from deal_hw.transport import Message, Transport
 
 BITRATE: Final = 500_000
-_SETTINGS: Final = ("bitrate", "node", "encoder")
+_SETTINGS: Final = (
+    "bitrate", "node", "encoder", "mm_per_turn", "kv", "enable_watchdog", "watchdog_timeout",
+)  # fmt: skip
 _NOT_SET_HERE: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose bit rate the system sets (``ip link``), or that have none."""
 _CAN_LINK: Final = "280"
@@ -54,6 +56,10 @@ class CanAddress:
         bitrate: Bits per second of the bus; socketcan's is set by ``ip link``.
         node: Number of the device on the bus; None: the driver's usual one.
         encoder: Number of a second device, the pole's encoder; None: the driver's usual one.
+        mm_per_turn: Travel of the cart a turn of the motor [mm], for a motor drive.
+        kv: Of the motor [rev/min/V], for a motor drive.
+        enable_watchdog: Number of a motor drive's setting, as its firmware numbers them.
+        watchdog_timeout: The same.
     """
 
     interface: str
@@ -61,6 +67,10 @@ class CanAddress:
     bitrate: int = BITRATE
     node: int | None = None
     encoder: int | None = None
+    mm_per_turn: int | None = None
+    kv: int | None = None
+    enable_watchdog: int | None = None
+    watchdog_timeout: int | None = None
 
     @classmethod
     def parse(cls, port: str) -> CanAddress:
@@ -83,8 +93,9 @@ class CanAddress:
         for name, value in parse_qsl(query, keep_blank_values=True):
             if name not in _SETTINGS:
                 raise UnknownNameError("setting of a CAN port", name, _SETTINGS)
-            if not value.isascii() or not value.isdigit() or not 0 < int(value[:9]) <= 1_000_000:
-                raise ConfigurationError(f"port {port!r}: {name} is a whole number, at most 1000000")
+            least = 0 if name == "node" else 1
+            if not value.isascii() or not value.isdigit() or not least <= int(value[:9]) <= 1_000_000:
+                raise ConfigurationError(f"port {port!r}: {name} is a whole number, {least} to 1000000")
             values[name] = int(value)
         return cls(interface=interface, channel=channel, **values)
 

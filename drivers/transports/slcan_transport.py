@@ -13,6 +13,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final, Protocol
 
+from serial.tools import list_ports
+
 from deal_hw.clock import Clock
 from deal_hw.drivers.transports.can_transport import NO_ACKNOWLEDGE, CanTransport
 from deal_hw.drivers.transports.serial_transport import SerialTransport
@@ -29,12 +31,24 @@ END: Final = b"\r"
 REFUSED: Final = b"\a"
 LONGEST_LINE: Final = 40
 """An extended frame of 8 bytes with a time stamp has 31 characters; what is longer is garbage."""
+USB_ADAPTERS: Final = {
+    (0xAD50, 0x60C4): "CANable or CANtact (slcan)",
+    (0x16D0, 0x117E): "CANable 2 (slcan)",
+    (0x04D8, 0x000A): "USBtin (slcan)",
+}
+"""USB vendor and product of adapters that speak slcan."""
 TX_FULL, WARNING, PASSIVE, BUS_ERROR = 0x02, 0x04, 0x20, 0x80
 """Bits of the adapter's answer to F that matter here."""
 _SILENCE_NS = 100_000_000
 """After such a silence another process may have left half a line in the adapter: it is ended first [ns]."""
 _LINE = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _FLAGS = re.compile(rb"F([0-9A-Fa-f]{2})")
+
+
+def serial_adapters() -> list[tuple[str, str]]:
+    """Return this computer's serial CAN adapters: port and kind."""
+    found = ((port.device, USB_ADAPTERS.get((port.vid, port.pid))) for port in list_ports.comports())
+    return [(device, kind) for device, kind in found if kind is not None]
 
 
 def encode_line(channel: str, payload: bytes) -> bytes:
