@@ -125,7 +125,9 @@ def main() -> int:
             print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
     print(table(rows))
     if given.out is not None:
-        result = {"argv": sys.argv[1:-1], "machine": describe_machine(), "rows": rows}
+        # Names of files only: where they lay on this machine is nobody's business.
+        argv = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
+        result = {"argv": argv, "machine": describe_machine(), "rows": rows}
         given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return 0
 
