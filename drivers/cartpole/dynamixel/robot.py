@@ -284,8 +284,8 @@ class DynamixelCartpole(Robot):
         if self._misses[asked[0]] > _MISSES:
             role = "belt" if asked == self._servos[:1] else "pole"
             self._latch(
-                f"servo {asked[0]} ({role}) does not answer any more: check its cable and its supply, then "
-                "start again"
+                f"servo {asked[0]} ({role}) does not answer any more: it restarted, or lost its supply or "
+                "its cable. Check both, then start again"
             )
 
     def _latch(self, fault: str) -> None:
