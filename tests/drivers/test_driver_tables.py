@@ -36,6 +36,7 @@ NOWHERE = {
     "odrive": "slcan:/dev/ttyNOPE",
     "dds": "nope0",
     "zenoh": "tcp/127.0.0.1:1",
+    "dynamixel": "/dev/does_not_exist?pole_id=3",
 }
 PAIRS = [(name, transport) for name in ROBOTS for transport in REACHED_BY[name]]
 
