@@ -352,11 +352,12 @@ class OdriveLink:
     def _take_angle(self, angle: Angle) -> Iterator[protocol.State]:
         cart, self._cart = self._cart, None
         # Number and time have gone on by less than their fields hold, or the host has started anew.
-        first = self._sequence < 0
+        passed_us = (angle.device_us - self._device_us) & _U32
         self._sequence = (self._sequence + (((angle.sequence - self._sequence - 1) & 0xFF) + 1)) & _U32
-        self._device_us += (angle.device_us - self._device_us) & _U32
+        self._device_us += passed_us
         self._heard_ns = self._clock.now_ns()
-        if first and self._heartbeat_us is not None:
+        # After a silence, as between two processes, a heartbeat gets its time anew.
+        if self._heartbeat_us is not None and passed_us > self._s.heartbeat_age_s * 1e6:
             self._heartbeat_us = self._device_us
         if cart is None:
             return  # Its number is missing from the states: that counts.

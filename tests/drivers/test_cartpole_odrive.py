@@ -276,6 +276,17 @@ def test_a_heartbeat_that_stays_away_is_a_fault() -> None:
     assert "205 ms old" in link.fault
 
 
+def test_a_silence_of_the_whole_bus_is_no_missing_heartbeat() -> None:
+    """What waited in a buffer, then 6 s later: the heartbeat has another 200 ms."""
+    link = OdriveLink(PARTS, VirtualClock())
+    list(link.decode(heartbeat()))
+    states(link, sample(1) + sample(1226))
+    assert link.fault == ""
+    for number in range(1227, 1268):
+        states(link, sample(number))
+    assert "205 ms old" in link.fault
+
+
 @settings(deadline=None, max_examples=300)
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.integers(0, 8), st.binary(max_size=8)), max_size=30))
 def test_nothing_on_the_bus_makes_the_link_fail(junk: list[tuple[int, int, bytes]]) -> None:
