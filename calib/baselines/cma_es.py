@@ -15,7 +15,7 @@ import numpy as np
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import SearchLog
 from deal_hw.calib.search.resume import Kept, State
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray

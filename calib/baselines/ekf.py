@@ -17,8 +17,7 @@ import numpy as np
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.uncertainty.intervals import Z90, intervals
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray

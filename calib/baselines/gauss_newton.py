@@ -19,8 +19,7 @@ from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
 from deal_hw.calib.uncertainty.intervals import uncertainty
 from deal_hw.calibration import CalibrationResult

@@ -26,8 +26,7 @@ from deal_hw.calib.data.innovations import explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
 from deal_hw.calib.fit.residual import DIFFERENCES
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
 from deal_hw.calib.uncertainty.intervals import intervals
 from deal_hw.calibration import Alarm, CalibrationResult

@@ -12,8 +12,7 @@ import numpy as np
 
 from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.innovations import cut, explained, whitened_residual
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import cut, explained, is_noisy, whitened_residual
-from deal_hw.calib.search.base import Search
+from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.ensemble_kalman import KalmanStepper
-from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import State
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.coordinates import Members, logistic, logit
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import Kept
 from deal_hw.types import FloatArray
 
