@@ -34,7 +34,7 @@ from scipy.stats import rankdata
 from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import SearchLog
 from deal_hw.calib.search.resume import Kept

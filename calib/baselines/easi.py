@@ -16,9 +16,9 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
-from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.base import SearchLog
+from deal_hw.calib.search.base import Coordinates, SearchLog
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError

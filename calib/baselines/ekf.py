@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, SearchLog, Stepper

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import cut, is_noisy, whitened_residual
+from deal_hw.calib.data.innovations import Members, cut, is_noisy, whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, SearchLog, Stepper

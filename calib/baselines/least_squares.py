@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import explained, samples_per_tick
+from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
 from deal_hw.calib.fit.residual import DIFFERENCES

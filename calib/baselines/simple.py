@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import cut, explained, whitened_residual
+from deal_hw.calib.data.innovations import Members, cut, explained, whitened_residual
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace

@@ -13,12 +13,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.problem import Prediction, Problem, WindowData
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Members:
+    """A population in physical units.
+
+    Attributes:
+        theta: Parameter values, (N, K).
+        latency_s: Total latency of each member, (N,) [s]; may be negative by less than the margin.
+    """
+
+    theta: FloatArray
+    latency_s: FloatArray
 
 
 def is_noisy(problem: Problem) -> bool:

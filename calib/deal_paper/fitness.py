@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.distance import cdist, pdist
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
-from deal_hw.calib.data.innovations import Whitening, cut, linearise, whitened_residual
+from deal_hw.calib.data.innovations import Members, Whitening, cut, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.rollouts import (
     PopulationPolicy,
@@ -26,6 +25,7 @@ from deal_hw.calib.deal_paper.rollouts import (
     rollout_population,
     transitions,
 )
+from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray

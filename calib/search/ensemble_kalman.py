@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members, logistic, logit
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import Kept
 from deal_hw.types import FloatArray
@@ -159,3 +159,14 @@ class KalmanStepper(Stepper):
         """Return the members at logits z, (N, C), and the one at their mean."""
         middle = logistic(z.mean(axis=0, keepdims=True))
         return self.coordinates.members(logistic(z)), self.coordinates.members(middle)
+
+
+def logit(unit: FloatArray, edge: float = 1e-9) -> FloatArray:
+    """Map the unit interval, but for its edges, to the real line: unbounded steps then stay inside."""
+    inside = np.clip(unit, edge, 1 - edge)
+    return np.asarray(np.log(inside) - np.log1p(-inside))
+
+
+def logistic(z: FloatArray) -> FloatArray:
+    """Undo :func:`logit`."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * z)))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings
 from deal_hw.calib.deal_paper.rollouts import control_ticks, rollout_population
