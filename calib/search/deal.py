@@ -36,7 +36,7 @@ from deal_hw.calib.data.innovations import (
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
-from deal_hw.calib.search.ensemble_kalman import KalmanStepper
+from deal_hw.calib.search.eki import KalmanStepper
 from deal_hw.calib.search.resume import Kept, State
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray

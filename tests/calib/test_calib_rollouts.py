@@ -19,7 +19,7 @@ from deal_hw.calib.deal_paper.rollouts import (
     transitions,
 )
 from deal_hw.calib.search.base import Coordinates
-from deal_hw.calib.search.ensemble_kalman import logistic, logit
+from deal_hw.calib.search.eki import logistic, logit
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
