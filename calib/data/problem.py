@@ -11,6 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -365,3 +366,26 @@ class Problem:
 def samples_in(problem: Problem, seconds: float) -> int:
     """Return how many samples a time holds, at least 4 and at most the longest usable episode."""
     return max(round(seconds / problem.episodes[0].period_s), 4)
+
+
+def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
+    """Cut windows of so many seconds, shorter ones where no recording holds one.
+
+    Raises:
+        InsufficientDataError: Not even windows of four samples fit.
+    """
+    length = max(round(seconds / problem.episodes[0].period_s), 4)
+    while True:
+        try:
+            return problem.windows(length)
+        except InsufficientDataError:
+            if length <= 4:
+                raise
+            length = max(int(0.8 * length), 4)
+
+
+def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
+    """Return some of the windows, chosen by a mask (W,) or by their rows."""
+    names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
+    windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
+    return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})

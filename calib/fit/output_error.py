@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem, WindowData, longest_windows
 from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
 from deal_hw.calib.fit.solver import (
     SolverSettings,
@@ -26,7 +26,6 @@ from deal_hw.calib.fit.solver import (
     huber_weights,
     solve,
 )
-from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
 
@@ -173,22 +172,6 @@ def prediction_rmse(
         squares += np.sum(np.where(seen, error, 0.0) ** 2, axis=(1, 2))
         count += np.sum(seen, axis=(0, 1))
     return np.asarray(np.sqrt(np.where(np.isfinite(squares), squares, np.inf) / np.maximum(count, 1)))
-
-
-def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
-    """Cut windows of so many seconds, shorter ones where no recording holds one.
-
-    Raises:
-        InsufficientDataError: Not even windows of four samples fit.
-    """
-    length = max(round(seconds / problem.episodes[0].period_s), 4)
-    while True:
-        try:
-            return problem.windows(length)
-        except InsufficientDataError:
-            if length <= 4:
-                raise
-            length = max(int(0.8 * length), 4)
 
 
 def expected_residual(problem: Problem) -> FloatArray:

@@ -7,13 +7,10 @@ it.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Prediction, Problem, WindowData
 from deal_hw.types import FloatArray
@@ -432,10 +429,3 @@ def _rows(
         np.concatenate([jp, np.zeros((W, S, jp.shape[2]))], axis=1),
         np.concatenate([js, root[:, :, None] * np.eye(S)], axis=1),
     )
-
-
-def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
-    """Return some of the windows, chosen by a mask (W,) or by their rows."""
-    names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
-    windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
-    return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})

@@ -7,9 +7,9 @@ is that of Iglesias and Yang (2021), the discrepancy rule for the regularisation
 linear model with a Gaussian prior the ensemble is, for large N, a sample of the exact posterior once the
 tempering reaches 1.
 
-`eki` regresses on all window innovations, whitened for noise and start-state error. No critic: the vector
-itself is regressed on. Short windows come first, because over a long one the unstable pole makes the prediction
-of a wrong simulator meaningless; long ones then hold the information.
+`eki` regresses on the vector of all window innovations, whitened for noise and start-state error; there is no
+critic. Short windows come first, because over a long one the unstable pole makes the prediction of a wrong
+simulator meaningless; long ones then hold the information.
 """
 
 from __future__ import annotations

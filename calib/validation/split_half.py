@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, taken
 from deal_hw.calib.fit.refinement import Polished, polish_windows
-from deal_hw.calib.fit.residual import Point, Shooting, taken
+from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, statement, widened_to, with_rows
 from deal_hw.calibration import Alarm, listed
 from deal_hw.parameters import ParameterSpace

@@ -23,8 +23,8 @@ from deal_hw.cli.calibrate_run import (
     finish,
     residual_std,
 )
-from deal_hw.cli.excite import balancer
 from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.cli.run_plan import balancer
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError

@@ -154,9 +154,8 @@ def require_visible_parameters(
     say: Callable[[str], None],
 ) -> None:
     """Check before any search that the recordings are long enough, move, and show every parameter."""
-    from deal_hw.calib.data.checks import check_excitation
+    from deal_hw.calib.data.checks import check_excitation, jumps, look, require_visible
     from deal_hw.calib.data.problem import Problem, samples_in
-    from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
     # Raises where not even one window of that length fits.

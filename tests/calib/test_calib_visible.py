@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deal_hw.calib.data.checks import jumps, look, require_visible
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
