@@ -145,7 +145,7 @@ class OutputErrorFits(Fits):
             known, facts["diagnosis"] = with_causes(run.problem, local, known)
         left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s)).normal
         chi2 = left.cost / max(left.count, 1)
-        found = confounded(problem, fit.hessian / known.inflation)
+        found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {
             "folds": choice.to_json(),
@@ -319,12 +319,8 @@ def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
         problem.space,
         fit.theta,
         fit.latency_s,
-        fit.hessian,
+        fit.normal,
         1.0,
-        fit.residual,
         problem.latency_range_s,
         fixed_latency=problem.fixed_latency_s is not None,
-        gradient=fit.gradient,
-        prior=fit.prior,
-        rows=fit.rows,
     )

@@ -7,7 +7,6 @@ extended, not unscented or ensemble: what bends between the mean and its uncerta
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.uncertainty.intervals import Z90, intervals
@@ -203,7 +202,7 @@ class _Passes(Stepper):
             predicted = problem.predict(
                 members.theta,
                 members.latency_s,
-                only(data, w),
+                taken(data, np.array([w])),
                 points[:, None, :C],
                 points[:, None, C : 2 * C],
             )
@@ -257,18 +256,3 @@ class Ekf(Search):
     name = "ekf"
     stepper = _Passes
     settings: EkfSettings = field(default_factory=EkfSettings)
-
-
-def only(data: WindowData, w: int) -> WindowData:
-    """Return one window of several."""
-    one = slice(w, w + 1)
-    return dataclasses.replace(
-        data,
-        windows=dataclasses.replace(data.windows, start=data.windows.start[one]),
-        measured=data.measured[one],
-        std=data.std[one],
-        start_position=data.start_position[one],
-        start_velocity=data.start_velocity[one],
-        prior_mean=data.prior_mean[one],
-        prior_std=data.prior_std[one],
-    )

@@ -17,7 +17,7 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, cut, is_noisy, whitened_residual
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
+from deal_hw.calib.fit.residual import DIFFERENCES, Normal, value_bounds
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
 from deal_hw.calib.uncertainty.intervals import uncertainty
@@ -297,13 +297,14 @@ class _MultiStart(Stepper):
         chi2 = float(linear.cost[0]) / linear.residual.shape[1]
         theta = problem.space.from_scale(value[:-1])
         latency = self.coordinates.clip_latency(float(value[-1]))
+        residual, nothing = np.nan_to_num(linear.residual[0]), np.zeros(len(value))
+        split = innovations.split(residual)
         known = uncertainty(
             problem.space,
             theta,
             latency,
-            linear.hessian[0],
+            Normal(float(linear.cost[0]), residual.size, linear.hessian[0], nothing, split, nothing),
             chi2 if math.isfinite(chi2) else 1.0,
-            innovations.split(np.nan_to_num(linear.residual[0])),
             problem.latency_range_s,
             fixed_latency=self._fixed,
             timing_std_s=problem.noise.timing_std_s,

@@ -334,13 +334,13 @@ def _solve_starts(
     ]
     best = min(fits, key=_score)
     K = len(problem.space)
-    residual = np.concatenate([r.ravel() for r in best.residual])
+    residual = np.concatenate([r.ravel() for r in best.normal.residual])
     variance = float(residual @ residual) / max(len(residual) - K, 1)
     # The range as a flat prior keeps what the data cannot see finite.
     flat = np.diag(12.0 / problem.space.width**2)
     return Found(
         theta=best.theta,
-        covariance=np.asarray(np.linalg.inv(best.hessian[:K, :K] / variance + flat)),
+        covariance=np.asarray(np.linalg.inv(best.normal.hessian[:K, :K] / variance + flat)),
         latency_s=best.latency_s,
         iterations=sum(fit.iterations for fit in (*rough, *fits)),
         message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",

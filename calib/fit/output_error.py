@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData, longest_windows
-from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
+from deal_hw.calib.fit.residual import Normal, Point, Shooting
 from deal_hw.calib.fit.solver import (
     SolverSettings,
     channel_scale,
@@ -71,23 +71,15 @@ class HorizonFit:
         latency_s: Total latency [s].
         scale: What residuals were measured by, channel by channel, (M,): their root mean square, or where the
             loss is robust their middle.
-        hessian: Normal matrix of residuals over ``scale`` and of what is known of the parameters by other
-            means, parameters in their own scale and the latency, (K + 1, K + 1).
-        gradient: Half the gradient of their sum of squares, (K + 1,).
-        prior: Information that is not the recordings', (K + 1,).
-        rows: Weighed residuals and their derivatives, window by window.
-        residual: Residuals over ``scale`` per recording, (W, H, M).
+        normal: Normal equations of weighed residuals and of what is known of the parameters by other means,
+            with their rows; nothing of a latency that is fixed. Its residuals are those over ``scale``.
         iterations: Steps used.
     """
 
     theta: FloatArray
     latency_s: float
     scale: FloatArray
-    hessian: FloatArray
-    gradient: FloatArray
-    prior: FloatArray
-    rows: tuple[WindowRows, ...]
-    residual: tuple[FloatArray, ...]
+    normal: Normal
     iterations: int
 
 
@@ -127,7 +119,7 @@ def fit_horizon(
     while left > 0:
         # Residuals are measured anew every few steps: nobody has said how good the model is.
         weighed, _ = _weighed(plain, point, recipe)
-        before = weighed.costs([point])[0]
+        before = weighed.cost(point)
         # The prior holds what is not seen; autocorrelated residuals weigh too little for another hold.
         solver = SolverSettings(
             iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
@@ -139,19 +131,16 @@ def fit_horizon(
     weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf)
     normal = weighed.normal(point, keep=True, central=central)
     free = np.append(np.ones(len(space)), 0.0 if fixed else 1.0)
-    return HorizonFit(
-        theta=plain.theta(point),
-        latency_s=float(point.value[-1]),
-        scale=scale,
+    normal = dataclasses.replace(
+        normal,
         hessian=normal.hessian * np.outer(free, free),
         gradient=normal.gradient * free,
-        prior=normal.prior,
         rows=tuple(dataclasses.replace(r, parameter=r.parameter * free) for r in normal.rows),
         residual=tuple(
             _errors(d, r) / scale for d, r in zip(plain.data, plain.residuals(point), strict=True)
         ),
-        iterations=used,
     )
+    return HorizonFit(plain.theta(point), float(point.value[-1]), scale, normal, used)
 
 
 def prediction_rmse(

@@ -219,7 +219,7 @@ def polish_robust(polished: Polished, fixed_latency: bool) -> Polished:
         )
         iterations += found.iterations
     free = len(plain.problem.space) + (0 if fixed_latency else 1)
-    chi2 = float(plain.costs([found.point])[0]) / max(found.normal.count - free, 1)
+    chi2 = plain.cost(found.point) / max(found.normal.count - free, 1)
     return dataclasses.replace(found, chi2=chi2, iterations=iterations)
 
 

@@ -89,9 +89,9 @@ class Normal:
         count: Residuals, not counting start states' unknowns.
         hessian: (K + 1, K + 1).
         gradient: (K + 1,).
-        back: Per episode what turns a parameter step into start-state steps: (W, 2C, K + 1) and (W, 2C).
         residual: Whitened residuals per episode, (W, H, M).
         prior: Information that the parameters' priors gave to the hessian, (K + 1,).
+        back: Per episode what turns a parameter step into start-state steps: (W, 2C, K + 1) and (W, 2C).
         rows: Linearised residuals per episode, where they were asked for.
     """
 
@@ -99,9 +99,9 @@ class Normal:
     count: int
     hessian: FloatArray
     gradient: FloatArray
-    back: tuple[tuple[FloatArray, FloatArray], ...]
     residual: tuple[FloatArray, ...]
     prior: FloatArray
+    back: tuple[tuple[FloatArray, FloatArray], ...] = ()
     rows: tuple[WindowRows, ...] = ()
 
 
@@ -268,8 +268,8 @@ class Shooting:
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
             count += W * int(data.prior_counts.sum()) - W * 2 * C
-        all_of = tuple(back), tuple(residuals), self.prior_information, tuple(rows)
-        return Normal(cost, count, hessian, gradient, *all_of)
+        found = tuple(residuals), self.prior_information, tuple(back), tuple(rows)
+        return Normal(cost, count, hessian, gradient, *found)
 
     def followed(self, point: Point, normal: Normal, step: FloatArray) -> Point:
         """Return the point after a parameter step, (K + 1,), each window's start state moved as suits it.
@@ -342,25 +342,15 @@ class Shooting:
         each = [np.concatenate([s.position_std, s.velocity_std]) for s in starts]
         return np.asarray(np.max(each, axis=0))
 
-    def costs(self, points: Sequence[Point]) -> FloatArray:
-        """Return the cost at each of several points, in one batch; infinite where a member diverged."""
-        each = self.each_cost(points)
-        return np.asarray(self.prior_costs(points) + np.sum([c.sum(axis=1) for c in each], axis=0))
+    def cost(self, point: Point) -> float:
+        """Return the sum of all squared whitened residuals at a point; infinite where it diverged."""
+        prior = ((point.value - self.prior_mean)[None] ** 2 @ self.prior_information)[0]
+        return float(prior + np.sum([c.sum() for c in self.window_costs(point)]))
 
-    def prior_costs(self, points: Sequence[Point]) -> FloatArray:
-        """Return what the parameters' priors add to the cost at each of several points, (N,)."""
-        values = np.stack([p.value for p in points])
-        return np.asarray((values - self.prior_mean) ** 2 @ self.prior_information)
-
-    def each_cost(self, points: Sequence[Point]) -> list[FloatArray]:
-        """Return the cost of each window at each of several points, in one batch, (N, W) an episode."""
-        values = np.stack([p.value for p in points])
-        found = []
-        for e in range(len(self.data)):
-            x = np.stack([p.position[e] for p in points])
-            v = np.stack([p.velocity[e] for p in points])
-            found.append(self._window_costs(e, values, x, v))
-        return found
+    def window_costs(self, point: Point) -> list[FloatArray]:
+        """Return what each window costs at a point, (W,) an episode."""
+        starts = enumerate(zip(point.position, point.velocity, strict=True))
+        return [self._window_costs(e, point.value[None], x[None], v[None])[0] for e, (x, v) in starts]
 
     def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""

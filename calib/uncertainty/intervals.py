@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.stats import truncnorm
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished
-from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
 from deal_hw.calibration import Alarm, Verdict, listed
@@ -148,16 +147,12 @@ def uncertainty(
     space: ParameterSpace,
     theta: FloatArray,
     latency_s: float,
-    hessian: FloatArray,
+    normal: Normal,
     chi2: float,
-    residuals: tuple[FloatArray, ...],
     latency_range_s: tuple[float, float],
+    *,
     fixed_latency: bool = False,
     timing_std_s: float = 0.0,
-    *,
-    gradient: FloatArray | None = None,
-    prior: FloatArray | None = None,
-    rows: Sequence[WindowRows] = (),
     kinks: float = SETTINGS.kinks,
 ) -> Uncertainty:
     """Turn normal equations into statements.
@@ -166,24 +161,20 @@ def uncertainty(
         space: The parameters.
         theta: Estimate, (K,).
         latency_s: Estimate [s].
-        hessian: Whitened normal matrix of parameters and latency, start states eliminated, (K + 1, K + 1).
+        normal: Normal equations there. Their gradient says how hard a bound is pressed; from their rows
+            variances are clustered, and without any residuals are believed to be independent but for their
+            correlation time.
         chi2: Mean squared whitened residual.
-        residuals: Whitened residuals of windows, (W, H, J) each.
         latency_range_s: Searched latencies [s].
         fixed_latency: The latency was given.
         timing_std_s: Jitter of the samples' time that the recording shows [s].
-        gradient: Half the cost's gradient there, (K + 1,); says how hard a bound is pressed. None for zeros.
-        prior: Information of the parameters' priors that is in the hessian, (K + 1,). None for none.
-        rows: Linearised residuals there, from which variances are clustered; none to believe that residuals
-            are independent but for their correlation time.
         kinks: Factor on standard deviations for what linearising leaves out.
     """
     K = len(space)
-    tau = correlation_time(residuals)
+    tau = correlation_time(normal.residual)
     inflation = kinks**2 * max(1.0, chi2) * tau
-    slope = np.zeros(K + 1) if gradient is None else gradient
-    known = np.zeros(K + 1) if prior is None else prior
-    data = hessian - np.diag(known)
+    slope, known = normal.gradient, normal.prior
+    data = normal.hessian - np.diag(known)
     # The range is a flat prior; its variance keeps what the data cannot see as wide as the range.
     flat = np.append(space.width**2, (latency_range_s[1] - latency_range_s[0]) ** 2) / 12.0
     belief = known + 1.0 / flat
@@ -194,7 +185,7 @@ def uncertainty(
     free = np.append(bound == 0, not fixed_latency)
     precision = data / inflation + np.diag(belief)
     covariance = _covariance(precision, free)
-    cluster = clustered(rows, covariance / inflation, residuals[0].shape[1], tau) if rows else None
+    cluster = clustered(normal.rows, covariance / inflation, normal.residual[0].shape[1], tau)
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
     # What the data cannot see stays as wide as the range, however autocorrelated its residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
@@ -412,20 +403,15 @@ def statement(problem: Problem, polished: Polished, fixed_latency: bool) -> Unce
         polished: Where; variances are clustered where it holds linearised residuals.
         fixed_latency: The latency was given, or decided.
     """
-    normal = polished.normal
     return uncertainty(
         problem.space,
         polished.theta,
         polished.latency_s,
-        normal.hessian,
+        polished.normal,
         polished.chi2,
-        normal.residual,
         problem.latency_range_s,
         fixed_latency=fixed_latency,
         timing_std_s=problem.noise.timing_std_s,
-        gradient=normal.gradient,
-        prior=normal.prior,
-        rows=normal.rows,
         kinks=SETTINGS.kinks if problem.robot.base is None or problem.exact else SETTINGS.contact_kinks,
     )
 

@@ -104,7 +104,7 @@ def test_a_search_that_is_kept_gets_start_states_and_intervals(case: Case, probl
     smoothed = shooting.smoothed()
     there = at_parameters(problem, searched.estimate, searched.latency_s, 40, smoothed)
     assert there.theta == pytest.approx(case.theta)
-    assert there.normal.cost < shooting.costs([shooting.start(case.theta, case.latency_s, smoothed)])[0]
+    assert there.normal.cost < shooting.cost(shooting.start(case.theta, case.latency_s, smoothed))
     assert there.chi2 < 1.3 and not unexplained(there)
 
 

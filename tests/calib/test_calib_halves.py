@@ -43,8 +43,8 @@ def test_halves_share_no_window_and_hold_all(problem: Problem, polished: Polishe
     starts = [set(s.data[0].windows.start.tolist()) for s, _ in halves]
     assert not starts[0] & starts[1]
     assert starts[0] | starts[1] == set(polished.shooting.data[0].windows.start.tolist())
-    whole = polished.shooting.costs([polished.point])[0]
-    assert sum(s.costs([p])[0] for s, p in halves) == pytest.approx(whole)
+    whole = polished.shooting.cost(polished.point)
+    assert sum(s.cost(p) for s, p in halves) == pytest.approx(whole)
     first = halves[0][0].data[0]
     assert len(first.measured) == len(first.windows) == len(halves[0][1].position[0])
 

@@ -11,7 +11,7 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import polish
-from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.uncertainty.intervals import SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
@@ -200,9 +200,10 @@ def test_intervals_of_what_the_data_cannot_see_are_the_ranges() -> None:
 def test_a_parameter_at_its_bound_is_reported() -> None:
     """The alarm names the parameter and says to widen the range."""
     space = _two()
+    residual = (np.random.default_rng(0).normal(size=(4, 50, 2)),)
     told = uncertainty(
-        space, np.array([1.0, 5.0]), 0.01, np.diag([1e4, 1e4, 1e8]), 1.0,
-        (np.random.default_rng(0).normal(size=(4, 50, 2)),), (0.0, 0.04),
+        space, np.array([1.0, 5.0]), 0.01,
+        Normal(1.0, 1, np.diag([1e4, 1e4, 1e8]), np.zeros(3), residual, np.zeros(3)), 1.0, (0.0, 0.04),
     )  # fmt: skip
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
     assert told.verdicts == ("identifiable", "identifiable")
