@@ -35,7 +35,7 @@ class Progress:
     """Where a long run stands; given to the callback after each generation or iteration.
 
     Attributes:
-        stage: What is being done, such as ``"search"``, ``"polish"`` or ``"latency"``.
+        stage: What is being done, such as ``"search"``, ``"refinement"`` or ``"latency"``.
         done: Units done.
         total: Units expected; may grow.
         message: One short line.
@@ -66,12 +66,12 @@ class Budget:
     Attributes:
         population: Members N.
         generations: Search steps T; restarts count.
-        polish: Whether the search is followed by multiple shooting.
+        refinement: Whether the search is followed by multiple shooting.
     """
 
     population: int = 100
     generations: int = 50
-    polish: bool = True
+    refine: bool = True
 
 
 @dataclass(frozen=True, slots=True)

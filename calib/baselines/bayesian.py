@@ -4,7 +4,7 @@ The first generation is a scrambled Sobol sequence. Each further one fits a Gaus
 one length scale a coordinate, whose prior grows with their number) to what was scored and takes the batch of
 the largest log expected improvement (qLogEI, Ament et al. 2023) inside a trust region around the best point,
 which grows after successes and shrinks after failures (TuRBO, Eriksson et al. 2019). Over the whole range of
-ten coordinates the batch is little better than a random one (measured: worse than the range's centre).
+ten coordinates the batch is little better than a random one (measured: worse than the range's midpoint).
 
 Scores have an arbitrary scale and long tails, so the process models their normal quantiles, which keep
 nothing but the order.

@@ -1,7 +1,7 @@
 """`cma`: covariance matrix adaptation (pycma) with restarts of growing population, on a pluggable fitness.
 
 The baseline of robot calibration in practice (PACE, NVIDIA's extension). Restarts double the population
-(IPOP, Auger and Hansen 2005) and begin at a uniform draw; the first one begins at the centre of the range.
+(IPOP, Auger and Hansen 2005) and begin at a uniform draw; the first one begins at the midpoint of the range.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ class Cma(ScoredSearch):
 
 
 class Best(Kept):
-    """The best member so far; before any was scored, the centre of the range.
+    """The best member so far; before any was scored, the midpoint of the range.
 
     Args:
         count: Coordinates C.

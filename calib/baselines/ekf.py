@@ -122,7 +122,7 @@ class _Passes(Stepper):
         self._low, self._high = value_bounds(log.problem)
         space = log.problem.space
         self._free_latency = log.problem.fixed_latency_s is None
-        # A range is a flat prior: its centre and its standard deviation, where nothing better is expected.
+        # A range is a flat prior: its midpoint and its standard deviation, where nothing better is expected.
         expected, spread = space.prior
         known = np.isfinite(spread)
         self._drift = np.append(space.width, self._high[-1] - self._low[-1])

@@ -166,10 +166,10 @@ class _MultiStart(Stepper):
         self._innovations = Innovations(self.problem, self._ticks[0], follow=False)
         # The best draws so far with their scores, later the starts with their costs.
         self._values, self._cost, self._drawn = np.empty((0, len(self.problem.space) + 1)), np.empty(0), 0
-        self._best: tuple[float, FloatArray] = (math.inf, self._centre())
+        self._best: tuple[float, FloatArray] = (math.inf, self._midpoint())
         self._explained = False
 
-    def _centre(self) -> FloatArray:
+    def _midpoint(self) -> FloatArray:
         middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
         return np.asarray(self._value_of(middle)[0], dtype=np.float64)
 
@@ -199,9 +199,9 @@ class _MultiStart(Stepper):
         budget, settings = self.log.budget, self.settings
         members = self.coordinates.members(self.coordinates.sample(self.rng, budget.population))
         values = self._value_of(members)
-        # One metric for all draws, that of the range's centre, and absolute values: most draws are so far
+        # One metric for all draws, that of the range's midpoint, and absolute values: most draws are so far
         # off that squares would rank them by their one worst window.
-        score = np.mean(np.abs(self._innovations.residual(values, self._centre())), axis=1)
+        score = np.mean(np.abs(self._innovations.residual(values, self._midpoint())), axis=1)
         pool = np.concatenate([self._values, values])
         scores = np.concatenate([self._cost, np.where(np.isfinite(score), score, np.inf)])
         order = np.argsort(scores, kind="stable")[: settings.starts]

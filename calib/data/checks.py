@@ -45,7 +45,7 @@ def check_excitation(problem: Problem) -> None:
     joints = problem.robot.joints
     spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
-    if problem.known_std is None and not problem.exact:
+    if problem.known_std is None and not problem.noise_free:
         # What a recording happens to show may be less than its sensor's noise, down to none at all: a joint
         # that never left its friction is still no motion to calibrate from.
         noises = np.maximum(noises, problem.robot.description.sensor.position_std)
@@ -98,7 +98,7 @@ SETTINGS = SensitivitySettings()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Visibility:
+class Sensitivity:
     """How much predictions change from one end of a parameter's range to the other.
 
     Attributes:
@@ -110,7 +110,7 @@ class Visibility:
     effect: FloatArray
 
     @property
-    def invisible(self) -> tuple[str, ...]:
+    def unseen(self) -> tuple[str, ...]:
         """Parameters that change nothing."""
         return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < SETTINGS.nothing)
 
@@ -122,7 +122,7 @@ class Visibility:
         )
 
 
-def look(problem: Problem) -> Visibility:
+def look(problem: Problem) -> Sensitivity:
     """Compare rollouts at both ends of each parameter's range with the nominal one.
 
     Raises:
@@ -141,7 +141,7 @@ def look(problem: Problem) -> Visibility:
         # A member that diverges at the end of its range is seen, to be sure.
         change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
         effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
-    return Visibility(space.names, effect)
+    return Sensitivity(space.names, effect)
 
 
 def jumps(problem: Problem) -> dict[str, float]:
@@ -177,15 +177,15 @@ def jumps(problem: Problem) -> dict[str, float]:
     return {name: float(nudged[k].max()) for k, name in enumerate(space.names) if rough[k]}
 
 
-def require_visible(found: Visibility) -> None:
+def require_sensitive(found: Sensitivity) -> None:
     """Refuse parameters that no rollout sees.
 
     Raises:
         ConfigurationError: There are such; the message names them.
     """
-    if found.invisible:
+    if found.unseen:
         raise ConfigurationError(
-            f"no rollout of these recordings sees {', '.join(found.invisible)}: predictions are the same "
+            f"no rollout of these recordings sees {', '.join(found.unseen)}: predictions are the same "
             "from one end of the range to the other. Remove them from the parameters (or give them with "
             "--known), or record a motion that shows them"
         )

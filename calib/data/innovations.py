@@ -36,7 +36,7 @@ class Members:
 def is_noisy(problem: Problem) -> bool:
     """Return whether what was measured carries sensor noise."""
     std = problem.noise_std[problem.channels]
-    return not problem.exact and bool(np.any(std >= problem.settings.noise_free_std))
+    return not problem.noise_free and bool(np.any(std >= problem.settings.noise_free_std))
 
 
 def samples_per_tick(problem: Problem) -> int:
@@ -213,7 +213,7 @@ def whitened_residual(
     """
     parts = []
     for i, data in enumerate(windows):
-        if problem.exact:
+        if problem.noise_free:
             whitened = (data.measured - predict(problem, members, data).observed) / data.std
             parts.append(whitened.reshape(len(whitened), -1))
             continue

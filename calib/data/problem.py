@@ -146,7 +146,7 @@ class Problem:
                     "positions, then velocities"
                 )
             return np.maximum(self.known_std, floor)
-        if self.exact:
+        if self.noise_free:
             return np.full(2 * self.coordinates, self.settings.noise_free_residual)
         found = np.full(2 * self.coordinates, floor)
         for e in self.episodes:
@@ -156,7 +156,7 @@ class Problem:
 
     def _noise_model(self) -> NoiseModel:
         slow = self.episodes[0].period_s > self.settings.slowest_jitter_s
-        if self.known_std is not None or self.exact or slow:
+        if self.known_std is not None or self.noise_free or slow:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
         # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.
@@ -224,7 +224,7 @@ class Problem:
         return self.latency_range_s[0] if self.fixed_latency_s is None else self.fixed_latency_s
 
     @property
-    def exact(self) -> bool:
+    def noise_free(self) -> bool:
         """Whether all states are known without error, so that windows need not fit where they start."""
         return all(e.exact for e in self.episodes)
 

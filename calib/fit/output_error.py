@@ -1,4 +1,4 @@
-"""Open-loop fit: least squares on long predictions from smoothed states, as a held-out recording is judged.
+"""Output-error fit: least squares on long predictions from smoothed states, as held-out motion is judged.
 
 Multiple shooting explains every sample with start states of its own, which a model that lacks something
 (backlash, a friction law, a slipped clock) uses to explain what is no start state. Over windows of seconds a
@@ -63,8 +63,8 @@ SHORT = Recipe(seconds=0.2)
 
 
 @dataclass(frozen=True, slots=True)
-class HorizonFit:
-    """Where an open-loop fit ended, with predictions linearised there.
+class OutputErrorFit:
+    """Where an output-error fit ended, with predictions linearised there.
 
     Attributes:
         theta: Physical parameters, (K,).
@@ -83,7 +83,7 @@ class HorizonFit:
     iterations: int
 
 
-def fit_horizon(
+def fit_output_error(
     problem: Problem,
     theta: FloatArray,
     latency_s: float,
@@ -91,7 +91,7 @@ def fit_horizon(
     *,
     iterations: int | None = None,
     central: bool = False,
-) -> HorizonFit:
+) -> OutputErrorFit:
     """Fit from a start.
 
     Args:
@@ -140,7 +140,7 @@ def fit_horizon(
             _errors(d, r) / scale for d, r in zip(plain.data, plain.residuals(point), strict=True)
         ),
     )
-    return HorizonFit(plain.theta(point), float(point.value[-1]), scale, normal, used)
+    return OutputErrorFit(plain.theta(point), float(point.value[-1]), scale, normal, used)
 
 
 def prediction_rmse(
@@ -172,7 +172,7 @@ def expected_residual(problem: Problem) -> FloatArray:
     Args:
         problem: Recordings and simulator.
     """
-    fit = fit_horizon(problem, problem.space.nominal, problem.first_latency_s, SHORT)
+    fit = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
     std = problem.noise_std.copy()
     std[problem.channels] = np.maximum(std[problem.channels], fit.scale)
     return std

@@ -24,8 +24,8 @@ class DifferenceSettings:
         parameter: Of a parameter, in its own scale.
         contact_parameter: The same where feet touch the floor: sticking and slipping kink predictions on
             every scale, and a secant says more of them than a derivative.
-        exact_parameter: The same where states are exact: the residual then has no floor to hide a secant's
-            error under.
+        noise_free_parameter: The same where states are known without error: the residual then has no floor to
+            hide a secant's error under.
         latency_s: Of the latency [s].
         position: Of a start position [rad or m].
         velocity: Of a start velocity [rad/s or m/s].
@@ -35,7 +35,7 @@ class DifferenceSettings:
 
     parameter: float = 1e-4
     contact_parameter: float = 2e-2
-    exact_parameter: float = 1e-5
+    noise_free_parameter: float = 1e-5
     latency_s: float = 2e-4
     position: float = 1e-6
     velocity: float = 1e-4
@@ -128,7 +128,7 @@ class Shooting:
         prior_share: float = np.inf,
     ) -> None:
         self.problem = problem
-        self.given = given or problem.exact
+        self.given = given or problem.noise_free
         self.prior_share = prior_share
         self.data: Sequence[WindowData] = problem.windows(length) if data is None else data
         self.length = length
@@ -141,7 +141,9 @@ class Shooting:
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
         self.start_information = [1 / d.prior_std**2 for d in self.data]
-        self._parameter_step = DIFFERENCES.exact_parameter if problem.exact else DIFFERENCES.parameter
+        self._parameter_step = (
+            DIFFERENCES.noise_free_parameter if problem.noise_free else DIFFERENCES.parameter
+        )
         self._state_step = np.concatenate(
             [np.full(C, DIFFERENCES.position), np.full(C, DIFFERENCES.velocity)]
         )

@@ -174,7 +174,7 @@ class SearchLog:
 
         The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
         calibrated: a searcher's population shrinks as its step rule says, too far where the ensemble is
-        small, and to nothing for diffusion evolution. The polish computes intervals from the data.
+        small, and to nothing for diffusion evolution. The refinement computes intervals from the data.
 
         Args:
             centre: The estimate, one member.

@@ -12,7 +12,7 @@ from scipy.stats import t as t_law
 from scipy.stats import truncnorm
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
@@ -380,39 +380,39 @@ def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.b
     return np.asarray((unit < SETTINGS.at_bound) | (unit > 1 - SETTINGS.at_bound))
 
 
-def with_rows(polished: Polished) -> Polished:
+def with_rows(refined: Refined) -> Refined:
     """Return the same with linearised residuals, from which variances are clustered.
 
     Central differences where nothing kinks: what is said of directions without information depends on them.
     """
-    if polished.normal.rows:
-        return polished
-    shooting = polished.shooting
+    if refined.normal.rows:
+        return refined
+    shooting = refined.shooting
     if shooting.problem.robot.base is None:
-        normal = shooting.normal(polished.point, keep=True, stretch=SETTINGS.near, central=True)
+        normal = shooting.normal(refined.point, keep=True, stretch=SETTINGS.near, central=True)
     else:
-        normal = shooting.normal(polished.point, keep=True)
-    return dataclasses.replace(polished, normal=normal)
+        normal = shooting.normal(refined.point, keep=True)
+    return dataclasses.replace(refined, normal=normal)
 
 
-def statement(problem: Problem, polished: Polished, fixed_latency: bool) -> Uncertainty:
-    """Return what the data say where the polish ended.
+def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> Uncertainty:
+    """Return what the data say where the refinement ended.
 
     Args:
         problem: The problem.
-        polished: Where; variances are clustered where it holds linearised residuals.
+        refined: Where; variances are clustered where it holds linearised residuals.
         fixed_latency: The latency was given, or decided.
     """
     return uncertainty(
         problem.space,
-        polished.theta,
-        polished.latency_s,
-        polished.normal,
-        polished.chi2,
+        refined.theta,
+        refined.latency_s,
+        refined.normal,
+        refined.chi2,
         problem.latency_range_s,
         fixed_latency=fixed_latency,
         timing_std_s=problem.noise.timing_std_s,
-        kinks=SETTINGS.kinks if problem.robot.base is None or problem.exact else SETTINGS.contact_kinks,
+        kinks=SETTINGS.kinks if problem.robot.base is None or problem.noise_free else SETTINGS.contact_kinks,
     )
 
 

@@ -1,4 +1,4 @@
-"""The polish's solver where feet touch the floor: windows whose start states follow one by one."""
+"""The refinement's solver where feet touch the floor: windows whose start states follow one by one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import Sticking, settle
-from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.uncertainty.intervals import MISMATCH, correlation_time
 from deal_hw.calib.validation.verdict import unexplained
@@ -53,7 +53,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three
     """From eight percent off the residual becomes noise, and the parameters come back."""
     space, truth = three_unknown(sensed.space, sensed.theta)
     problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1)
-    found = polish(
+    found = refine(
         problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=8, fixed_latency=True
     )
     assert found.chi2 < MISMATCH.chi2

@@ -85,7 +85,7 @@ def test_trajectory_is_the_logarithm_of_the_mean_square(problem: Problem) -> Non
 
 
 def test_flat_sees_nothing(problem: Problem) -> None:
-    """The null row: one score for all, no simulation."""
+    """The no-data baseline: one score for all, no simulation."""
     steps = problem.steps
     fitness = make_fitness("flat", problem, np.random.default_rng(0))
     np.testing.assert_array_equal(fitness.score(members(problem)), np.zeros(3))

@@ -1,4 +1,4 @@
-"""The polish and what is said about its result, on recordings of the real device core with hidden truths."""
+"""The refinement and what is said of its result, on recordings of the real device core with hidden truths."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.uncertainty.intervals import SETTINGS, correlation_time, intervals, uncertainty
@@ -30,7 +30,7 @@ from deal_hw.types import FloatArray
 class Near(CalibrationMethod[Problem]):
     """A search that starts some percent off the truth: what is tested is what comes after it."""
 
-    name = "near"
+    name = "local"
 
     def __init__(self, theta: FloatArray, latency_s: float) -> None:
         self._theta, self._latency_s = theta, latency_s
@@ -48,7 +48,7 @@ class Near(CalibrationMethod[Problem]):
         theta = self._theta * np.exp(rng.normal(0.0, 0.05, len(self._theta)))
         interval = np.stack([problem.space.low, problem.space.high], axis=1)
         return CalibrationResult(
-            method="near",
+            method="local",
             space=problem.space,
             estimate=theta,
             interval=interval,
@@ -68,17 +68,17 @@ def noisy() -> Demonstration:
     return demonstrate("sensor", 2, 5.0)
 
 
-def test_polish_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
+def test_refinement_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
     """Truth recovery: from 10 % off, all parameters within 0.01 % and the latency within a microsecond."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
     start = ideal.theta * np.exp(0.1 * np.cos(np.arange(9)))
-    found = polish(problem, start, 1e-3)
+    found = refine(problem, start, 1e-3)
     assert error_percent(found.theta, ideal.theta) < 0.01
     assert abs(found.latency_s - ideal.truth.latency_s) < 1e-6
     assert found.chi2 < 2.0
 
 
-def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
+def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
     """Truth recovery with noise: mean error within 3 %, latency to the tick, 7 of 9 intervals hold."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     stages: list[str] = []
@@ -248,7 +248,7 @@ def test_diverged_members_are_nan_and_the_others_untouched() -> None:
 def test_latency_scan_weighs_ticks_by_their_cost(ideal: Demonstration) -> None:
     """Costs 10 and 12 at chi2 1 weigh 1 : exp(-1)."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
-    at = polish(problem, ideal.theta, 0.0, (0.2,), iterations=1)
+    at = refine(problem, ideal.theta, 0.0, (0.2,), iterations=1)
     import dataclasses
 
     costs = [
