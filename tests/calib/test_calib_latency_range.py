@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.gauss_newton import damped_step
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, fit_output_error
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
+from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.validation.verdict import latency_alarms
 from deal_hw.errors import ConfigurationError
 
@@ -27,6 +27,18 @@ def shooting(problem: Problem) -> Refined:
     return found
 
 
+class Pull:
+    """A fit that draws the parameter and the latency away from where they are."""
+
+    def residual(self, value: np.ndarray) -> np.ndarray:
+        """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
+        return value + np.array([0.5, 1.0])
+
+    def jacobian(self, value: np.ndarray) -> np.ndarray:
+        """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
+        return np.eye(2)
+
+
 def output_error(problem: Problem) -> OutputErrorFit:
     """Return the first fit of the output-error method."""
     return fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
@@ -39,8 +51,8 @@ def test_a_given_latency_is_never_moved(small_problem: MakeProblem, latency_s: f
     low, high = problem.latency_range_s
     assert low <= latency_s <= high and problem.first_latency_s == latency_s
     ends = (np.array([-1.0, 0.0]), np.array([1.0, 0.04]))
-    step = damped_step(np.array([0.5, latency_s]), np.array([1.0, 50.0]), np.eye(2), 0.1, *ends, True)
-    assert step[1] == 0.0 and step[0] < 0.0
+    value, _ = minimise(Pull(), np.array([0.5, latency_s]), ends, SolverSettings(), fixed_latency=True)
+    assert value[1] == latency_s and value[0] < 0.5
 
 
 def test_given_latency_of_85_ms_is_the_one_that_is_fitted_with(
