@@ -20,6 +20,8 @@ LATENCY_RANGE_S = (0.0, 0.04)
 """Total latencies that are searched where nothing else is said [s]."""
 SHORTEST_S = 1.0
 """Shortest recording that is calibrated from [s]."""
+Z90 = 1.6448536269514722
+"""A standard normal lies within +- this with 90 % probability."""
 RESULT_FILE = "result.json"
 RESULT_FORMAT = "deal_hw.calibration_result/1"
 Verdict = Literal["identifiable", "weak", "not identifiable"]
@@ -162,7 +164,7 @@ class CalibrationResult:
         """Return what is now known about the parameters."""
         covariance = self.covariance
         if covariance is None:
-            spread = np.diff(self.space.to_scale(self.interval.T), axis=0)[0] / (2 * 1.6448536269514722)
+            spread = np.diff(self.space.to_scale(self.interval.T), axis=0)[0] / (2 * Z90)
             covariance = np.diag(np.square(spread))
         return ParameterDistribution(
             space=self.space, mean=self.estimate, covariance=covariance, latency_s=self.latency_interval_s

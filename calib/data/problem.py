@@ -364,8 +364,8 @@ class Problem:
 
 
 def samples_in(problem: Problem, seconds: float) -> int:
-    """Return how many samples a time holds, at least 4 and at most the longest usable episode."""
-    return max(round(seconds / problem.episodes[0].period_s), 4)
+    """Return how many samples a time holds: at least 1 from known states, 4 where start states are fitted."""
+    return max(round(seconds / problem.episodes[0].period_s), 1 if problem.noise_free else 4)
 
 
 def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:

@@ -142,7 +142,7 @@ def refine(
     done = 0
     for seconds in stages_s:
         try:
-            shooting = Shooting(problem, _samples(problem, seconds))
+            shooting = Shooting(problem, samples_in(problem, seconds))
         except InsufficientDataError:
             if result is None:
                 raise
@@ -253,15 +253,6 @@ def at_parameters(
     return dataclasses.replace(found, theta=theta, latency_s=latency_s)
 
 
-def _samples(problem: Problem, seconds: float) -> int:
-    """Return the samples of a window: at least one from exact states, more where start states are unknown."""
-    return (
-        max(round(seconds / problem.episodes[0].period_s), 1)
-        if problem.noise_free
-        else samples_in(problem, seconds)
-    )
-
-
 def _whole_step(
     problem: Problem, theta: FloatArray, latency_s: float, seconds: float
 ) -> tuple[FloatArray, float]:
@@ -273,7 +264,7 @@ def _whole_step(
     low, high = (round(v / step_s) for v in problem.latency_range_s)
     nearest = round(latency_s / step_s)
     beside = sorted((nearest - 1, nearest + 1), key=lambda tick: abs(tick * step_s - latency_s))
-    shooting = Shooting(problem, _samples(problem, seconds))
+    shooting = Shooting(problem, samples_in(problem, seconds))
     best, least = (theta, nearest * step_s), np.inf
     for tick in (nearest, *(t for t in beside if low <= t <= high)):
         start = shooting.start(theta, tick * step_s)

@@ -19,6 +19,7 @@ from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.resume import Kept, restore_generator
 from deal_hw.calibration import (
+    Z90,
     Alarm,
     Budget,
     CalibrationMethod,
@@ -84,10 +85,6 @@ class Coordinates:
         if self.fixed_latency_s is not None:
             return self.fixed_latency_s
         return float(np.clip(latency_s, *self._range))
-
-
-Z90 = 1.6448536269514722
-"""A standard normal lies within +- this with 90 % probability."""
 
 
 class SearchLog:

@@ -16,12 +16,9 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calibration import Alarm, Verdict, listed
+from deal_hw.calibration import Z90, Alarm, Verdict, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-
-Z90 = 1.6448536269514722
-"""Half width of a 90 % interval in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

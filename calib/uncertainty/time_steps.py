@@ -22,8 +22,8 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, intervals, widened_to
-from deal_hw.calibration import Alarm, Progress, ProgressCallback, listed
+from deal_hw.calib.uncertainty.intervals import Uncertainty, intervals, widened_to
+from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
 from deal_hw.types import FloatArray
 
 
