@@ -43,6 +43,9 @@ class Demo(Checked):
     episodes: Annotated[int, Range(1, 1000)] = 3
     """Deployments of each policy, 10 s each."""
 
+    firmware: Literal["python", "host", "avr"] = "python"
+    """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
+
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps; by default those of the shipped UDR policy."""
 
@@ -101,7 +104,10 @@ def demo(config: Demo) -> DemoReport:
             {"kind": "demo", "profile": config.profile, "episodes": config.episodes, "steps": config.steps},
             {"demo": config.seed},
         )
-        options = ("--profile", config.profile, "--seed", str(config.seed), "--reveal-to", str(truth_file))
+        options = (
+            "--profile", config.profile, "--seed", str(config.seed), "--firmware", config.firmware,
+            "--reveal-to", str(truth_file),
+        )  # fmt: skip
         with EmulatorProcess("cartpole", *options) as emulator:
             port = emulator.port
             print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")

@@ -38,14 +38,14 @@ def emulate(config: Emulate) -> int:
 
 def _emulate_cartpole(config: Emulate, stop: threading.Event, cut: threading.Event) -> int:
     try:
-        from deal_hw.drivers.cartpole.device import CartpoleDevice
         from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+        from deal_hw.drivers.cartpole.firmwares import device_of
     except ModuleNotFoundError as error:
         if error.name in ("mujoco", "scipy"):
             raise MissingExtraError(error.name, "sim") from error
         raise
     truth = _truth(config)
-    emulator = CartpoleEmulator(CartpoleDevice(truth), link=config.link, hazards=_hazards(config))
+    emulator = CartpoleEmulator(device_of(truth, config.firmware), link=config.link, hazards=_hazards(config))
     try:
         print(f"port {emulator.open()}", flush=True)
         print(

@@ -119,6 +119,10 @@ class Emulate:
     truth_from: Path | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
+    firmware: Literal["python", "host", "avr"] = "python"
+    """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
+    under simavr (docs/firmware.md)."""
+
     link: Path | None = None
     """Make a symbolic link to the port here."""
 
@@ -186,6 +190,7 @@ class Emulate:
         if self.robot == "cartpole":
             return self.go2.given() + (["--port"] if self.port is not None else [])
         own = {
+            "--firmware": None if self.firmware == "python" else self.firmware,
             "--link": self.link,
             "--vanish-after-s": self.vanish_after_s,
             "--return-after-s": self.return_after_s,

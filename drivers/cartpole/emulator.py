@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.drivers.cartpole.avr_device import AvrDevice
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
@@ -64,7 +65,7 @@ class CartpoleEmulator:
 
     def __init__(
         self,
-        device: CartpoleDevice,
+        device: CartpoleDevice | AvrDevice,
         link: Path | None = None,
         hazards: Hazards | None = None,
         clock: Clock | None = None,
