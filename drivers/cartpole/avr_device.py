@@ -7,6 +7,7 @@ import functools
 import math
 import struct
 from dataclasses import dataclass
+from typing import ClassVar
 
 from fastcrc import crc16
 
@@ -180,6 +181,9 @@ class AvrDevice:
         self._decoder = protocol.FrameDecoder()
         self._status = Status.NONE
         self.received_bytes = 0
+
+    trouble: ClassVar[str] = ""
+    """What is wrong with its wire; an emulated bus tells more."""
 
     @property
     def device_ns(self) -> int:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import enum
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Final, Protocol
 
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.link import Link, SerialLink
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
 from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.errors import ProtocolError
 from deal_hw.types import Status
 
 TICKS_PER_STATE: Final = round(DESCRIPTION.device_rate_hz / DESCRIPTION.state_rate_hz)
@@ -25,52 +25,6 @@ class Mode(enum.Enum):
     IDLE = enum.auto()
     HOMING = enum.auto()
     ARMED = enum.auto()
-
-
-class Link(Protocol):
-    """The device's side of a wire: what the host's bytes say, and how an answer is written.
-
-    Attributes:
-        errors: Corrupt frames so far.
-    """
-
-    errors: int
-
-    def decode(self, data: bytes) -> Iterable[protocol.AnyMessage]:
-        """Take bytes; return the messages that they complete, and count what is none."""
-        ...
-
-    def encode(self, message: protocol.AnyMessage) -> bytes:
-        """Return the bytes of a message."""
-        ...
-
-
-class SerialLink:
-    """COBS frames with a CRC, as on the serial wire."""
-
-    def __init__(self) -> None:
-        self._decoder = protocol.FrameDecoder()
-
-    @property
-    def errors(self) -> int:
-        """Corrupt frames so far."""
-        return self._decoder.errors
-
-    @errors.setter
-    def errors(self, count: int) -> None:
-        self._decoder.errors = count
-
-    def decode(self, data: bytes) -> Iterable[protocol.AnyMessage]:
-        """Take bytes; return the messages that they complete, and count what is none."""
-        for payload in self._decoder.feed(data):
-            try:
-                yield protocol.decode(payload)
-            except ProtocolError:
-                self._decoder.errors += 1
-
-    def encode(self, message: protocol.AnyMessage) -> bytes:
-        """Return the bytes of a message."""
-        return protocol.encode(message)
 
 
 class Firmware(Protocol):

@@ -5,10 +5,12 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from deal_hw.drivers.cartpole.controller import Controller, Firmware, Link, Mode
+from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
+from deal_hw.drivers.cartpole.link import Link
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.servo import Servo
 from deal_hw.drivers.cartpole.truth import Truth, unique_id
@@ -73,6 +75,9 @@ class CartpoleDevice:
         self.received_bytes = 0
         self._tick = 0
         self._kept: array[float] | None = array("d") if keep_truth else None
+
+    trouble: ClassVar[str] = ""
+    """What is wrong with its wire; an emulated bus tells more."""
 
     @property
     def device_ns(self) -> int:
