@@ -2,9 +2,10 @@
 
 Each cause of a wrong model leaves a signature: a disturbance that a motion alone determines, such as a force
 against the velocity at low speed. Its effect on the predictions is the convolution of the disturbance with
-the windows' own response to a kick at their start, which the polish has computed. What parameters and start
-states could explain of it is projected out, and the residual is regressed on what is left. A cause's effect
-is the share of the residual's excess over noise that it explains beyond what as many random columns would.
+the windows' own response to a kick at their start, which the refinement has computed. What parameters and
+start states could explain of it is projected out, and the residual is regressed on what is left. A cause's
+effect is the share of the residual's excess over noise that it explains beyond what as many random columns
+would.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from scipy.signal import fftconvolve
 from scipy.stats import chi2 as chi2_law
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calibration import Alarm
@@ -145,20 +146,20 @@ class Motion:
     time_s: FloatArray
 
 
-def motions(problem: Problem, polished: Polished) -> list[Motion]:
-    """Return how the joints moved in the polish's windows.
+def motions(problem: Problem, refined: Refined) -> list[Motion]:
+    """Return how the joints moved in the refinement's windows.
 
     Args:
         problem: The problem.
-        polished: Where the polish ended, with linearised residuals.
+        refined: Where the refinement ended, with linearised residuals.
     """
     C, joints, channels = problem.coordinates, problem.robot.joints, problem.channels
-    states = polished.shooting.states(polished.point)
+    states = refined.shooting.states(refined.point)
     own = np.zeros((len(channels), C))
     at = channels < C
     own[at, channels[at]] = 1.0
     found = []
-    for data, rows in zip(polished.shooting.data, polished.normal.rows, strict=True):
+    for data, rows in zip(refined.shooting.data, refined.normal.rows, strict=True):
         samples = data.windows.samples()
         W, H = samples.shape
         episode = problem.episodes[data.episode]

@@ -130,12 +130,12 @@ def demo(config: Demo) -> DemoReport:
                             seed=config.seed,
                         )
                     )  # fmt: skip
-            with stages.stage("calibrate", "search, polish, latency, intervals"):
+            with stages.stage("calibrate", "search, refinement, latency, intervals"):
                 found = calibrate(Calibrate(dataset=folder.dataset, out=config.out, seed=config.seed))
             with stages.stage("calibrate deal", "the adversarial search alone, to compare with"):
                 beside = calibrate(
                     Calibrate(
-                        dataset=folder.dataset, out=config.out / "deal", method="deal", polish=False,
+                        dataset=folder.dataset, out=config.out / "deal", method="deal", refine=False,
                         seed=config.seed, quiet=True,
                     )
                 )  # fmt: skip

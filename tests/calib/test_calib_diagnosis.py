@@ -58,7 +58,7 @@ def _diagnosed(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> tuple
         np.concatenate([parameter, np.zeros((WINDOWS, 2, parameter.shape[2]))], axis=1),
         np.concatenate([start, known], axis=1),
     )
-    # The hessian with start states eliminated, as the polish has it.
+    # The hessian with start states eliminated, as the refinement has it.
     js, jp = rows.start, rows.parameter
     gain = np.linalg.solve(np.einsum("wrs,wrt->wst", js, js), np.einsum("wrs,wrp->wsp", js, jp))
     left = jp - np.einsum("wrs,wsp->wrp", js, gain)

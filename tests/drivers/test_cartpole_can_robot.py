@@ -23,7 +23,9 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.can_emulator import SlcanAdapter, can_device, can_devices, can_emulator
 from deal_hw.drivers.cartpole.can_link import FRAME, CanLink, accept
 from deal_hw.drivers.cartpole.can_robot import CanFrames, can_robot
+from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
+from deal_hw.drivers.cartpole.link import SerialLink
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport
@@ -132,6 +134,32 @@ def test_two_devices_under_one_number_end_a_run() -> None:
     for _ in range(3):
         robot.read_state(1.0)
     assert "two devices use node 1" in robot.fault
+
+
+def test_the_wire_changes_no_sample() -> None:
+    """The same commands at the same times give the same numbers on serial frames and on CAN."""
+    truth = nominal_truth("sensor", seed=3)
+    runs = []
+    for device, link in ((CartpoleDevice(truth), SerialLink), (can_device(truth), CanLink)):
+        clock = VirtualClock()
+        robot = CartpoleRobot(VirtualTransport(device, clock), clock, link=link)
+        robot.connect()
+        robot.home(5.0)
+        robot.arm(2.0)
+        found = []
+        for cycle in range(100):
+            clock.sleep_until_ns((2000 + 20 * cycle) * MS)
+            robot.send_command(default_command(robot, 0.1 * (cycle // 10 % 2)))
+            while True:
+                try:
+                    state = robot.read_state(0.0)
+                except TransportTimeoutError:
+                    break
+                found.append((*state.position, *state.velocity, state.effort[0], state.device_ns,
+                              state.command_sequence, state.command_age_ns, int(state.status)))  # fmt: skip
+        runs.append(found)
+    assert len(runs[0]) > 700
+    assert runs[0] == runs[1]
 
 
 # Over an emulated adapter, in a time that the test moves.

@@ -31,7 +31,7 @@ COMMAND_DELAY = "command_delay"
 """Kind that no MuJoCo field holds: what an actuator is sent acts later by it, on top of the latency."""
 
 SIZES_KEPT = 6
-"""Simulators of so many sizes are kept: one iteration of a search or polish needs up to four."""
+"""Simulators of so many sizes are kept: one iteration of a search or refinement needs up to four."""
 
 
 def default_threads() -> int:
