@@ -355,7 +355,7 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
             part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.exact
         )
 
-    part, nominal = _spread(problem, SETTINGS.local_s), problem.space.nominal
+    part, nominal = part_of(problem, SETTINGS.local_s), problem.space.nominal
     if part is problem or problem.exact:
         found = fit(problem, nominal, latency_s, None)
         return found if np.isfinite(found.chi2) else None
@@ -375,7 +375,7 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
         return fit(problem, found.theta, found.latency_s, (short,))
 
 
-def _spread(problem: Problem, seconds: float) -> Problem:
+def part_of(problem: Problem, seconds: float) -> Problem:
     """Return the problem with pieces of a second, evenly spread, that add up to about so many seconds."""
     lengths = [len(e.sample) for e in problem.episodes]
     period_s = problem.episodes[0].period_s
