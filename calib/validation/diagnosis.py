@@ -279,8 +279,9 @@ def _finding(
     cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str, seen: str = ""
 ) -> Finding:
     looks, means, do = LOOKS[cause]
-    words = f"{100 * share:.2g} % of the squared residual on left-out motion looks like {looks}: {cause}."
-    alarm = Alarm(seen or words, means, do.replace("{}", where))
+    if not seen:
+        seen = f"{100 * share:.2g} % of the squared residual on left-out motion looks like {looks}: {cause}."
+    alarm = Alarm(seen, means, do.replace("{}", where))
     return Finding(cause, float(share), float(deviance), tuple(joints), alarm)
 
 

@@ -215,9 +215,10 @@ def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Pr
 
 
 def test_a_right_model_has_no_cause(tmp_path: Path) -> None:
-    """Neither a signature nor a delay predicts left-out windows better."""
-    _, problem, fit = _truth("double-pendulum", None, tmp_path)
+    """Neither a signature, nor a delay, nor play predicts left-out windows better."""
+    _, problem, fit = _truth("pendulum", None, tmp_path)
     assert name_causes(evidence(problem, fit)) == []
+    assert find_play(problem, fit) is None
 
 
 def test_faults_of_a_simulated_robot_are_named(tmp_path: Path) -> None:
@@ -245,9 +246,3 @@ def test_play_is_found_and_measured(tmp_path: Path) -> None:
     assert found is not None and found.cause == "backlash" and found.joints == ("pivot",)
     assert "0.06 rad at pivot" in found.alarm.seen and "servo_play" in found.alarm.do
     assert found.share > diagnosis.SETTINGS.decisive
-
-
-def test_a_right_model_has_no_play(tmp_path: Path) -> None:
-    """The same robot without it."""
-    _, problem, fit = _truth("pendulum", None, tmp_path)
-    assert find_play(problem, fit) is None
