@@ -22,7 +22,13 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Polished, at_parameters, local_fit, polish, polish_robust
 from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, statement, with_rows
+from deal_hw.calib.uncertainty.intervals import (
+    MISMATCH,
+    Uncertainty,
+    correlation_time,
+    statement,
+    with_rows,
+)
 from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
 from deal_hw.calib.validation.cross_validation import Choice, choose
 from deal_hw.calib.validation.verdict import Validation, judge, unexplained
@@ -181,7 +187,7 @@ class Calibration(CalibrationMethod[Problem]):
             run.offer("local fit", local)
         elif self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
-        if local is not None and conclusive(problem, local):
+        if local is not None and needs_no_search(problem, local):
             found = to_the_noise(run, without_search(problem, budget, local), local)
         else:
             if local is not None and progress is not None:
@@ -247,6 +253,11 @@ class Refinement(Fits):
                 break
         if best is None:
             raise RuntimeError("unreachable: at least one search is run")
+        local, refined = run.local, best[1]
+        if local is not None and local.chi2 < refined.chi2:
+            # Short windows are easier to explain.
+            if local.shooting.length >= refined.shooting.length:
+                best = (best[0], local)
         return to_the_noise(run, *best, self._choose(run, *best), attempt)
 
     def _better(self, a: Polished, b: Polished) -> bool:
@@ -360,6 +371,17 @@ def conclusive(problem: Problem, fit: Polished) -> bool:
     """
     chosen = problem.known_std is not None and problem.robot.base is None
     return not chosen and not unexplained(fit)
+
+
+def needs_no_search(problem: Problem, local: Polished) -> bool:
+    """Return whether the local fit is the answer: its residual is noise, and white as noise is.
+
+    What another minimum leaves can be as small as noise, but it has a pattern.
+    """
+    if not conclusive(problem, local):
+        return False
+    negligible = local.chi2 <= MISMATCH.negligible_chi2
+    return negligible or correlation_time(local.normal.residual) <= MISMATCH.white_samples
 
 
 def without_search(problem: Problem, budget: Budget, local: Polished) -> CalibrationResult:
