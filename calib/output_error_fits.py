@@ -47,7 +47,7 @@ from deal_hw.calib.validation.cross_validation import (
     time_masks,
 )
 from deal_hw.calib.validation.split_half import Halves, agreement, heed
-from deal_hw.calib.validation.verdict import Validation, with_causes, with_step
+from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.parts import joined, spread, stretches
@@ -149,7 +149,8 @@ class OutputErrorFits(Fits):
             # Where the local fit lost its way it has seen a part of the recordings alone.
             lost = run.local.chi2 >= REFINEMENT.local_hopeless
             judged = (problem, with_rows(left)) if lost else (run.problem, local)
-            known, facts["diagnosis"] = with_causes(*judged, known)
+            if unexplained(judged[1]):
+                known, facts["diagnosis"] = with_causes(*judged, known)
         found = confounded(problem, fit.hessian / known.inflation)
         names = problem.channel_names
         facts |= {
