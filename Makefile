@@ -17,7 +17,7 @@ SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test dds-peer check coverage-safety mutation bench typing format clean
+.PHONY: help setup demo test dds-peer avr-tools firmware check coverage-safety mutation bench typing format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -39,13 +39,20 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
-# Without the DDS peer, the tests that meet it are skipped and say what to install.
+# Without the DDS peer or the AVR's tools, the tests that need them are skipped and say what to install.
 test: $(STAMP) ## all tests that need no robot
 	@tools/build_dds_peer.sh || true
+	@tools/install_avr_tools.sh || true
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 	@tools/build_dds_peer.sh
+
+avr-tools: ## install gcc-avr and simavr
+	@tools/install_avr_tools.sh
+
+firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and the memory that it takes
+	@$(BIN)/python -m deal_hw.drivers.cartpole.native build/firmware
 
 check: $(STAMP) typing coverage-safety ## format, lint, types, import order and coverage of the safety module
 	$(BIN)/ruff format --check --output-format concise .

@@ -19,8 +19,8 @@ METHODS: dict[str, str] = {
     "deal-paper-fn": "deal_hw.calib.deal_paper.algorithm1:without_noise_adaptation",
     "deal-paper-pn": "deal_hw.calib.deal_paper.algorithm1:without_normalisation",
     "deal-paper-flat": "deal_hw.calib.deal_paper.algorithm1:flat",
-    "open-loop": "deal_hw.calib.output_error_fits:open_loop",
-    "near": "deal_hw.calib.output_error_fits:near",
+    "output-error": "deal_hw.calib.output_error_fits:output_error_method",
+    "local": "deal_hw.calib.output_error_fits:local",
     "easi": "deal_hw.calib.baselines.easi:Easi",
     "bo": "deal_hw.calib.baselines.bayesian:BayesianOptimisation",
     "cma": "deal_hw.calib.baselines.cma_es:Cma",
@@ -30,16 +30,16 @@ METHODS: dict[str, str] = {
     "ekf": "deal_hw.calib.baselines.ekf:Ekf",
     "mujoco-sysid": "deal_hw.calib.baselines.sysid:MujocoSysid",
     "random": "deal_hw.calib.baselines.simple:RandomSearch",
-    "centre": "deal_hw.calib.baselines.simple:Centre",
+    "midpoint": "deal_hw.calib.baselines.simple:Midpoint",
     "nominal": "deal_hw.calib.baselines.simple:Nominal",
 }
 """Name -> ``module:callable`` without arguments. ``default`` is the search that won on the tuning seeds."""
 
-NULL_METHODS = frozenset({"centre", "nominal", "deal-paper-flat"})
-"""Rows that must not read the data, so they are never polished."""
+NO_DATA_METHODS = frozenset({"midpoint", "nominal", "deal-paper-flat"})
+"""Rows that must not read the data, so they are never refined."""
 
-WHOLE_METHODS = frozenset({"open-loop", "near", "mujoco-sysid"})
-"""Methods that decide themselves what follows their search, or stand for somebody else: never polished."""
+WHOLE_METHODS = frozenset({"output-error", "local", "mujoco-sysid"})
+"""Methods that decide themselves what follows their search, or stand for somebody else: never refined."""
 
 
 def check_method(name: str) -> None:
@@ -52,12 +52,12 @@ def check_method(name: str) -> None:
         raise UnknownNameError("calibration method", name, METHODS)
 
 
-def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem]:
+def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem]:
     """Return a new method.
 
     Args:
         name: A name in `METHODS`.
-        polish: Follow the search by the polish; null rows and whole methods stay what they are.
+        refine: Refine what the search finds; no-data baselines and whole methods stay what they are.
 
     Raises:
         UnknownNameError: The name is not in the table.
@@ -65,7 +65,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
     check_method(name)
     module, _, attribute = METHODS[name].partition(":")
     search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
-    if not polish or name in NULL_METHODS | WHOLE_METHODS:
+    if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
         return search
     from deal_hw.calib.pipeline import Calibration
     from deal_hw.calib.search.eki import Eki
@@ -73,7 +73,7 @@ def make_method(name: str, *, polish: bool = False) -> CalibrationMethod[Problem
 
     if isinstance(search, Eki):
         search = dataclasses.replace(
-            search, settings=dataclasses.replace(search.settings, before_polish=True)
+            search, settings=dataclasses.replace(search.settings, before_refinement=True)
         )
     # Who names a search wants it run, also where the model's own values could be refined without one.
     return Calibration(search, name, Validation(local_first=name == "default"))

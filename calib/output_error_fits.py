@@ -24,7 +24,7 @@ import numpy as np
 
 from deal_hw.calib.baselines.simple import Nominal
 from deal_hw.calib.data.problem import Problem, samples_in
-from deal_hw.calib.fit.output_error import SHORT, HorizonFit, Recipe, fit_horizon, prediction_rmse
+from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline import Calibration, CalibrationRun, Fits, Outcome
@@ -46,7 +46,7 @@ from deal_hw.calib.validation.cross_validation import (
     on_folds,
     time_masks,
 )
-from deal_hw.calib.validation.split_half import Halves, agreement, heed
+from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_halves
 from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
@@ -118,26 +118,26 @@ class OutputErrorFits(Fits):
     def best(self, run: CalibrationRun) -> Outcome:
         """Search, fit all candidates, take the one that predicts best. See :meth:`Fits.best`."""
         settings, problem = self.settings, run.problem
-        if run.settings.folds:
+        if run.settings.cross_validation:
             problem = _whole(problem)
         run.say("residual", "fits short windows from the model's own values")
-        first = fit_horizon(problem, problem.space.nominal, problem.first_latency_s, SHORT)
+        first = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
         run.offer("search", searched)
         # Drawn after the search, so that a resumed run draws the same.
         seed = int(run.rng.integers(2**32))
         choice = Choice("long", {}, settings.long_s, note="without folds")
-        if run.settings.folds:
+        if run.settings.cross_validation:
             choice = self._choose(run, problem, seed)
         run.say("fit", f"{choice.chosen} on all recordings")
         members = self._members(run, problem, _member(first), searched, choice.chosen)
         theta, latency_s = members[choice.chosen]
         recipe = settings.recipe(choice.chosen)
         told = dataclasses.replace(recipe, latency=True)
-        fit = fit_horizon(problem, theta, latency_s, told, iterations=0, central=True)
+        fit = fit_output_error(problem, theta, latency_s, told, iterations=0, central=True)
         known = _known(problem, fit)
         halves = self._halves(problem, fit, recipe, known)
-        known = heed(problem, known, theta, halves)
+        known = widened_by_halves(problem, known, theta, halves)
         facts: dict[str, Any] = {}
         if run.local is not None:
             # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
@@ -151,10 +151,10 @@ class OutputErrorFits(Fits):
             judged = (problem, with_rows(left)) if lost else (run.problem, local)
             if unexplained(judged[1]):
                 known, facts["diagnosis"] = with_causes(*judged, known)
-        found = confounded(problem, fit.hessian / known.inflation)
+        found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {
-            "folds": choice.to_json(),
+            "cross_validation": choice.to_json(),
             "residual_std": dict(zip(names, map(float, first.scale), strict=True)),
             "prediction_rmse": dict(zip(names, map(float, fit.scale), strict=True)),
             "window_s": recipe.seconds,
@@ -163,7 +163,7 @@ class OutputErrorFits(Fits):
             "at_bound": [
                 problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
             ],
-            "halves": halves.to_json(),
+            "split_half": halves.to_json(),
             "confounded": [pair.to_json() for pair in found],
         }
         known = dataclasses.replace(
@@ -175,7 +175,7 @@ class OutputErrorFits(Fits):
             searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
         )
 
-    def _reduced(self, problem: Problem, first: HorizonFit) -> Problem:
+    def _reduced(self, problem: Problem, first: OutputErrorFit) -> Problem:
         """Return the search's problem: part of the recordings, and residuals as large as a first fit's."""
         parts = [p for e in problem.episodes for p in stretches(e, self.settings.stretch_s)]
         std = problem.known_std
@@ -197,7 +197,7 @@ class OutputErrorFits(Fits):
         def fits(train: Problem, fold: int) -> dict[str, Member]:
             question = f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?"
             run.say("cross-validation", question)
-            first = fit_horizon(train, problem.space.nominal, problem.first_latency_s, SHORT)
+            first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, SHORT)
             rng = np.random.default_rng([seed, fold])
             searched = run.search.run(self._reduced(train, first), run.budget, rng)
             return self._members(run, train, _member(first), searched)
@@ -227,7 +227,7 @@ class OutputErrorFits(Fits):
             only: Name of the one candidate that is wanted; None for all.
         """
         settings = self.settings
-        horizons_s = settings.horizons_s if run.settings.folds else (settings.long_s,)
+        horizons_s = settings.horizons_s if run.settings.cross_validation else (settings.long_s,)
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
         rmse = prediction_rmse(problem, [found["search"], short], settings.compared_s)
         start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
@@ -237,7 +237,7 @@ class OutputErrorFits(Fits):
             horizons = [start]
             for seconds in horizons_s:
                 recipe = Recipe(seconds=seconds, prior_std=prior_std)
-                horizons.append(_member(fit_horizon(problem, *horizons[-1], recipe)))
+                horizons.append(_member(fit_output_error(problem, *horizons[-1], recipe)))
             for seconds, member in zip(horizons_s[:-1], horizons[1:], strict=False):
                 found[f"{seconds:g} s{words}"] = member
             found["long" + words] = horizons[-1]
@@ -246,16 +246,16 @@ class OutputErrorFits(Fits):
             if only in (None, name):
                 theta, latency_s = found["long"]
                 latency_s = latency_s if recipe.latency else problem.first_latency_s
-                found[name] = _member(fit_horizon(problem, theta, latency_s, recipe))
+                found[name] = _member(fit_output_error(problem, theta, latency_s, recipe))
         return found
 
-    def _halves(self, problem: Problem, fit: HorizonFit, recipe: Recipe, known: Uncertainty) -> Halves:
+    def _halves(self, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty) -> SplitHalf:
         """Fit two halves of the recordings, motion by motion, from the whole's estimate and compare."""
         space, before = problem.space, problem.steps
         estimates, stds, intervals = [], [], []
         for mask in fold_masks(problem, 2):
             try:
-                half = fit_horizon(
+                half = fit_output_error(
                     problem.part(mask),
                     fit.theta,
                     fit.latency_s,
@@ -264,7 +264,7 @@ class OutputErrorFits(Fits):
                     central=True,
                 )
             except InsufficientDataError as err:
-                return Halves((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
+                return SplitHalf((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
             told = _known(problem, half)
             estimates.append(half.theta)
             stds.append(np.sqrt(np.diag(told.covariance)))
@@ -277,22 +277,22 @@ class OutputErrorFits(Fits):
         return (mismatch(chi2, f" over {self.settings.mismatch_s:g} s from fitted start states"),)
 
 
-def open_loop(search: CalibrationMethod[Problem] | None = None) -> Calibration:
-    """Return `open-loop`: output-error fits by cross-validation, after the local fit and a search.
+def output_error_method(search: CalibrationMethod[Problem] | None = None) -> Calibration:
+    """Return `output-error`: output-error fits by cross-validation, after the local fit and a search.
 
     Args:
         search: The search; `eki` by default.
     """
-    return Calibration(search or Eki(), "open-loop", fits=OutputErrorFits())
+    return Calibration(search or Eki(), "output-error", fits=OutputErrorFits())
 
 
-def near() -> Calibration:
-    """Return `near`: the fits over short and then long horizons alone, from the model's own values.
+def local() -> Calibration:
+    """Return `local`: the fits over short and then long horizons alone, from the model's own values.
 
     For a robot whose model is near (within a factor two or so) and in which motion is damped: it costs a
-    twentieth of a search. What its residual does not explain it says like `open-loop`.
+    twentieth of a search. What its residual does not explain it says like `output-error`.
     """
-    return Calibration(Nominal(), "near", Validation(folds=False), fits=OutputErrorFits())
+    return Calibration(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
 
 
 def _whole(problem: Problem) -> Problem:
@@ -309,7 +309,7 @@ def _error(problem: Problem, rmse: FloatArray) -> float:
     return float(np.exp(np.mean(np.log(rmse))))
 
 
-def _member(fit: HorizonFit) -> Member:
+def _member(fit: OutputErrorFit) -> Member:
     return fit.theta, fit.latency_s
 
 
@@ -320,17 +320,13 @@ def _mean(problem: Problem, members: Sequence[Member]) -> Member:
     return theta, float(np.mean([latency_s for _, latency_s in members]))
 
 
-def _known(problem: Problem, fit: HorizonFit) -> Uncertainty:
+def _known(problem: Problem, fit: OutputErrorFit) -> Uncertainty:
     return uncertainty(
         problem.space,
         fit.theta,
         fit.latency_s,
-        fit.hessian,
+        fit.normal,
         1.0,
-        fit.residual,
         problem.latency_range_s,
         fixed_latency=problem.fixed_latency_s is not None,
-        gradient=fit.gradient,
-        prior=fit.prior,
-        rows=fit.rows,
     )

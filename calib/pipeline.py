@@ -19,14 +19,14 @@ import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, at_parameters, local_fit, polish, polish_robust
+from deal_hw.calib.fit.refinement import Refined, at_parameters, local_fit, refine, refine_robust
 from deal_hw.calib.fit.solver import ROBUST, kurtosis
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
     Uncertainty,
     correlation_time,
-    statement,
+    uncertainty_at,
     with_rows,
 )
 from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
@@ -105,7 +105,7 @@ class CalibrationRun:
     search: CalibrationMethod[Problem]
     attempts: Restarts
     settings: Validation
-    local: Polished | None = None
+    local: Refined | None = None
     progress: ProgressCallback | None = None
 
     def say(self, stage: str, message: str) -> None:
@@ -113,9 +113,9 @@ class CalibrationRun:
         if self.progress is not None:
             self.progress(Progress(stage, 0, 1, message))
 
-    def offer(self, stage: str, found: Polished | CalibrationResult) -> None:
+    def offer(self, stage: str, found: Refined | CalibrationResult) -> None:
         """Report what could be the answer, and the stage that found it."""
-        theta = found.theta if isinstance(found, Polished) else found.estimate
+        theta = found.theta if isinstance(found, Refined) else found.estimate
         if self.progress is not None:
             values = {"chi2": found.chi2}
             self.progress(Progress(stage, 1, 1, estimate=theta, latency_s=found.latency_s, values=values))
@@ -234,14 +234,14 @@ class Refinement(Fits):
     def best(self, run: CalibrationRun) -> Outcome:
         """Search, refine, let cross-validation say whether the refinement helps. See :meth:`Fits.best`."""
         settings, left = self.restarts, run.budget.generations
-        best: tuple[CalibrationResult, Polished] | None = None
+        best: tuple[CalibrationResult, Refined] | None = None
         attempt = 0
         for attempt in range(1 + settings.restarts):
             budget = dataclasses.replace(run.budget, generations=left)
             searched = run.attempts.run(run.problem, attempt, budget, run.progress)
             run.offer("search", searched)
             left -= len(searched.trace)
-            refined = refine(run, searched)
+            refined = from_search(run, searched)
             run.offer("refinement", refined)
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or self._better(refined, best[1]):
@@ -260,7 +260,7 @@ class Refinement(Fits):
                 best = (best[0], local)
         return to_the_noise(run, *best, self._choose(run, *best), attempt)
 
-    def _better(self, a: Polished, b: Polished) -> bool:
+    def _better(self, a: Refined, b: Refined) -> bool:
         """Say whether ``a`` explains more: a longer window only counts where both are explained."""
         if (
             all(fit.chi2 < self.restarts.explained for fit in (a, b))
@@ -269,11 +269,11 @@ class Refinement(Fits):
             return a.shooting.length > b.shooting.length
         return a.chi2 < b.chi2
 
-    def _choose(self, run: CalibrationRun, searched: CalibrationResult, refined: Polished) -> Choice | None:
+    def _choose(self, run: CalibrationRun, searched: CalibrationResult, refined: Refined) -> Choice | None:
         """Return what cross-validation says of the refinement; None where it explains all but the noise."""
         # A fold is a search and a refinement; with contacts these take a minute each.
         floating = run.problem.robot.base is not None
-        if not run.settings.folds or floating or conclusive(run.problem, refined):
+        if not run.settings.cross_validation or floating or conclusive(run.problem, refined):
             return None
         run.say("cross-validation", "does the refinement help on what it has not seen?")
         robust = run.settings.robust and kurtosis(refined.normal.residual) > ROBUST.heavy_tails
@@ -288,7 +288,7 @@ class Refinement(Fits):
 def to_the_noise(
     run: CalibrationRun,
     searched: CalibrationResult,
-    refined: Polished,
+    refined: Refined,
     choice: Choice | None = None,
     restarts: int = 0,
 ) -> Outcome:
@@ -310,12 +310,12 @@ def to_the_noise(
         scan = scan_latency(problem, refined, run.progress)
     whole = scan is not None and scan.decides(refined)
     if scan is not None and whole:
-        refined = scan.polished[scan.best]
+        refined = scan.refined[scan.best]
     decided = whole or problem.fixed_latency_s is not None
-    if choice is not None and choice.chosen == "robust polish":
-        refined = polish_robust(refined, decided)
+    if choice is not None and choice.chosen == "robust refinement":
+        refined = refine_robust(refined, decided)
     refined = with_rows(refined)
-    known = statement(problem, refined, fixed_latency=decided)
+    known = uncertainty_at(problem, refined, fixed_latency=decided)
     if scan is not None and whole:
         known = averaged(problem, scan, known)
     known, checked = judge(problem, refined, known, run.settings)
@@ -324,15 +324,15 @@ def to_the_noise(
         "window_s": refined.shooting.length * problem.episodes[0].period_s,
         "noise_std": problem.noise.position_std.tolist(),
         "timing_std_s": problem.noise.timing_std_s,
-        "polish_iterations": refined.iterations,
+        "refinement_iterations": refined.iterations,
         **checked,
     }
     if choice is not None:
-        facts["folds"] = choice.to_json()
+        facts["cross_validation"] = choice.to_json()
     if scan is not None:
         facts["latency_scan"] = {
             "ticks": list(scan.ticks),
-            "chi2": [p.chi2 for p in scan.polished],
+            "chi2": [p.chi2 for p in scan.refined],
             "weights": scan.weights.tolist(),
         }
     return Outcome(
@@ -345,7 +345,7 @@ def to_the_noise(
     )
 
 
-def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> None:
+def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> None:
     """Say before the search what the recordings cannot tell, by their Fisher information at the local fit.
 
     Args:
@@ -355,7 +355,7 @@ def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> N
     """
     # What the model does not explain says nothing of what the motion shows: noise alone counts.
     noise_only = dataclasses.replace(local, chi2=1.0)
-    known = statement(problem, noise_only, fixed_latency=problem.fixed_latency_s is not None)
+    known = uncertainty_at(problem, noise_only, fixed_latency=problem.fixed_latency_s is not None)
     blind = [n for n, v in zip(problem.space.names, known.verdicts, strict=True) if v == "not identifiable"]
     words = list(known.null_directions)
     if blind and not words:
@@ -364,7 +364,7 @@ def foretell(problem: Problem, local: Polished, progress: ProgressCallback) -> N
         progress(Progress(BEFORE_SEARCH, 1, 1, f"the data cannot tell: {'; '.join(words)}"))
 
 
-def conclusive(problem: Problem, fit: Polished) -> bool:
+def conclusive(problem: Problem, fit: Refined) -> bool:
     """Return whether a fit needs no other judge: what it leaves has the size of the sensors' noise.
 
     A residual that was chosen explains itself: only what no fit has seen can judge then.
@@ -373,7 +373,7 @@ def conclusive(problem: Problem, fit: Polished) -> bool:
     return not chosen and not unexplained(fit)
 
 
-def needs_no_search(problem: Problem, local: Polished) -> bool:
+def needs_no_search(problem: Problem, local: Refined) -> bool:
     """Return whether the local fit is the answer: its residual is noise, and white as noise is.
 
     What another minimum leaves can be as small as noise, but it has a pattern.
@@ -384,7 +384,7 @@ def needs_no_search(problem: Problem, local: Polished) -> bool:
     return negligible or correlation_time(local.normal.residual) <= MISMATCH.white_samples
 
 
-def without_search(problem: Problem, budget: Budget, local: Polished) -> CalibrationResult:
+def without_search(problem: Problem, budget: Budget, local: Refined) -> CalibrationResult:
     """Return what stands for a search's result where none was needed."""
     space = problem.space
     return CalibrationResult(
@@ -398,7 +398,7 @@ def without_search(problem: Problem, budget: Budget, local: Polished) -> Calibra
     )
 
 
-def refine(run: CalibrationRun, searched: CalibrationResult) -> Polished:
+def from_search(run: CalibrationRun, searched: CalibrationResult) -> Refined:
     """Refine a search's estimate."""
     given = run.problem.fixed_latency_s
 
@@ -407,4 +407,4 @@ def refine(run: CalibrationRun, searched: CalibrationResult) -> Polished:
             run.progress(Progress("refinement", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
 
     latency_s = searched.latency_s if given is None else given
-    return polish(run.problem, searched.estimate, latency_s, fixed_latency=given is not None, notify=notify)
+    return refine(run.problem, searched.estimate, latency_s, fixed_latency=given is not None, notify=notify)

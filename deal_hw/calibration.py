@@ -20,6 +20,8 @@ LATENCY_RANGE_S = (0.0, 0.04)
 """Total latencies that are searched where nothing else is said [s]."""
 SHORTEST_S = 1.0
 """Shortest recording that is calibrated from [s]."""
+Z90 = 1.6448536269514722
+"""A standard normal lies within +- this with 90 % probability."""
 RESULT_FILE = "result.json"
 RESULT_FORMAT = "deal_hw.calibration_result/1"
 Verdict = Literal["identifiable", "weak", "not identifiable"]
@@ -35,7 +37,7 @@ class Progress:
     """Where a long run stands; given to the callback after each generation or iteration.
 
     Attributes:
-        stage: What is being done, such as ``"search"``, ``"polish"`` or ``"latency"``.
+        stage: What is being done, such as ``"search"``, ``"refinement"`` or ``"latency"``.
         done: Units done.
         total: Units expected; may grow.
         message: One short line.
@@ -66,12 +68,12 @@ class Budget:
     Attributes:
         population: Members N.
         generations: Search steps T; restarts count.
-        polish: Whether the search is followed by multiple shooting.
+        refinement: Whether the search is followed by multiple shooting.
     """
 
     population: int = 100
     generations: int = 50
-    polish: bool = True
+    refine: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +164,7 @@ class CalibrationResult:
         """Return what is now known about the parameters."""
         covariance = self.covariance
         if covariance is None:
-            spread = np.diff(self.space.to_scale(self.interval.T), axis=0)[0] / (2 * 1.6448536269514722)
+            spread = np.diff(self.space.to_scale(self.interval.T), axis=0)[0] / (2 * Z90)
             covariance = np.diag(np.square(spread))
         return ParameterDistribution(
             space=self.space, mean=self.estimate, covariance=covariance, latency_s=self.latency_interval_s

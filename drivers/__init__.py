@@ -49,15 +49,28 @@ TRANSPORTS: Final = {
 }
 TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
 """Transports without a descriptor to inherit: each process opens its own."""
+MAKERS: Final[Mapping[tuple[str, str], str]] = {
+    ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
+    ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
+}
+"""Robots whose driver on a wire is another than that of :data:`ROBOTS`, (robot, wire) -> "module:function".
+
+The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
+descriptor of the port that a parent process opened. It does no I/O.
+"""
+CAN_NODES: Final[Mapping[str, tuple[int, ...]]] = {"can": (1,), "odrive": (0, 2)}
+"""Transports over a CAN bus, and the numbers that their devices usually have."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
-    "cartpole": ("serial",),
+    "cartpole": ("serial", "can", "odrive"),
     "go2": TOPIC_TRANSPORTS,
     "go2_hung": TOPIC_TRANSPORTS,
 }
 """Transports that reach each robot; the first is the default."""
 
 __all__ = [
+    "CAN_NODES",
     "DESCRIPTIONS",
+    "MAKERS",
     "REACHED_BY",
     "ROBOTS",
     "SPACES",
@@ -104,9 +117,12 @@ def make_robot(
             has no such setting.
     """
     robot = _driver(name)
-    link = make_transport(transport_name, port, clock, options)
     _check_reach(name, transport_name)
     try:
+        if (name, transport_name) in MAKERS:
+            _refuse_options(transport_name, options)
+            return _make(name, transport_name, port, clock, can_send=can_send, **(settings or {}))
+        link = make_transport(transport_name, port, clock, options)
         made: Robot = robot(link if can_send else listen_only(link), clock, **(settings or {}))
     except TypeError as error:
         raise ConfigurationError(
@@ -128,7 +144,9 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
 
         port = f"{find_interface(port).name}, domain {options.domain}"
     else:
-        port = os.path.realpath(port)
+        # Settings after the path of a port do not make it another port.
+        prefix, colon, path = port.partition("?")[0].rpartition(":")
+        port = prefix + colon + (os.path.realpath(path) if "/" in path else path)
     return f"{transport_name} on {port}"
 
 
@@ -159,12 +177,7 @@ def make_transport(
     if transport_name in TOPIC_TRANSPORTS:
         return make_topic_transport(transport_name, port, clock, options)
     transport = _find("transport", TRANSPORTS, transport_name)
-    if options is not None and options != WireOptions():
-        default = WireOptions().to_json()
-        given = [name for name, value in options.to_json().items() if value != default[name]]
-        raise ConfigurationError(
-            f"{_options(given)} would have no effect: transport {transport_name!r} is no network"
-        )
+    _refuse_options(transport_name, options)
     made: Transport = transport(port, clock=clock)
     return made
 
@@ -200,8 +213,11 @@ def adopt_robot(
         UnknownNameError: There is no such robot or transport.
         ConfigurationError: The robot has a description, but no driver, or the transport has no descriptor.
     """
-    robot, transport = _driver(name), _find("transport", TRANSPORTS, transport_name)
+    robot = _driver(name)
     _check_reach(name, transport_name)
+    if (name, transport_name) in MAKERS:
+        return _make(name, transport_name, port, clock, fd=fd, can_send=can_send)
+    transport = _find("transport", TRANSPORTS, transport_name)
     if transport_name in TOPIC_TRANSPORTS:
         raise ConfigurationError(
             f"transport {transport_name!r} has no descriptor to inherit: each process opens its own, "
@@ -275,7 +291,26 @@ def _options(names: Iterable[str]) -> str:
     return ", ".join("--" + name.replace("_", "-") for name in names)
 
 
+def _make(name: str, transport_name: str, port: str, clock: Clock, **settings: Any) -> Robot:
+    made: Robot = _find("driver", {transport_name: MAKERS[name, transport_name]}, transport_name)(
+        port, clock, **settings
+    )
+    return made
+
+
+def _refuse_options(transport_name: str, options: WireOptions | None) -> None:
+    """Refuse settings of a network on a wire that is none."""
+    if options is not None and options != WireOptions():
+        default = WireOptions().to_json()
+        given = [name for name, value in options.to_json().items() if value != default[name]]
+        raise ConfigurationError(
+            f"{_options(given)} would have no effect: transport {transport_name!r} is no network"
+        )
+
+
 def _check_reach(name: str, transport_name: str) -> None:
+    if transport_name not in TRANSPORTS and all(transport_name not in found for found in REACHED_BY.values()):
+        raise UnknownNameError("transport", transport_name, dict.fromkeys(sum(REACHED_BY.values(), ())))
     if transport_name not in REACHED_BY[name]:
         raise ConfigurationError(
             f"robot {name!r} is not reached by transport {transport_name!r}; "

@@ -2,7 +2,8 @@
 """Fault table of the cart-pole: what happens when something goes wrong, and how soon its motor is off.
 
 python tools/measure_cartpole_faults.py --jobs 2 --out cartpole.json
-python tools/measure_cartpole_faults.py --table faults.md cartpole.json
+python tools/measure_cartpole_faults.py --transport can --jobs 2 --out cartpole_can.json
+python tools/measure_cartpole_faults.py --table faults.md cartpole.json cartpole_can.json
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 
 SECONDS = 1.2
 HOMING, ARMED, IDLE, HELD = "homing", "armed", "idle", "held"
-GONE = "gone"
+BY_ITSELF = ("gone", "cut", "frozen", "bus-off", "transmit buffer full", "node lost")
+CAN = ("can", "odrive")
 DEPLOY = """
 import sys
 from pathlib import Path
@@ -27,9 +29,10 @@ from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import run_episodes
 from deal_hw.errors import DealHwError
 
-policy, wanted, seconds, port, dataset, *dry = sys.argv[1:]
+policy, wanted, seconds, wire, port, dataset, *dry = sys.argv[1:]
 plan = RunPlan(
-    robot="cartpole", policy=policy, velocity=wanted, seconds=float(seconds), dry_run=bool(dry), home=not dry
+    robot="cartpole", transport=wire, policy=policy, velocity=wanted, seconds=float(seconds),
+    dry_run=bool(dry), home=not dry,
 )
 try:
     code = run_episodes(plan, port=port, dataset=Path(dataset), episodes=1, purpose="deploy").exit_code
@@ -46,7 +49,7 @@ class CartpoleRig(Rig):
     """A cart-pole that plays a chirp."""
 
     robot = "cartpole"
-    wires = ("serial",)
+    wires = ("serial", "can", "odrive")
     longest_s = 1.0
     active = frozenset({ARMED})
     inactive = frozenset({IDLE, HELD})
@@ -55,11 +58,13 @@ class CartpoleRig(Rig):
 
     def emulator_options(self) -> list[str]:
         """A port whose name stays when the cable is put back."""
-        return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port")]
+        link = ["--link", str(self.folder / "port")]
+        return ["--transport", self.wire, "--profile", "sensor", "--nominal", *link]
 
     def arguments(self) -> list[str]:
         """Play a chirp."""
-        return ["collect", "cartpole", "--profile", "chirp", "--seconds", str(self._seconds)]
+        motion = ["--profile", "chirp", "--seconds", str(self._seconds)]
+        return ["collect", "cartpole", "--transport", self.wire, *motion]
 
     def command(self, out: str, port: str = "") -> list[str]:
         """Return the command line of a run.
@@ -70,7 +75,7 @@ class CartpoleRig(Rig):
         if not (self.case.policy or self.case.dry):
             return super().command(out, port)
         _, policy, _, wanted = self.policy_arguments()
-        where = [port or self.port, str(self.folder / out / "dataset")]
+        where = [self.wire, port or self.port, str(self.folder / out / "dataset")]
         dry = ["dry"] * self.case.dry
         return [UNDER_TEST, "-c", DEPLOY, policy, wanted, str(self._seconds), *where, *dry]
 
@@ -97,8 +102,8 @@ class CartpoleRig(Rig):
         return f"{report['received_bytes']} bytes" if report["received_bytes"] else ""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
-        """The port vanished, the wire was cut, or the firmware hung."""
-        return next((ns for ns, what in self.changes(report) if what in (GONE, "cut", "frozen")), -1)
+        """The port vanished, the wire was cut, the firmware hung, or the bus had a fault."""
+        return next((ns for ns, what in self.changes(report) if what in BY_ITSELF), -1)
 
 
 def after(option: str) -> tuple[str, ...]:
@@ -118,6 +123,15 @@ CASES = (
     Case(name="5 % of the frames lost", emulator=("--drop", "0.05"), expect="goes on", codes=(0,)),
     Case(name="60 % of the frames corrupt", emulator=("--corrupt", "0.6"), codes=(2, 3)),
     Case(name="the firmware hangs", emulator=after("--freeze-after-s")),
+    *(Case(name=f"bus-off for {seconds:g} s", wires=CAN,
+           emulator=(*after("--bus-off-after-s"), "--bus-off-s", f"{seconds}"))
+      for seconds in (0.1, 1.5)),
+    Case(name="the adapter's transmit buffer is full for 0.3 s", wires=CAN,
+         emulator=(*after("--tx-full-after-s"), "--tx-full-s", "0.3")),
+    Case(name="the node is lost, the adapter stays", emulator=after("--lost-node-after-s"), wires=CAN),
+    Case(name="two devices under one node number", emulator=("--duplicate-node",), codes=(2,), wires=CAN),
+    Case(name="a DBC of another version", emulator=("--dbc-version", "2"), codes=(2,), wires=CAN),
+    Case(name="nobody on the bus acknowledges", emulator=("--no-acknowledge",), codes=(2,), wires=CAN),
     Case(name="the policy answers NaN", policy="nan"),
     Case(name="the policy takes over 100 ms", policy="late"),
 )  # fmt: skip

@@ -225,7 +225,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the recording to fit")
     parser.add_argument("--heldout", default="steps", help="family of the held-out motion")
     parser.add_argument("--heldout-seconds", type=float, default=6.0)
-    parser.add_argument("--calibrate", default="--method near", help="further options of calibrate")
+    parser.add_argument("--calibrate", default="--method local", help="further options of calibrate")
     parser.add_argument("--keep", type=Path, default=None, help="folder for the runs' temporary folders")
     parser.add_argument("--out", type=Path, required=True)
     return parser.parse_args()

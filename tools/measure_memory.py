@@ -38,7 +38,7 @@ from deal_hw.testing.simulated_episode import simulated_episode
 
 Unit = Literal["generation", "run"]
 
-POLISHED = "default, polished"
+REFINED = "default, refined"
 """What `deal-hw calibrate` does without options."""
 
 SEARCHES = (
@@ -47,14 +47,14 @@ SEARCHES = (
 )  # fmt: skip
 """Methods with generations; a generation of `ekf` is a pass along the recording."""
 
-WHOLES = ("least-squares", "least-squares-multistart", "mujoco-sysid", "near", "open-loop", POLISHED)
-"""Methods without; `centre` and `nominal`, which only draw once, are not measured."""
+WHOLES = ("least-squares", "least-squares-multistart", "mujoco-sysid", "local", "output-error", REFINED)
+"""Methods without; `midpoint` and `nominal`, which only draw once, are not measured."""
 
 LONGER = {"bo": 2, "gauss-newton": 4}
 """Times as many generations: until the Gaussian process has its most points (49 generations), and until
 `gauss-newton` has begun anew (62 draws, some 25 refinements)."""
 
-LEAST_SECONDS = {"near": 1.6, "open-loop": 1.6, POLISHED: 1.6}
+LEAST_SECONDS = {"local": 1.6, "output-error": 1.6, REFINED: 1.6}
 """Recordings that these refuse to judge are shorter [s]."""
 
 RUN_GENERATIONS = 5
@@ -145,18 +145,18 @@ def watch(method: str, generations: int, population: int, seconds: float) -> dic
         population: Members.
         seconds: Length of the recording [s].
     """
-    polish = method == POLISHED
+    refine = method == REFINED
     unit: Unit = "run" if method in WHOLES else "generation"
     generations *= LONGER.get(method, 1)
     wanted = generations if unit == "generation" else max(generations // RUN_GENERATIONS, 4)
     each = generations if unit == "generation" else RUN_GENERATIONS
     series = Series(wanted)
     problem, runs = make_problem(max(seconds, LEAST_SECONDS.get(method, 0.0))), 0
-    budget = Budget(population=population, generations=each, polish=polish)
+    budget = Budget(population=population, generations=each, refine=refine)
     try:
         while True:
             runs += 1
-            made = make_method("default" if polish else method, polish=polish)
+            made = make_method("default" if refine else method, refine=refine)
             note = series.note if unit == "generation" else None
             made.run(problem, budget, np.random.default_rng(runs), note)
             if unit == "run":

@@ -4,7 +4,7 @@ The first generation is a scrambled Sobol sequence. Each further one fits a Gaus
 one length scale a coordinate, whose prior grows with their number) to what was scored and takes the batch of
 the largest log expected improvement (qLogEI, Ament et al. 2023) inside a trust region around the best point,
 which grows after successes and shrinks after failures (TuRBO, Eriksson et al. 2019). Over the whole range of
-ten coordinates the batch is little better than a random one (measured: worse than the range's centre).
+ten coordinates the batch is little better than a random one (measured: worse than the range's midpoint).
 
 Scores have an arbitrary scale and long tails, so the process models their normal quantiles, which keep
 nothing but the order.
@@ -34,9 +34,9 @@ from scipy.stats import rankdata
 from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import SearchLog
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray

@@ -1,7 +1,7 @@
 """`cma`: covariance matrix adaptation (pycma) with restarts of growing population, on a pluggable fitness.
 
 The baseline of robot calibration in practice (PACE, NVIDIA's extension). Restarts double the population
-(IPOP, Auger and Hansen 2005) and begin at a uniform draw; the first one begins at the centre of the range.
+(IPOP, Auger and Hansen 2005) and begin at a uniform draw; the first one begins at the midpoint of the range.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import SearchLog
 from deal_hw.calib.search.resume import Kept, State
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
@@ -228,7 +228,7 @@ class Cma(ScoredSearch):
 
 
 class Best(Kept):
-    """The best member so far; before any was scored, the centre of the range.
+    """The best member so far; before any was scored, the midpoint of the range.
 
     Args:
         count: Coordinates C.

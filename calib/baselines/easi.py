@@ -16,10 +16,10 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
-from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
+from deal_hw.calib.search.base import Coordinates, SearchLog
 from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
@@ -35,8 +35,8 @@ class EasiSettings:
         fitness: Name of the fitness; EASI's is the critic.
         survive_rate: Share of members that are elites; at most a half, beyond which weights are negative.
         scale: Box of the search: "own" takes equal steps of each parameter's own scale (log for positive
-            ones), "linear" is the box as published, in which a range of ratio xi^2 has its centre at half its
-            upper end.
+            ones), "linear" is the box as published, in which a range of ratio xi^2 has its midpoint at half
+            its upper end.
         critic: The published critic (two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation).
         batch_per_member: Transitions in one of the critic's batches for each member of the population (16).
         scoring: How the fitness scores, but for the critic.

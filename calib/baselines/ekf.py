@@ -7,20 +7,18 @@ extended, not unscented or ensemble: what bends between the mean and its uncerta
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.innovations import Members
+from deal_hw.calib.data.problem import WindowData, taken
 from deal_hw.calib.fit.residual import DIFFERENCES, value_bounds
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
-from deal_hw.calib.uncertainty.intervals import Z90, intervals
-from deal_hw.calibration import Alarm, CalibrationResult
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
+from deal_hw.calib.uncertainty.intervals import intervals
+from deal_hw.calibration import Z90, Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 
 
@@ -124,7 +122,7 @@ class _Passes(Stepper):
         self._low, self._high = value_bounds(log.problem)
         space = log.problem.space
         self._free_latency = log.problem.fixed_latency_s is None
-        # A range is a flat prior: its centre and its standard deviation, where nothing better is expected.
+        # A range is a flat prior: its midpoint and its standard deviation, where nothing better is expected.
         expected, spread = space.prior
         known = np.isfinite(spread)
         self._drift = np.append(space.width, self._high[-1] - self._low[-1])
@@ -204,7 +202,7 @@ class _Passes(Stepper):
             predicted = problem.predict(
                 members.theta,
                 members.latency_s,
-                only(data, w),
+                taken(data, np.array([w])),
                 points[:, None, :C],
                 points[:, None, C : 2 * C],
             )
@@ -258,18 +256,3 @@ class Ekf(Search):
     name = "ekf"
     stepper = _Passes
     settings: EkfSettings = field(default_factory=EkfSettings)
-
-
-def only(data: WindowData, w: int) -> WindowData:
-    """Return one window of several."""
-    one = slice(w, w + 1)
-    return dataclasses.replace(
-        data,
-        windows=dataclasses.replace(data.windows, start=data.windows.start[one]),
-        measured=data.measured[one],
-        std=data.std[one],
-        start_position=data.start_position[one],
-        start_velocity=data.start_velocity[one],
-        prior_mean=data.prior_mean[one],
-        prior_std=data.prior_std[one],
-    )

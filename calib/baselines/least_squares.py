@@ -4,7 +4,7 @@ And `least-squares-multistart`, a stronger one for real recordings: windows, a l
 
 The plain textbook baseline, as the paper's Table 6 means it. Every control period starts from the state that
 the robot reported, the simulation predicts the next one, and `scipy.optimize.least_squares` (trust region,
-with the ranges as bounds) minimises the sum of squared differences, from the centre of the ranges on. Each
+with the ranges as bounds) minimises the sum of squared differences, from the midpoint of the ranges on. Each
 recorded quantity is divided by how much it changes in one control period; that is all the weighing there is.
 No noise model, no latency but one that is given, no second start: errors in the recorded states go into the
 parameters, and a start on a plateau stays there. Parameters are in their own scale (log for positive ones).
@@ -21,13 +21,11 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import explained, samples_per_tick
+from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.output_error import HorizonFit, Recipe, fit_horizon
+from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
 from deal_hw.calib.fit.residual import DIFFERENCES
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calib.search.resume import State
 from deal_hw.calib.uncertainty.intervals import intervals
 from deal_hw.calibration import Alarm, CalibrationResult
@@ -328,21 +326,21 @@ def _solve_starts(
     recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
     parts = [p for e in problem.episodes for p in stretches(e, settings.part_s)]
     part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
-    rough = [fit_horizon(part, *start, recipe, iterations=settings.first_iterations) for start in starts]
+    rough = [fit_output_error(part, *start, recipe, iterations=settings.first_iterations) for start in starts]
     order = np.argsort([_score(fit) for fit in rough], kind="stable")[: settings.survivors]
     fits = [
-        fit_horizon(problem, rough[i].theta, rough[i].latency_s, recipe, iterations=max(iterations, 1))
+        fit_output_error(problem, rough[i].theta, rough[i].latency_s, recipe, iterations=max(iterations, 1))
         for i in order
     ]
     best = min(fits, key=_score)
     K = len(problem.space)
-    residual = np.concatenate([r.ravel() for r in best.residual])
+    residual = np.concatenate([r.ravel() for r in best.normal.residual])
     variance = float(residual @ residual) / max(len(residual) - K, 1)
     # The range as a flat prior keeps what the data cannot see finite.
     flat = np.diag(12.0 / problem.space.width**2)
     return Found(
         theta=best.theta,
-        covariance=np.asarray(np.linalg.inv(best.hessian[:K, :K] / variance + flat)),
+        covariance=np.asarray(np.linalg.inv(best.normal.hessian[:K, :K] / variance + flat)),
         latency_s=best.latency_s,
         iterations=sum(fit.iterations for fit in (*rough, *fits)),
         message=f"best of {len(starts)} starts, {len(fits)} of them fitted to all recordings",
@@ -360,6 +358,6 @@ def _unfinished(iterations: int) -> Alarm:
     )
 
 
-def _score(fit: HorizonFit) -> float:
+def _score(fit: OutputErrorFit) -> float:
     score = float(np.mean(np.log(fit.scale)))
     return score if np.isfinite(score) else np.inf

@@ -8,12 +8,10 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import explained
+from deal_hw.calib.data.innovations import Members, explained
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray
 

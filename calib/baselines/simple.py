@@ -1,6 +1,7 @@
 """Baselines that bound what a method is worth: two that ignore the recording, and one that draws at random.
 
-`centre` and `nominal` are the null rows of every table: a method that does not beat them has read nothing.
+`midpoint` and `nominal` are the no-data baselines of every table: a method that does not beat
+them has read nothing.
 """
 
 from __future__ import annotations
@@ -10,10 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import cut, explained, whitened_residual
-from deal_hw.calib.search.base import Search, Stepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.data.innovations import Members, cut, explained, whitened_residual
+from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
@@ -63,10 +62,10 @@ class Ignorant(Search, abc.ABC):
         """Return the estimate, (K,)."""
 
 
-class Centre(Ignorant):
-    """Return the centre of every range, in the range's own scale."""
+class Midpoint(Ignorant):
+    """Return the midpoint of every range, in the range's own scale."""
 
-    name = "centre"
+    name = "midpoint"
 
     def estimate(self, space: ParameterSpace) -> FloatArray:
         """Return the centre."""
@@ -106,7 +105,7 @@ class _Random(Stepper):
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         self._windows = cut(log.problem, self.settings.ticks)
-        # One metric for all draws, that of the range's centre: scores of different metrics do not compare.
+        # One metric for all draws, that of the range's midpoint: scores of different metrics do not compare.
         self._middle = self.coordinates.members(np.full((1, self.coordinates.count), 0.5))
         self._unit = np.empty((0, self.coordinates.count))
         self._score = np.empty(0)

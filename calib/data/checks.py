@@ -1,13 +1,16 @@
-"""Is there enough in a recording to calibrate from? Refuses before any long work and says what to record."""
+"""Before any long work: is there enough in a recording to calibrate from, and what does it show?"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import Problem, WindowData, longest_windows, taken
 from deal_hw.calibration import SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.engine.batch import COMMAND_DELAY
+from deal_hw.types import FloatArray
 
 
 def check_delays(problem: Problem) -> None:
@@ -42,7 +45,7 @@ def check_excitation(problem: Problem) -> None:
     joints = problem.robot.joints
     spans = np.max([np.ptp(e.position[e.usable][:, joints], axis=0) for e in problem.episodes], axis=0)
     noises = problem.noise_std[: problem.coordinates][joints]
-    if problem.known_std is None and not problem.exact:
+    if problem.known_std is None and not problem.noise_free:
         # What a recording happens to show may be less than its sensor's noise, down to none at all: a joint
         # that never left its friction is still no motion to calibrate from.
         noises = np.maximum(noises, problem.robot.description.sensor.position_std)
@@ -63,3 +66,139 @@ def check_excitation(problem: Problem) -> None:
             f"the position target changed {changes} times, at least {settings.fewest_changes} are needed; "
             f"{advice}"
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensitivitySettings:
+    """Settings of :func:`look` and :func:`jumps`.
+
+    Attributes:
+        window_s: Length of the windows [s].
+        most_windows: So many are predicted.
+        nothing: Predictions that agree to this many standard deviations of the noise are the same [-].
+        faint: A range that changes nothing by more standard deviations than this is hardly visible [-].
+        nudge: A parameter is changed by so much, in its own scale, to see whether predictions jump,
+        push: and by so much to see how steep they really are.
+        jump: A nudge that changes predictions by so many times what the push says is a jump [-].
+        many: Share of windows that must jump [-]: where a contact begins or ends at another moment some do,
+            by no fault.
+    """
+
+    window_s: float = 0.5
+    most_windows: int = 12
+    nothing: float = 1e-9
+    faint: float = 1.0
+    nudge: float = 1e-6
+    push: float = 1e-3
+    jump: float = 10.0
+    many: float = 0.2
+
+
+SETTINGS = SensitivitySettings()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensitivity:
+    """How much predictions change from one end of a parameter's range to the other.
+
+    Attributes:
+        names: The K parameters.
+        effect: Largest change of any sample, in standard deviations of the noise, (K,).
+    """
+
+    names: tuple[str, ...]
+    effect: FloatArray
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Parameters that change nothing."""
+        return tuple(n for n, e in zip(self.names, self.effect, strict=True) if e < SETTINGS.nothing)
+
+    @property
+    def faint(self) -> tuple[str, ...]:
+        """Parameters whose whole range changes no sample by more than the noise."""
+        return tuple(
+            n for n, e in zip(self.names, self.effect, strict=True) if SETTINGS.nothing <= e < SETTINGS.faint
+        )
+
+
+def look(problem: Problem) -> Sensitivity:
+    """Compare rollouts at both ends of each parameter's range with the nominal one.
+
+    Raises:
+        InsufficientDataError: The recordings hold no window.
+    """
+    space = problem.space
+    K = len(space)
+    theta = np.repeat(space.nominal[None], 1 + 2 * K, axis=0)
+    for k in range(K):
+        theta[1 + 2 * k, k], theta[2 + 2 * k, k] = space.low[k], space.high[k]
+    latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
+    effect = np.zeros(K)
+    for data in _some(longest_windows(problem, SETTINGS.window_s)):
+        predicted = problem.predict(theta, latency, data).observed
+        change = np.abs(predicted[1:] - predicted[:1]) / data.std
+        # A member that diverges at the end of its range is seen, to be sure.
+        change = np.where(np.isfinite(change), change, np.where(np.isfinite(data.std), np.inf, 0.0))
+        effect = np.maximum(effect, change.reshape(K, -1).max(axis=1))
+    return Sensitivity(space.names, effect)
+
+
+def jumps(problem: Problem) -> dict[str, float]:
+    """Return the parameters whose smallest change makes predictions jump, and by how many of their units.
+
+    Fits follow derivatives, and those of a simulator whose solver stops early are noise: two frictions at one
+    joint are divided between them as it happens.
+
+    Raises:
+        InsufficientDataError: The recordings hold no window.
+    """
+    space = problem.space
+    K = len(space)
+    value = space.to_scale(space.nominal)
+    # Towards the middle of the range, or a value at its end would be nudged to nothing.
+    inwards = np.where(value > (space.to_scale(space.low) + space.to_scale(space.high)) / 2, -1.0, 1.0)
+    values = np.repeat(value[None], 1 + 2 * K, axis=0)
+    values[1 : 1 + K] += SETTINGS.nudge * np.diag(inwards)
+    values[1 + K :] += SETTINGS.push * np.diag(inwards)
+    theta = space.from_scale(values)
+    latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
+    changes = []
+    for data in _some(longest_windows(problem, SETTINGS.window_s)):
+        predicted = problem.predict(theta, latency, data).observed
+        change = np.where(np.isfinite(data.std), np.abs(predicted[1:] - predicted[:1]), 0.0)
+        changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
+    nudged, pushed = np.split(np.concatenate(changes, axis=1), 2)
+    jumping = nudged > np.maximum(
+        SETTINGS.jump * SETTINGS.nudge / SETTINGS.push * pushed,
+        SETTINGS.nothing * np.min(problem.noise_std[problem.channels]),
+    )
+    rough = np.mean(jumping, axis=1) > SETTINGS.many
+    return {name: float(nudged[k].max()) for k, name in enumerate(space.names) if rough[k]}
+
+
+def require_sensitive(found: Sensitivity) -> None:
+    """Refuse parameters that no rollout sees.
+
+    Raises:
+        ConfigurationError: There are such; the message names them.
+    """
+    if found.unseen:
+        raise ConfigurationError(
+            f"no rollout of these recordings sees {', '.join(found.unseen)}: predictions are the same "
+            "from one end of the range to the other. Remove them from the parameters (or give them with "
+            "--known), or record a motion that shows them"
+        )
+
+
+def _some(windows: list[WindowData]) -> list[WindowData]:
+    """Return about as many of the windows, evenly over all recordings."""
+    total = sum(len(data.windows) for data in windows)
+    every = max(total // SETTINGS.most_windows, 1)
+    kept, first = [], 0
+    for data in windows:
+        rows = np.arange((-first) % every, len(data.windows), every)
+        first += len(data.windows)
+        if rows.size:
+            kept.append(taken(data, rows))
+    return kept

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
 from deal_hw.calib.data.problem import Prediction, Problem, WindowData
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.recordings.episode import Episode
@@ -21,10 +20,23 @@ from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
 
+@dataclass(frozen=True, slots=True)
+class Members:
+    """A population in physical units.
+
+    Attributes:
+        theta: Parameter values, (N, K).
+        latency_s: Total latency of each member, (N,) [s]; may be negative by less than the margin.
+    """
+
+    theta: FloatArray
+    latency_s: FloatArray
+
+
 def is_noisy(problem: Problem) -> bool:
     """Return whether what was measured carries sensor noise."""
     std = problem.noise_std[problem.channels]
-    return not problem.exact and bool(np.any(std >= problem.settings.noise_free_std))
+    return not problem.noise_free and bool(np.any(std >= problem.settings.noise_free_std))
 
 
 def samples_per_tick(problem: Problem) -> int:
@@ -201,7 +213,7 @@ def whitened_residual(
     """
     parts = []
     for i, data in enumerate(windows):
-        if problem.exact:
+        if problem.noise_free:
             whitened = (data.measured - predict(problem, members, data).observed) / data.std
             parts.append(whitened.reshape(len(whitened), -1))
             continue

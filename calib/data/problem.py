@@ -11,6 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -145,7 +146,7 @@ class Problem:
                     "positions, then velocities"
                 )
             return np.maximum(self.known_std, floor)
-        if self.exact:
+        if self.noise_free:
             return np.full(2 * self.coordinates, self.settings.noise_free_residual)
         found = np.full(2 * self.coordinates, floor)
         for e in self.episodes:
@@ -155,7 +156,7 @@ class Problem:
 
     def _noise_model(self) -> NoiseModel:
         slow = self.episodes[0].period_s > self.settings.slowest_jitter_s
-        if self.known_std is not None or self.exact or slow:
+        if self.known_std is not None or self.noise_free or slow:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
         # Timing jitter shows in positions; a rotation vector around the smoothed orientation has none left.
@@ -234,7 +235,7 @@ class Problem:
         return self.latency_range_s[0] if self.fixed_latency_s is None else self.fixed_latency_s
 
     @property
-    def exact(self) -> bool:
+    def noise_free(self) -> bool:
         """Whether all states are known without error, so that windows need not fit where they start."""
         return all(e.exact for e in self.episodes)
 
@@ -379,5 +380,28 @@ class Problem:
 
 
 def samples_in(problem: Problem, seconds: float) -> int:
-    """Return how many samples a time holds, at least 4 and at most the longest usable episode."""
-    return max(round(seconds / problem.episodes[0].period_s), 4)
+    """Return how many samples a time holds: at least 1 from known states, 4 where start states are fitted."""
+    return max(round(seconds / problem.episodes[0].period_s), 1 if problem.noise_free else 4)
+
+
+def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
+    """Cut windows of so many seconds, shorter ones where no recording holds one.
+
+    Raises:
+        InsufficientDataError: Not even windows of four samples fit.
+    """
+    length = max(round(seconds / problem.episodes[0].period_s), 4)
+    while True:
+        try:
+            return problem.windows(length)
+        except InsufficientDataError:
+            if length <= 4:
+                raise
+            length = max(int(0.8 * length), 4)
+
+
+def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
+    """Return some of the windows, chosen by a mask (W,) or by their rows."""
+    names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
+    windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
+    return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
-from deal_hw.calib.search.base import Search, Stepper
+from deal_hw.calib.search.base import Coordinates, Search, SearchLog, Stepper
 from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.log import SearchLog
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import Fitness, RolloutView, Samples
 from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.critic import ClippedCritic, CriticSettings, torch_threads

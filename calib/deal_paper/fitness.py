@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.distance import cdist, pdist
 
-from deal_hw.calib.data.coordinates import Coordinates, Members
-from deal_hw.calib.data.innovations import Whitening, cut, linearise, whitened_residual
+from deal_hw.calib.data.innovations import Members, Whitening, cut, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.rollouts import (
     PopulationPolicy,
@@ -26,6 +25,7 @@ from deal_hw.calib.deal_paper.rollouts import (
     rollout_population,
     transitions,
 )
+from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
@@ -42,7 +42,7 @@ FITNESSES: dict[str, str] = {
     "mmd": "deal_hw.calib.deal_paper.fitness:KernelFitness",
     "flat": "deal_hw.calib.deal_paper.fitness:FlatFitness",
 }
-"""Name -> ``module:class``, imported on use: only the critic needs torch. ``flat`` is the null row."""
+"""Name -> ``module:class``, imported on use: only the critic needs torch. ``flat`` ignores the data."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,7 +147,7 @@ class FlatFitness(Fitness):
     """The same number for every member: a search that cannot see the data."""
 
     def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
-        # The critic's seed, which nobody reads: search and null row then see the same random numbers.
+        # The critic's seed, which nobody reads: search and no-data baseline then see the same random numbers.
         rng.integers(2**62)
 
     def score(self, members: Members) -> FloatArray:
@@ -159,23 +159,23 @@ class TrajectoryFitness(Fitness):
     """Prediction error at a horizon: minus the logarithm of the mean squared whitened window innovation.
 
     The logarithm, because errors of far members span many decades: a softmax of the errors themselves would
-    see nothing among the good ones. The metric is that of the range's centre for all members and
+    see nothing among the good ones. The metric is that of the range's midpoint for all members and
     generations, or scores would not compare.
     """
 
     def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
         self._windows = cut(self._problem, self._settings.horizon_ticks)
         coordinates = Coordinates(self._problem)
-        self._centre = coordinates.members(np.full((1, coordinates.count), 0.5))
+        self._midpoint = coordinates.members(np.full((1, coordinates.count), 0.5))
         # Made on first use and kept: a small population's call costs less than its metric.
         self._whitenings: list[Whitening] | None = None
 
     def score(self, members: Members) -> FloatArray:
         """See :meth:`Fitness.score`."""
         if self._whitenings is None:
-            self._whitenings = [linearise(self._problem, self._centre, data) for data in self._windows]
+            self._whitenings = [linearise(self._problem, self._midpoint, data) for data in self._windows]
         residual = whitened_residual(
-            self._problem, members, self._centre, self._windows, whitenings=self._whitenings
+            self._problem, members, self._midpoint, self._windows, whitenings=self._whitenings
         )
         with np.errstate(over="ignore"):
             error = np.mean(residual**2, axis=1)

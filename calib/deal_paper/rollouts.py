@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import early_setpoints
+from deal_hw.calib.data.innovations import Members, early_setpoints
 from deal_hw.calib.data.problem import Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch

@@ -138,11 +138,11 @@ def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, fl
     Returns:
         The point and its cost.
     """
-    cost = float(shooting.costs([point])[0])
+    cost = shooting.cost(point)
     for number in range(iterations):
         normal = shooting.normal(point, keep=True, stretch=CONTACTS.stretches[number % 2])
         point, _ = _settled(shooting, point, normal)
-        before, cost = cost, float(shooting.costs([point])[0])
+        before, cost = cost, shooting.cost(point)
         if before - cost < CONTACTS.gain:
             break
     return point, cost

@@ -1,4 +1,4 @@
-"""Open-loop fit: least squares on long predictions from smoothed states, as a held-out recording is judged.
+"""Output-error fit: least squares on long predictions from smoothed states, as held-out motion is judged.
 
 Multiple shooting explains every sample with start states of its own, which a model that lacks something
 (backlash, a friction law, a slipped clock) uses to explain what is no start state. Over windows of seconds a
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
+from deal_hw.calib.data.problem import Problem, WindowData, longest_windows
+from deal_hw.calib.fit.residual import Normal, Point, Shooting
 from deal_hw.calib.fit.solver import (
     SolverSettings,
     channel_scale,
@@ -26,7 +26,6 @@ from deal_hw.calib.fit.solver import (
     huber_weights,
     solve,
 )
-from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
 
@@ -64,35 +63,27 @@ SHORT = Recipe(seconds=0.2)
 
 
 @dataclass(frozen=True, slots=True)
-class HorizonFit:
-    """Where an open-loop fit ended, with predictions linearised there.
+class OutputErrorFit:
+    """Where an output-error fit ended, with predictions linearised there.
 
     Attributes:
         theta: Physical parameters, (K,).
         latency_s: Total latency [s].
         scale: What residuals were measured by, channel by channel, (M,): their root mean square, or where the
             loss is robust their middle.
-        hessian: Normal matrix of residuals over ``scale`` and of what is known of the parameters by other
-            means, parameters in their own scale and the latency, (K + 1, K + 1).
-        gradient: Half the gradient of their sum of squares, (K + 1,).
-        prior: Information that is not the recordings', (K + 1,).
-        rows: Weighed residuals and their derivatives, window by window.
-        residual: Residuals over ``scale`` per recording, (W, H, M).
+        normal: Normal equations of weighed residuals and of what is known of the parameters by other means,
+            with their rows; nothing of a latency that is fixed. Its residuals are those over ``scale``.
         iterations: Steps used.
     """
 
     theta: FloatArray
     latency_s: float
     scale: FloatArray
-    hessian: FloatArray
-    gradient: FloatArray
-    prior: FloatArray
-    rows: tuple[WindowRows, ...]
-    residual: tuple[FloatArray, ...]
+    normal: Normal
     iterations: int
 
 
-def fit_horizon(
+def fit_output_error(
     problem: Problem,
     theta: FloatArray,
     latency_s: float,
@@ -100,7 +91,7 @@ def fit_horizon(
     *,
     iterations: int | None = None,
     central: bool = False,
-) -> HorizonFit:
+) -> OutputErrorFit:
     """Fit from a start.
 
     Args:
@@ -128,7 +119,7 @@ def fit_horizon(
     while left > 0:
         # Residuals are measured anew every few steps: nobody has said how good the model is.
         weighed, _ = _weighed(plain, point, recipe)
-        before = weighed.costs([point])[0]
+        before = weighed.cost(point)
         # The prior holds what is not seen; autocorrelated residuals weigh too little for another hold.
         solver = SolverSettings(
             iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
@@ -140,19 +131,16 @@ def fit_horizon(
     weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf)
     normal = weighed.normal(point, keep=True, central=central)
     free = np.append(np.ones(len(space)), 0.0 if fixed else 1.0)
-    return HorizonFit(
-        theta=plain.theta(point),
-        latency_s=float(point.value[-1]),
-        scale=scale,
+    normal = dataclasses.replace(
+        normal,
         hessian=normal.hessian * np.outer(free, free),
         gradient=normal.gradient * free,
-        prior=normal.prior,
         rows=tuple(dataclasses.replace(r, parameter=r.parameter * free) for r in normal.rows),
         residual=tuple(
             _errors(d, r) / scale for d, r in zip(plain.data, plain.residuals(point), strict=True)
         ),
-        iterations=used,
     )
+    return OutputErrorFit(plain.theta(point), float(point.value[-1]), scale, normal, used)
 
 
 def prediction_rmse(
@@ -175,22 +163,6 @@ def prediction_rmse(
     return np.asarray(np.sqrt(np.where(np.isfinite(squares), squares, np.inf) / np.maximum(count, 1)))
 
 
-def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
-    """Cut windows of so many seconds, shorter ones where no recording holds one.
-
-    Raises:
-        InsufficientDataError: Not even windows of four samples fit.
-    """
-    length = max(round(seconds / problem.episodes[0].period_s), 4)
-    while True:
-        try:
-            return problem.windows(length)
-        except InsufficientDataError:
-            if length <= 4:
-                raise
-            length = max(int(0.8 * length), 4)
-
-
 def expected_residual(problem: Problem) -> FloatArray:
     """Return what predictions of real recordings may be off, positions then velocities, (2 C,).
 
@@ -200,7 +172,7 @@ def expected_residual(problem: Problem) -> FloatArray:
     Args:
         problem: Recordings and simulator.
     """
-    fit = fit_horizon(problem, problem.space.nominal, problem.first_latency_s, SHORT)
+    fit = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
     std = problem.noise_std.copy()
     std[problem.channels] = np.maximum(std[problem.channels], fit.scale)
     return std

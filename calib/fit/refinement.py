@@ -23,7 +23,7 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefinementSettings:
-    """Settings of :func:`polish`.
+    """Settings of :func:`refine`.
 
     Attributes:
         stages_s: Window lengths, short first: short windows have a wide basin, long ones the information [s].
@@ -38,7 +38,7 @@ class RefinementSettings:
             deviations.
         shake_count: Draws of each.
         shaken: Draws that leave more than this share of the cost are the last: it is the model that is wrong.
-        robust_rounds: Rounds of Huber's weights, see :func:`polish_robust`.
+        robust_rounds: Rounds of Huber's weights, see :func:`refine_robust`.
         robust_iterations: Most steps of each.
         rounds: Most rounds of weights where start states are exact.
         round_iterations: Most steps of each.
@@ -76,8 +76,8 @@ SETTINGS = RefinementSettings()
 
 
 @dataclass(frozen=True, slots=True)
-class Polished:
-    """Where the polish ended.
+class Refined:
+    """Where the refinement ended.
 
     Attributes:
         theta: Physical parameters, (K,).
@@ -98,7 +98,7 @@ class Polished:
     iterations: int
 
 
-def polish(
+def refine(
     problem: Problem,
     theta: FloatArray,
     latency_s: float,
@@ -108,8 +108,8 @@ def polish(
     notify: Callable[[int, float], None] | None = None,
     states: States | None = None,
     shake: bool = True,
-) -> Polished:
-    """Polish parameters from a start.
+) -> Refined:
+    """Refine parameters from a start.
 
     Args:
         problem: The problem.
@@ -128,7 +128,7 @@ def polish(
     """
     space, settings = problem.space, SETTINGS
     theta = np.clip(theta, space.low, space.high)
-    if problem.exact:
+    if problem.noise_free:
         stages_s = stages_s or settings.given_stages_s
         if shake and not fixed_latency:
             theta, latency_s = _whole_step(problem, theta, latency_s, stages_s[0])
@@ -136,13 +136,13 @@ def polish(
         fixed_latency = True
     elif stages_s is None:
         stages_s = settings.contact_stages_s if problem.robot.base is not None else settings.stages_s
-    result: Polished | None = None
-    # Fixed: a polish is part of the data's analysis, not of the search's luck.
+    result: Refined | None = None
+    # Fixed: a refinement is part of the data's analysis, not of the search's luck.
     rng = np.random.default_rng(0)
     done = 0
     for seconds in stages_s:
         try:
-            shooting = Shooting(problem, _samples(problem, seconds))
+            shooting = Shooting(problem, samples_in(problem, seconds))
         except InsufficientDataError:
             if result is None:
                 raise
@@ -151,11 +151,13 @@ def polish(
         if shooting.contacts:
             point, normal, used = _with_contacts(shooting, point, iterations, fixed_latency, shake, rng)
         elif shooting.given:
-            point, normal, used = _from_exact(shooting, point, iterations, settings.rounds if shake else 0)
+            point, normal, used = _from_known_states(
+                shooting, point, iterations, settings.rounds if shake else 0
+            )
         else:
             point, normal, used = _solved(shooting, point, iterations, fixed_latency)
         done += used
-        found = _polished(shooting, point, normal, done, fixed_latency)
+        found = _refined(shooting, point, normal, done, fixed_latency)
         if result is not None and not shooting.given and found.chi2 > settings.worse * max(result.chi2, 1.0):
             break
         result, theta, latency_s = found, found.theta, found.latency_s
@@ -168,10 +170,10 @@ def polish(
     return result
 
 
-def polish_windows(
+def refine_windows(
     shooting: Shooting, point: Point, iterations: int = 6, fixed_latency: bool = False
-) -> Polished:
-    """Polish from a point in the windows it is of, such as a part of all windows or weighed ones.
+) -> Refined:
+    """Refine from a point in the windows it is of, such as a part of all windows or weighed ones.
 
     Args:
         shooting: The windows.
@@ -180,7 +182,7 @@ def polish_windows(
         fixed_latency: Keep the latency.
     """
     point, normal, used = _solved(shooting, point, iterations, fixed_latency)
-    return _polished(shooting, point, normal, used, fixed_latency)
+    return _refined(shooting, point, normal, used, fixed_latency)
 
 
 def _solved(
@@ -191,42 +193,42 @@ def _solved(
     return solve(shooting, point, SolverSettings(iterations=iterations), fixed_latency=fixed_latency)
 
 
-def _polished(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Polished:
+def _refined(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Refined:
     free = len(shooting.problem.space) + (0 if fixed_latency else 1)
     chi2 = normal.cost / max(normal.count - free, 1)
-    return Polished(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
+    return Refined(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
 
 
-def polish_robust(polished: Polished, fixed_latency: bool) -> Polished:
-    """Polish on from where a polish ended, large residuals weighing less.
+def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
+    """Refine on from where a refinement ended, large residuals weighing less.
 
     The windows' standard deviations are divided by the weights' roots, so that normal equations, intervals
     and start states all see the same weights. ``chi2`` stays that of all residuals alike, or the loss would
     hide that the model is wrong.
 
     Args:
-        polished: Where to start; its windows are kept.
+        refined: Where to start; its windows are kept.
         fixed_latency: Keep the latency.
     """
-    plain, found, iterations = polished.shooting, polished, polished.iterations
+    plain, found, iterations = refined.shooting, refined, refined.iterations
     for _ in range(SETTINGS.robust_rounds):
         data = [
             dataclasses.replace(d, std=d.std / np.sqrt(huber_weights(r)))
             for d, r in zip(plain.data, plain.residuals(found.point), strict=True)
         ]
-        found = polish_windows(
+        found = refine_windows(
             plain.on(data), found.point, SETTINGS.robust_iterations, fixed_latency=fixed_latency
         )
         iterations += found.iterations
     free = len(plain.problem.space) + (0 if fixed_latency else 1)
-    chi2 = float(plain.costs([found.point])[0]) / max(found.normal.count - free, 1)
+    chi2 = plain.cost(found.point) / max(found.normal.count - free, 1)
     return dataclasses.replace(found, chi2=chi2, iterations=iterations)
 
 
 def at_parameters(
     problem: Problem, theta: FloatArray, latency_s: float, length: int, states: States | None = None
-) -> Polished:
-    """Return parameters with start states fitted to them, as if the polish had ended there.
+) -> Refined:
+    """Return parameters with start states fitted to them, as if the refinement had ended there.
 
     A prediction from smoothed start states errs by what smoothing errs, which says nothing of the model.
 
@@ -247,17 +249,8 @@ def at_parameters(
         normal = shooting.normal(point)
     else:
         point, normal = settled(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
-    found = _polished(shooting, point, normal, 0, problem.fixed_latency_s is not None)
+    found = _refined(shooting, point, normal, 0, problem.fixed_latency_s is not None)
     return dataclasses.replace(found, theta=theta, latency_s=latency_s)
-
-
-def _samples(problem: Problem, seconds: float) -> int:
-    """Return the samples of a window: at least one from exact states, more where start states are unknown."""
-    return (
-        max(round(seconds / problem.episodes[0].period_s), 1)
-        if problem.exact
-        else samples_in(problem, seconds)
-    )
 
 
 def _whole_step(
@@ -271,11 +264,11 @@ def _whole_step(
     low, high = (round(v / step_s) for v in problem.latency_range_s)
     nearest = round(latency_s / step_s)
     beside = sorted((nearest - 1, nearest + 1), key=lambda tick: abs(tick * step_s - latency_s))
-    shooting = Shooting(problem, _samples(problem, seconds))
+    shooting = Shooting(problem, samples_in(problem, seconds))
     best, least = (theta, nearest * step_s), np.inf
     for tick in (nearest, *(t for t in beside if low <= t <= high)):
         start = shooting.start(theta, tick * step_s)
-        point, normal, _ = _from_exact(shooting, start, SolverSettings().iterations, 1)
+        point, normal, _ = _from_known_states(shooting, start, SolverSettings().iterations, 1)
         if _most(normal) < least:
             best, least = (shooting.theta(point), tick * step_s), _most(normal)
         if least < SETTINGS.given_right:
@@ -289,7 +282,9 @@ def _most(normal: Normal) -> float:
     return float(np.quantile(each, SETTINGS.most_windows))
 
 
-def _from_exact(plain: Shooting, point: Point, iterations: int, rounds: int) -> tuple[Point, Normal, int]:
+def _from_known_states(
+    plain: Shooting, point: Point, iterations: int, rounds: int
+) -> tuple[Point, Normal, int]:
     """Solve from exact states: most windows are predicted to rounding, so what others miss is a kink.
 
     A window in which feet slip at another moment than they did has a residual that no small step mends, and
@@ -335,7 +330,7 @@ def _with_contacts(
     return point, normal, used
 
 
-def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished | None:
+def local_fit(problem: Problem, progress: ProgressCallback | None) -> Refined | None:
     """Refine the model's own values; return None where they are too far to be refined.
 
     Costs a small part of a search. Where its residual is explained by the sensors' noise nothing is left to
@@ -350,13 +345,13 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Polished |
             words = f"from the model's own values: chi2 {chi2:.3g}"
             progress(Progress("local fit", done, done, words, values={"chi2": chi2}))
 
-    def fit(part: Problem, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None) -> Polished:
-        return polish(
-            part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.exact
+    def fit(part: Problem, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None) -> Refined:
+        return refine(
+            part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.noise_free
         )
 
     part, nominal = part_of(problem, SETTINGS.local_s), problem.space.nominal
-    if part is problem or problem.exact:
+    if part is problem or problem.noise_free:
         found = fit(problem, nominal, latency_s, None)
         return found if np.isfinite(found.chi2) else None
     stages_s = SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s

@@ -7,13 +7,10 @@ it.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Prediction, Problem, WindowData
 from deal_hw.types import FloatArray
@@ -27,8 +24,8 @@ class DifferenceSettings:
         parameter: Of a parameter, in its own scale.
         contact_parameter: The same where feet touch the floor: sticking and slipping kink predictions on
             every scale, and a secant says more of them than a derivative.
-        exact_parameter: The same where states are exact: the residual then has no floor to hide a secant's
-            error under.
+        noise_free_parameter: The same where states are known without error: the residual then has no floor to
+            hide a secant's error under.
         latency_s: Of the latency [s].
         position: Of a start position [rad or m].
         velocity: Of a start velocity [rad/s or m/s].
@@ -38,7 +35,7 @@ class DifferenceSettings:
 
     parameter: float = 1e-4
     contact_parameter: float = 2e-2
-    exact_parameter: float = 1e-5
+    noise_free_parameter: float = 1e-5
     latency_s: float = 2e-4
     position: float = 1e-6
     velocity: float = 1e-4
@@ -92,9 +89,9 @@ class Normal:
         count: Residuals, not counting start states' unknowns.
         hessian: (K + 1, K + 1).
         gradient: (K + 1,).
-        back: Per episode what turns a parameter step into start-state steps: (W, 2C, K + 1) and (W, 2C).
         residual: Whitened residuals per episode, (W, H, M).
         prior: Information that the parameters' priors gave to the hessian, (K + 1,).
+        back: Per episode what turns a parameter step into start-state steps: (W, 2C, K + 1) and (W, 2C).
         rows: Linearised residuals per episode, where they were asked for.
     """
 
@@ -102,9 +99,9 @@ class Normal:
     count: int
     hessian: FloatArray
     gradient: FloatArray
-    back: tuple[tuple[FloatArray, FloatArray], ...]
     residual: tuple[FloatArray, ...]
     prior: FloatArray
+    back: tuple[tuple[FloatArray, FloatArray], ...] = ()
     rows: tuple[WindowRows, ...] = ()
 
 
@@ -131,7 +128,7 @@ class Shooting:
         prior_share: float = np.inf,
     ) -> None:
         self.problem = problem
-        self.given = given or problem.exact
+        self.given = given or problem.noise_free
         self.prior_share = prior_share
         self.data: Sequence[WindowData] = problem.windows(length) if data is None else data
         self.length = length
@@ -144,7 +141,9 @@ class Shooting:
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
         self.start_information = [1 / d.prior_std**2 for d in self.data]
-        self._parameter_step = DIFFERENCES.exact_parameter if problem.exact else DIFFERENCES.parameter
+        self._parameter_step = (
+            DIFFERENCES.noise_free_parameter if problem.noise_free else DIFFERENCES.parameter
+        )
         self._state_step = np.concatenate(
             [np.full(C, DIFFERENCES.position), np.full(C, DIFFERENCES.velocity)]
         )
@@ -271,8 +270,8 @@ class Shooting:
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
             count += W * int(data.prior_counts.sum()) - W * 2 * C
-        all_of = tuple(back), tuple(residuals), self.prior_information, tuple(rows)
-        return Normal(cost, count, hessian, gradient, *all_of)
+        found = tuple(residuals), self.prior_information, tuple(back), tuple(rows)
+        return Normal(cost, count, hessian, gradient, *found)
 
     def followed(self, point: Point, normal: Normal, step: FloatArray) -> Point:
         """Return the point after a parameter step, (K + 1,), each window's start state moved as suits it.
@@ -345,25 +344,15 @@ class Shooting:
         each = [np.concatenate([s.position_std, s.velocity_std]) for s in starts]
         return np.asarray(np.max(each, axis=0))
 
-    def costs(self, points: Sequence[Point]) -> FloatArray:
-        """Return the cost at each of several points, in one batch; infinite where a member diverged."""
-        each = self.each_cost(points)
-        return np.asarray(self.prior_costs(points) + np.sum([c.sum(axis=1) for c in each], axis=0))
+    def cost(self, point: Point) -> float:
+        """Return the sum of all squared whitened residuals at a point; infinite where it diverged."""
+        prior = ((point.value - self.prior_mean)[None] ** 2 @ self.prior_information)[0]
+        return float(prior + np.sum([c.sum() for c in self.window_costs(point)]))
 
-    def prior_costs(self, points: Sequence[Point]) -> FloatArray:
-        """Return what the parameters' priors add to the cost at each of several points, (N,)."""
-        values = np.stack([p.value for p in points])
-        return np.asarray((values - self.prior_mean) ** 2 @ self.prior_information)
-
-    def each_cost(self, points: Sequence[Point]) -> list[FloatArray]:
-        """Return the cost of each window at each of several points, in one batch, (N, W) an episode."""
-        values = np.stack([p.value for p in points])
-        found = []
-        for e in range(len(self.data)):
-            x = np.stack([p.position[e] for p in points])
-            v = np.stack([p.velocity[e] for p in points])
-            found.append(self._window_costs(e, values, x, v))
-        return found
+    def window_costs(self, point: Point) -> list[FloatArray]:
+        """Return what each window costs at a point, (W,) an episode."""
+        starts = enumerate(zip(point.position, point.velocity, strict=True))
+        return [self._window_costs(e, point.value[None], x[None], v[None])[0] for e, (x, v) in starts]
 
     def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""
@@ -432,10 +421,3 @@ def _rows(
         np.concatenate([jp, np.zeros((W, S, jp.shape[2]))], axis=1),
         np.concatenate([js, root[:, :, None] * np.eye(S)], axis=1),
     )
-
-
-def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
-    """Return some of the windows, chosen by a mask (W,) or by their rows."""
-    names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
-    windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
-    return dataclasses.replace(data, windows=windows, **{name: getattr(data, name)[chosen] for name in names})

@@ -162,7 +162,7 @@ def settled(shooting: Shooting, point: Point, normal: Normal, iterations: int) -
     """
     for _ in range(0 if shooting.given else iterations):
         moved = shooting.followed(point, normal, np.zeros_like(point.value))
-        if not shooting.costs([moved])[0] < normal.cost * (1 - SOLVER.settled):
+        if not shooting.cost(moved) < normal.cost * (1 - SOLVER.settled):
             break
         point, normal = moved, shooting.normal(moved, keep=bool(normal.rows))
     return point, normal

@@ -419,6 +419,6 @@ def population(
         axis.set_yticks(np.arange(K), space.names)
         axis.set_ylim(K - 0.5, -0.5)
         axis.set_xlim(-0.02, 1.02)
-        axis.set_xticks([0, 0.25, 0.5, 0.75, 1], ["low", "", "centre of the range", "", "high"])
+        axis.set_xticks([0, 0.25, 0.5, 0.75, 1], ["low", "", "midpoint of the range", "", "high"])
         axis.grid(axis="y", color=FAINT, alpha=0.25, linewidth=0.6)
         return svg(figure, f"last population of {len(unit)} members and estimate of {K} parameters")

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import whitened_residual
-from deal_hw.calib.data.problem import Problem, WindowData, samples_in
-from deal_hw.calib.fit.output_error import longest_windows
+from deal_hw.calib.data.innovations import Members, whitened_residual
+from deal_hw.calib.data.problem import Problem, WindowData, longest_windows, samples_in
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel

@@ -27,7 +27,7 @@ TRACE = "trace.npz"
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
 
-_HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "halves")
+_HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "split_half")
 """Provenance with a place of its own on the page."""
 
 
@@ -101,7 +101,7 @@ def render(inputs: ReportInputs) -> str:
         heldout_window_s=float(heldout.get("window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
-        halves=_mapping(_mapping(provenance.get("halves")).get("parameters")),
+        halves=_mapping(_mapping(provenance.get("split_half")).get("parameters")),
         residuals=drawn,
         advice=advice_rows(result),
         scan=charts.latency_scan(scan, inputs.tick_s),

@@ -8,14 +8,207 @@ decides all that follows.
 from __future__ import annotations
 
 import abc
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.log import SearchLog
 from deal_hw.calib.search.resume import Kept, restore_generator
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, ProgressCallback, StateStore
+from deal_hw.calibration import (
+    Z90,
+    Alarm,
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    Progress,
+    ProgressCallback,
+    StateStore,
+)
+from deal_hw.types import FloatArray
+
+
+class Coordinates:
+    """The map between a unit cube of K parameters (and the latency) and physical values.
+
+    Parameters are equal steps of their own scale, log for positive ones; the latency is linear.
+
+    Args:
+        problem: Gives the space and the range of the latency, or the latency.
+        margin_s: The latency's coordinate reaches so far beyond its range, or a latency of zero would sit at
+            infinity [s]; less than :func:`~deal_hw.calib.data.innovations.early_setpoints` can undo.
+    """
+
+    def __init__(self, problem: Problem, margin_s: float = 0.004) -> None:
+        self.space = problem.space
+        self.fixed_latency_s = problem.fixed_latency_s
+        self._range = problem.latency_range_s
+        self._low = self._range[0] - margin_s
+        self._width = self._range[1] - self._range[0] + 2 * margin_s
+
+    @property
+    def count(self) -> int:
+        """Coordinates: K, and one more where the latency is searched."""
+        return len(self.space) + (self.fixed_latency_s is None)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return self.space.names + (("latency_s",) if self.fixed_latency_s is None else ())
+
+    def members(self, unit: FloatArray) -> Members:
+        """Map unit coordinates, (N, C), to physical values; parameters are clipped to their range."""
+        K = len(self.space)
+        theta = np.clip(self.space.unnormalize(unit[:, :K]), self.space.low, self.space.high)
+        if self.fixed_latency_s is not None:
+            return Members(theta, np.full(len(unit), self.fixed_latency_s))
+        latency = self._low + self._width * np.clip(unit[:, K], 0.0, 1.0)
+        return Members(theta, latency)
+
+    def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Draw unit coordinates, (count, C), over all ranges; the latency's without its margin."""
+        unit = rng.random((count, self.count))
+        if self.fixed_latency_s is None:
+            inner = self._range[0] + (self._range[1] - self._range[0]) * unit[:, -1]
+            unit[:, -1] = (inner - self._low) / self._width
+        return unit
+
+    def latency_unit(self, latency_s: FloatArray) -> FloatArray:
+        """Return the unit coordinate of latencies, (N,)."""
+        return np.asarray((latency_s - self._low) / self._width)
+
+    def clip_latency(self, latency_s: float) -> float:
+        """Return the latency inside the range that was asked for [s]."""
+        if self.fixed_latency_s is not None:
+            return self.fixed_latency_s
+        return float(np.clip(latency_s, *self._range))
+
+
+class SearchLog:
+    """Book-keeping of one search.
+
+    Args:
+        method: Name of the method.
+        problem: What is searched.
+        budget: What may be used.
+        progress: Called after each generation.
+        settings: The method's settings, a dataclass.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        problem: Problem,
+        budget: Budget,
+        progress: ProgressCallback | None,
+        settings: Any,
+    ) -> None:
+        self.method, self.problem, self.budget, self._settings = method, problem, budget, settings
+        self.coordinates = Coordinates(problem)
+        self.trace: list[dict[str, float]] = []
+        self._progress = progress
+        self._steps = problem.steps
+        self._start = time.perf_counter()
+        self._earlier_steps, self._earlier_seconds = 0, 0.0
+
+    def note(self, message: str, members: Members, values: Mapping[str, float]) -> None:
+        """Write one generation into the trace and call the callback, which may raise to stop the run.
+
+        Args:
+            message: One short line.
+            members: What was simulated.
+            values: For the trace.
+        """
+        self.trace.append({"generation": float(len(self.trace)), **values})
+        if self._progress is not None:
+            total = max(self.budget.generations, len(self.trace))
+            latency_s = float(np.mean(members.latency_s))
+            progress = Progress("search", len(self.trace), total, message, members.theta, latency_s, values)
+            self._progress(progress)
+
+    @property
+    def steps(self) -> int:
+        """Physics steps simulated so far, before a resume too."""
+        return self._earlier_steps + self.problem.steps - self._steps
+
+    @property
+    def seconds(self) -> float:
+        """Wall clock so far, before a resume too [s]."""
+        return self._earlier_seconds + time.perf_counter() - self._start
+
+    def save(self) -> dict[str, Any]:
+        """Return the state of the book-keeping as plain values."""
+        return {"trace": self.trace, "steps": self.steps, "seconds": self.seconds}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state."""
+        self.trace[:] = state["trace"]
+        self._earlier_steps, self._earlier_seconds = state["steps"], state["seconds"]
+        self._steps, self._start = self.problem.steps, time.perf_counter()
+
+    def unexplained(self, chi2: float) -> Alarm:
+        """Return the alarm of a search that left a residual."""
+        return Alarm(
+            f"After {len(self.trace)} generations the residual is {chi2:.1f} times its expected variance.",
+            "The search ended elsewhere than at the robot, or the model lacks something.",
+            "Refine it, search again (another --seed, more --generations, wider ranges), or doubt the model.",
+        )
+
+    def result(
+        self,
+        centre: Members,
+        population: Members,
+        *,
+        chi2: float = float("nan"),
+        alarms: Sequence[Alarm] = (),
+        extra: Mapping[str, Any] | None = None,
+        **better: Any,
+    ) -> CalibrationResult:
+        """Return the result.
+
+        The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
+        calibrated: a searcher's population shrinks as its step rule says, too far where the ensemble is
+        small, and to nothing for diffusion evolution. The refinement computes intervals from the data.
+
+        Args:
+            centre: The estimate, one member.
+            population: The last population.
+            chi2: Mean squared whitened residual at the estimate.
+            alarms: Reasons to distrust the result.
+            extra: Further provenance.
+            better: Fields of the result that the method knows better than its population does.
+        """
+        space = self.problem.space
+        scaled = space.to_scale(population.theta)
+        covariance = np.atleast_2d(np.cov(scaled, rowvar=False)) if len(scaled) > 1 else None
+        std = np.zeros(len(space)) if covariance is None else np.sqrt(np.diag(covariance))
+        middle = space.to_scale(centre.theta[0])
+        interval = np.stack(
+            [space.from_scale(middle - Z90 * std), space.from_scale(middle + Z90 * std)], axis=1
+        )
+        clip = self.coordinates.clip_latency
+        latency = clip(float(centre.latency_s[0]))
+        spread = float(population.latency_s.std(ddof=1)) if len(scaled) > 1 else 0.0
+        plain = CalibrationResult(
+            method=self.method,
+            space=space,
+            estimate=np.array(centre.theta[0]),
+            interval=np.clip(interval, space.low[:, None], space.high[:, None]),
+            covariance=covariance,
+            population=population.theta,
+            latency_s=latency,
+            latency_interval_s=(clip(latency - Z90 * spread), clip(latency + Z90 * spread)),
+            chi2=chi2,
+            alarms=tuple(alarms),
+            trace=tuple(self.trace),
+            steps=self.steps,
+            seconds=self.seconds,
+            provenance={"settings": asdict(self._settings), "budget": asdict(self.budget), **(extra or {})},
+        )
+        return replace(plain, **better)
 
 
 class Stepper(Kept, abc.ABC):

@@ -24,13 +24,19 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.coordinates import Members
-from deal_hw.calib.data.innovations import cut, explained, is_noisy, linearise, predict, samples_per_tick
+from deal_hw.calib.data.innovations import (
+    Members,
+    cut,
+    explained,
+    is_noisy,
+    linearise,
+    predict,
+    samples_per_tick,
+)
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.search.base import Search
+from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
-from deal_hw.calib.search.ensemble_kalman import KalmanStepper
-from deal_hw.calib.search.log import SearchLog
+from deal_hw.calib.search.eki import KalmanStepper
 from deal_hw.calib.search.resume import Kept, State
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray

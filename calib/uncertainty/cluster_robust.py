@@ -1,6 +1,6 @@
 """Variances clustered by blocks of time: what holds where residuals are neither white nor of one size.
 
-The usual covariance H^-1 believes in independent residuals of known variance. The sandwich
+The usual covariance H^-1 believes in independent residuals of known variance. The cluster-robust one
 H^-1 (sum_b s_b s_b^T) H^-1 only believes that blocks of residuals are independent of each other: s_b is the
 score of block b (what it adds to half the cost's gradient), start states eliminated. Handed back is the ratio
 of both variances, coordinate by coordinate.
@@ -88,7 +88,7 @@ class _Level:
 def clustered(
     rows: Sequence[WindowRows], bread: FloatArray, samples: int, correlation_samples: float = 1.0
 ) -> Clustered | None:
-    """Compare the sandwich with the covariance of independent residuals.
+    """Compare the cluster-robust covariance with the covariance of independent residuals.
 
     Args:
         rows: Linearised residuals at the estimate.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +12,13 @@ from scipy.stats import t as t_law
 from scipy.stats import truncnorm
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished
-from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.fit.refinement import Refined
+from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calibration import Alarm, Verdict, listed
+from deal_hw.calibration import Z90, Alarm, Verdict, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-
-Z90 = 1.6448536269514722
-"""Half width of a 90 % interval in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,16 +149,12 @@ def uncertainty(
     space: ParameterSpace,
     theta: FloatArray,
     latency_s: float,
-    hessian: FloatArray,
+    normal: Normal,
     chi2: float,
-    residuals: tuple[FloatArray, ...],
     latency_range_s: tuple[float, float],
+    *,
     fixed_latency: bool = False,
     timing_std_s: float = 0.0,
-    *,
-    gradient: FloatArray | None = None,
-    prior: FloatArray | None = None,
-    rows: Sequence[WindowRows] = (),
     kinks: float = SETTINGS.kinks,
 ) -> Uncertainty:
     """Turn normal equations into statements.
@@ -171,24 +163,20 @@ def uncertainty(
         space: The parameters.
         theta: Estimate, (K,).
         latency_s: Estimate [s].
-        hessian: Whitened normal matrix of parameters and latency, start states eliminated, (K + 1, K + 1).
+        normal: Normal equations there. Their gradient says how hard a bound is pressed; from their rows
+            variances are clustered, and without any residuals are believed to be independent but for their
+            correlation time.
         chi2: Mean squared whitened residual.
-        residuals: Whitened residuals of windows, (W, H, J) each.
         latency_range_s: Searched latencies [s].
         fixed_latency: The latency was given.
         timing_std_s: Jitter of the samples' time that the recording shows [s].
-        gradient: Half the cost's gradient there, (K + 1,); says how hard a bound is pressed. None for zeros.
-        prior: Information of the parameters' priors that is in the hessian, (K + 1,). None for none.
-        rows: Linearised residuals there, from which variances are clustered; none to believe that residuals
-            are independent but for their correlation time.
         kinks: Factor on standard deviations for what linearising leaves out.
     """
     K = len(space)
-    tau = correlation_time(residuals)
+    tau = correlation_time(normal.residual)
     inflation = kinks**2 * max(1.0, chi2) * tau
-    slope = np.zeros(K + 1) if gradient is None else gradient
-    known = np.zeros(K + 1) if prior is None else prior
-    data = hessian - np.diag(known)
+    slope, known = normal.gradient, normal.prior
+    data = normal.hessian - np.diag(known)
     # The range is a flat prior; its variance keeps what the data cannot see as wide as the range.
     flat = np.append(space.width**2, (latency_range_s[1] - latency_range_s[0]) ** 2) / 12.0
     belief = known + 1.0 / flat
@@ -199,7 +187,7 @@ def uncertainty(
     free = np.append(bound == 0, not fixed_latency)
     precision = data / inflation + np.diag(belief)
     covariance = _covariance(precision, free)
-    cluster = clustered(rows, covariance / inflation, residuals[0].shape[1], tau) if rows else None
+    cluster = clustered(normal.rows, covariance / inflation, normal.residual[0].shape[1], tau)
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
     # What the data cannot see stays as wide as the range, however autocorrelated its residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
@@ -394,44 +382,39 @@ def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.b
     return np.asarray((unit < SETTINGS.at_bound) | (unit > 1 - SETTINGS.at_bound))
 
 
-def with_rows(polished: Polished) -> Polished:
+def with_rows(refined: Refined) -> Refined:
     """Return the same with linearised residuals, from which variances are clustered.
 
     Central differences where nothing kinks: what is said of directions without information depends on them.
     """
-    if polished.normal.rows:
-        return polished
-    shooting = polished.shooting
+    if refined.normal.rows:
+        return refined
+    shooting = refined.shooting
     if shooting.problem.robot.base is None:
-        normal = shooting.normal(polished.point, keep=True, stretch=SETTINGS.near, central=True)
+        normal = shooting.normal(refined.point, keep=True, stretch=SETTINGS.near, central=True)
     else:
-        normal = shooting.normal(polished.point, keep=True)
-    return dataclasses.replace(polished, normal=normal)
+        normal = shooting.normal(refined.point, keep=True)
+    return dataclasses.replace(refined, normal=normal)
 
 
-def statement(problem: Problem, polished: Polished, fixed_latency: bool) -> Uncertainty:
-    """Return what the data say where the polish ended.
+def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> Uncertainty:
+    """Return what the data say where the refinement ended.
 
     Args:
         problem: The problem.
-        polished: Where; variances are clustered where it holds linearised residuals.
+        refined: Where; variances are clustered where it holds linearised residuals.
         fixed_latency: The latency was given, or decided.
     """
-    normal = polished.normal
     return uncertainty(
         problem.space,
-        polished.theta,
-        polished.latency_s,
-        normal.hessian,
-        polished.chi2,
-        normal.residual,
+        refined.theta,
+        refined.latency_s,
+        refined.normal,
+        refined.chi2,
         problem.latency_range_s,
         fixed_latency=fixed_latency,
         timing_std_s=problem.noise.timing_std_s,
-        gradient=normal.gradient,
-        prior=normal.prior,
-        rows=normal.rows,
-        kinks=SETTINGS.kinks if problem.robot.base is None or problem.exact else SETTINGS.contact_kinks,
+        kinks=SETTINGS.kinks if problem.robot.base is None or problem.noise_free else SETTINGS.contact_kinks,
     )
 
 

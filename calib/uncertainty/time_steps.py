@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, intervals, widened_to
-from deal_hw.calibration import Alarm, Progress, ProgressCallback, listed
+from deal_hw.calib.uncertainty.intervals import Uncertainty, intervals, widened_to
+from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
 from deal_hw.types import FloatArray
 
 
@@ -57,64 +57,64 @@ SCAN = ScanSettings()
 
 @dataclass(frozen=True, slots=True)
 class LatencyScan:
-    """What the polish finds at whole device ticks of latency.
+    """What the refinement finds at whole device ticks of latency.
 
     Attributes:
         ticks: Latencies [device ticks], (L,).
-        polished: The polish at each.
+        refined: The refinement at each.
     """
 
     ticks: tuple[int, ...]
-    polished: tuple[Polished, ...]
+    refined: tuple[Refined, ...]
 
     @property
     def best(self) -> int:
         """Index of the latency with the least chi-square."""
-        return int(np.argmin([p.normal.cost for p in self.polished]))
+        return int(np.argmin([p.normal.cost for p in self.refined]))
 
     @property
     def weights(self) -> FloatArray:
         """How plausible each latency is, (L,); sums to 1."""
-        cost = np.array([p.normal.cost for p in self.polished])
-        scale = max(1.0, self.polished[self.best].chi2)
+        cost = np.array([p.normal.cost for p in self.refined])
+        scale = max(1.0, self.refined[self.best].chi2)
         weight = np.exp(-0.5 * (cost - cost.min()) / scale)
         return np.asarray(weight / weight.sum())
 
-    def decides(self, free: Polished) -> bool:
+    def decides(self, free: Refined) -> bool:
         """Return whether a whole tick explains the recordings about as well as a free latency."""
-        return self.polished[self.best].normal.cost < free.normal.cost + SCAN.worse
+        return self.refined[self.best].normal.cost < free.normal.cost + SCAN.worse
 
 
-def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallback | None) -> LatencyScan:
-    """Polish again at the whole device ticks around the latency found.
+def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback | None) -> LatencyScan:
+    """Refine again at the whole device ticks around the latency found.
 
     The device acts on period boundaries, so its latency is a whole number of ticks; knowing that sharpens the
     other parameters, and the ticks that remain plausible say how much.
     """
     tick = problem.episodes[0].step_s
-    centre = round(polished.latency_s / tick)
+    centre = round(refined.latency_s / tick)
     low, high = (round(v / tick) for v in problem.latency_range_s)
-    length_s = polished.shooting.length * problem.episodes[0].period_s
-    states = polished.shooting.states(polished.point)
+    length_s = refined.shooting.length * problem.episodes[0].period_s
+    states = refined.shooting.states(refined.point)
     contacts = problem.robot.base is not None
     reach, iterations = SCAN.ticks, SCAN.iterations
     if contacts:
         reach, iterations = SCAN.contact_ticks, SCAN.contact_iterations
     if not contacts:
         # In a smooth problem the curvature says how far off a tick is worth a fit.
-        worth_s = np.sqrt(SCAN.hopeless * max(1.0, polished.chi2) * _latency_variance(polished))
-        low = max(low, min(math.ceil((polished.latency_s - worth_s) / tick), centre))
-        high = min(high, max(math.floor((polished.latency_s + worth_s) / tick), centre))
-    found: dict[int, Polished] = {}
-    if problem.exact:
-        # That polish was at a whole tick, with more iterations than are spent on its neighbours.
-        found[centre] = polished
+        worth_s = np.sqrt(SCAN.hopeless * max(1.0, refined.chi2) * _latency_variance(refined))
+        low = max(low, min(math.ceil((refined.latency_s - worth_s) / tick), centre))
+        high = min(high, max(math.floor((refined.latency_s + worth_s) / tick), centre))
+    found: dict[int, Refined] = {}
+    if problem.noise_free:
+        # That refinement was at a whole tick, with more iterations than are spent on its neighbours.
+        found[centre] = refined
     waiting = [t for t in range(centre - reach, centre + reach + 1) if low <= t <= high and t not in found]
     while waiting and len(found) < SCAN.most:
         t = waiting.pop(0)
-        found[t] = polish(
+        found[t] = refine(
             problem,
-            polished.theta,
+            refined.theta,
             t * tick,
             (length_s,),
             iterations=iterations,
@@ -136,30 +136,30 @@ def scan_latency(problem: Problem, polished: Polished, progress: ProgressCallbac
     return LatencyScan(ticks, tuple(found[t] for t in ticks))
 
 
-def _latency_variance(polished: Polished) -> float:
+def _latency_variance(refined: Refined) -> float:
     """Return the latency's variance under the sensors' noise, all parameters free [s^2]."""
-    prior = np.append(1.0 / polished.shooting.problem.space.width**2, 0.0)
-    return float(np.linalg.inv(polished.normal.hessian + np.diag(prior))[-1, -1])
+    prior = np.append(1.0 / refined.shooting.problem.space.width**2, 0.0)
+    return float(np.linalg.inv(refined.normal.hessian + np.diag(prior))[-1, -1])
 
 
 def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:
     """Widen the best latency's statement by what the other plausible latencies would say."""
     space, tick = problem.space, problem.episodes[0].step_s
-    center = space.to_scale(scan.polished[scan.best].theta)
+    center = space.to_scale(scan.refined[scan.best].theta)
     covariance = np.zeros_like(best.covariance)
-    for weight, polished in zip(scan.weights, scan.polished, strict=True):
-        shift = space.to_scale(polished.theta) - center
+    for weight, refined in zip(scan.weights, scan.refined, strict=True):
+        shift = space.to_scale(refined.theta) - center
         covariance += weight * (best.covariance + np.outer(shift, shift))
     ticks = np.array(scan.ticks)
     spread = float(np.sqrt(np.sum(scan.weights * (ticks - ticks[scan.best]) ** 2)))
     # A tick is decided or not: half a tick is the least that rounding leaves open.
     half = max(Z90 * spread, 0.5) * tick
-    latency = scan.polished[scan.best].latency_s
+    latency = scan.refined[scan.best].latency_s
     low, high = problem.latency_range_s
     return dataclasses.replace(
         best,
         covariance=covariance,
-        interval=intervals(space, scan.polished[scan.best].theta, covariance, best.shape),
+        interval=intervals(space, scan.refined[scan.best].theta, covariance, best.shape),
         latency_interval_s=(max(latency - half, low), min(latency + half, high)),
     )
 
@@ -215,12 +215,12 @@ class StepCheck:
         return {"step_s": self.step_s, "bias": self.bias.tolist(), "chi2_gain": self.gain}
 
 
-def check_step(problem: Problem, polished: Polished, settings: StepSettings | None = None) -> StepCheck:
+def check_step(problem: Problem, refined: Refined, settings: StepSettings | None = None) -> StepCheck:
     """Compare predictions with the model's step and with half of it.
 
     Args:
         problem: Recordings and simulator.
-        polished: Where the fit ended, with linearised residuals.
+        refined: Where the fit ended, with linearised residuals.
         settings: What it may cost.
     """
     step_s, K = problem.robot.step_s, len(problem.space)
@@ -228,18 +228,18 @@ def check_step(problem: Problem, polished: Polished, settings: StepSettings | No
     if problem.robot.base is not None:
         # Feet that touch at another moment change a prediction more than the step's error does.
         return StepCheck(step_s, nothing, note="not compared for robots in contact")
-    shooting, rows = polished.shooting, polished.normal.rows
+    shooting, rows = refined.shooting, refined.normal.rows
     samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
     steps = 3.0 * samples * problem.episodes[0].step_s / step_s
     if steps > (settings or STEP).most_steps:
         return StepCheck(step_s, nothing, note=f"not compared: it would take {steps:.1g} physics steps")
     finer = Shooting(halved(problem), shooting.length, data=shooting.data)
-    before, after = shooting.residuals(polished.point), finer.residuals(polished.point)
+    before, after = shooting.residuals(refined.point), finer.residuals(refined.point)
     if not all(np.isfinite(r).all() for r in after):
         return StepCheck(step_s, nothing, note="not compared: half the step diverged")
     moved = [_shifted(r, b - a) for r, a, b in zip(rows, before, after, strict=True)]
     width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
-    belief = polished.normal.prior + 12.0 / width**2
+    belief = refined.normal.prior + 12.0 / width**2
     if problem.fixed_latency_s is not None:
         # A latency that is given takes nothing of the step's error.
         belief[-1] = np.inf

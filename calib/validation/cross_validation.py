@@ -1,9 +1,9 @@
-"""Search alone, or search and polish? Decided on inner folds of the data that are fitted, on nothing else.
+"""Search alone, or search and refinement? Decided on inner folds of the fitted data, on nothing else.
 
-Where the model is right the polish is nearer the truth. Where it is wrong the polish fits what the model
-lacks with parameters that have no part in it, and a search that stopped early may predict other motion
-better. So each fold's part is left out, both are fitted to the rest, and what predicts the left-out part
-better is taken.
+Where the model is right the refinement is nearer the truth. Where it is wrong it fits what the model lacks
+with parameters that have no part in it, and a search that stopped early may predict other motion better. So
+each fold's part is left out, both are fitted to the rest, and what predicts the left-out part better is
+taken.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import polish, polish_robust
+from deal_hw.calib.fit.refinement import refine, refine_robust
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import Episode
@@ -25,11 +25,11 @@ from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FoldSettings:
+class CrossValidationSettings:
     """Settings of :func:`choose`.
 
     Attributes:
-        folds: Each costs a search and a polish.
+        folds: Each costs a search and a refinement.
         blocks: Stretches of each recording that a fold leaves out.
         most_steps: More physics steps than this are not spent on folds.
     """
@@ -39,7 +39,7 @@ class FoldSettings:
     most_steps: float = 3e9
 
 
-SETTINGS = FoldSettings()
+SETTINGS = CrossValidationSettings()
 
 Member = tuple[FloatArray, float]
 """Physical parameters, (K,), and latency [s]."""
@@ -94,30 +94,31 @@ def choose(
         seed: Seeds the folds' searches.
         length: Samples that are predicted at a time.
         search_steps: What the search of all data cost [physics steps].
-        robust: Try the robust polish, too.
+        robust: Try the robust refinement, too.
     """
     window_s = length * problem.episodes[0].period_s
     if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
         note = f"left out: {SETTINGS.folds} searches would take {cost:.1g} physics steps"
-        return Choice("polish", {}, window_s, note=note)
+        return Choice("refinement", {}, window_s, note=note)
     before = problem.steps
     fixed = problem.fixed_latency_s is not None
 
     def fits(train: Problem, fold: int) -> dict[str, Member]:
         searched = search.run(train, budget, np.random.default_rng([seed, fold]))
-        polished = polish(train, searched.estimate, searched.latency_s, fixed_latency=fixed)
+        refined = refine(train, searched.estimate, searched.latency_s, fixed_latency=fixed)
         found = {
-            "search": (searched.estimate, searched.latency_s), "polish": (polished.theta, polished.latency_s)
-        }  # fmt: skip
+            "search": (searched.estimate, searched.latency_s),
+            "refinement": (refined.theta, refined.latency_s),
+        }
         if robust:
-            weighed = polish_robust(polished, fixed)
-            found["robust polish"] = weighed.theta, weighed.latency_s
+            weighed = refine_robust(refined, fixed)
+            found["robust refinement"] = weighed.theta, weighed.latency_s
         return found
 
     def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
         return prediction_error(test, members, length)
 
-    found = on_folds(problem, fold_masks(problem), fits, errors, "polish", window_s)
+    found = on_folds(problem, fold_masks(problem), fits, errors, "refinement", window_s)
     return dataclasses.replace(found, steps=problem.steps - before)
 
 

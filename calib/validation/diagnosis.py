@@ -17,7 +17,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
-from deal_hw.calib.fit.refinement import Polished, at_parameters, part_of, polish
+from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import ended_at_bound
@@ -153,32 +153,32 @@ class Evidence:
     time_s: Sequence[FloatArray]
 
 
-def diagnose(problem: Problem, polished: Polished) -> tuple[Finding, ...]:
+def diagnose(problem: Problem, refined: Refined) -> tuple[Finding, ...]:
     """Return what the residual of a fit looks like, best supported first.
 
     Args:
         problem: The problem.
-        polished: Where the fit ended, with linearised residuals.
+        refined: Where the fit ended, with linearised residuals.
     """
-    play = find_play(problem, polished)
+    play = find_play(problem, refined)
     if play is not None and play.share >= SETTINGS.decisive:
         return (play,)
-    found = name_causes(evidence(problem, polished))
+    found = name_causes(evidence(problem, refined))
     return tuple(sorted((*found, *((play,) if play else ())), key=lambda f: -f.deviance))
 
 
-def evidence(problem: Problem, polished: Polished) -> Evidence:
+def evidence(problem: Problem, refined: Refined) -> Evidence:
     """Return what the residual of a fit is judged by; see :func:`diagnose`."""
-    space, data = problem.space, polished.shooting.data
+    space, data = problem.space, refined.shooting.data
     width = np.append(SETTINGS.parameter_prior * space.width, SETTINGS.latency_prior_s)
     # A parameter at the end of its range explains no more.
-    free = np.append(~ended_at_bound(space, polished.theta), problem.fixed_latency_s is None)
+    free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
     episodes = [problem.episodes[d.episode] for d in data]
     return Evidence(
-        rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in polished.normal.rows],
+        rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
         prior=1 / width**2,
-        found=signatures(problem, polished),
-        answers=answers(problem, polished),
+        found=signatures(problem, refined),
+        answers=answers(problem, refined),
         period_s=problem.episodes[0].period_s,
         time_s=[
             np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
@@ -187,18 +187,18 @@ def evidence(problem: Problem, polished: Polished) -> Evidence:
     )
 
 
-def find_play(problem: Problem, polished: Polished) -> Finding | None:
+def find_play(problem: Problem, refined: Refined) -> Finding | None:
     """Fit a model with play in every gear to a part of the recordings; return what it says of the rest.
 
     The model without has seen all of them.
 
     Args:
         problem: The problem.
-        polished: Where its fit ended.
+        refined: Where its fit ended.
     """
     description, names = problem.robot.description, problem.robot.actuator_names
     known = any(p.kind == "servo_play" for p in problem.space.parameters)
-    if description.actuation != "position" or problem.robot.base is not None or problem.exact or known:
+    if description.actuation != "position" or problem.robot.base is not None or problem.noise_free or known:
         return None
     span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
     plays = [
@@ -218,8 +218,8 @@ def find_play(problem: Problem, polished: Polished) -> Finding | None:
     length = samples_in(problem, SETTINGS.play_s)
     try:
         first = problem.first_latency_s
-        fit = polish(part, wide.space.nominal, first, (SETTINGS.play_s,), fixed_latency=fixed)
-        without = at_parameters(problem.part(rest), polished.theta, polished.latency_s, length)
+        fit = refine(part, wide.space.nominal, first, (SETTINGS.play_s,), fixed_latency=fixed)
+        without = at_parameters(problem.part(rest), refined.theta, refined.latency_s, length)
         with_play = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return None

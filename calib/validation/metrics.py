@@ -10,7 +10,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.uncertainty.intervals import Z90
+from deal_hw.calibration import Z90
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_vector

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.refinement import Polished
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.parameters import Parameter
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.recordings.windows import setpoints
@@ -75,7 +75,7 @@ class Answer:
     change: FloatArray
 
 
-def signatures(problem: Problem, fit: Polished) -> list[Signature]:
+def signatures(problem: Problem, fit: Refined) -> list[Signature]:
     """Return what causes do in the windows of a fit.
 
     Args:
@@ -125,7 +125,7 @@ def signatures(problem: Problem, fit: Polished) -> list[Signature]:
     return [Signature(cause, where, tuple(columns)) for (cause, where), columns in found.items()]
 
 
-def answers(problem: Problem, fit: Polished) -> list[Answer]:
+def answers(problem: Problem, fit: Refined) -> list[Answer]:
     """Return how the windows of a fit answer to commands; see :func:`signatures`."""
     responses, changes = [], []
     for e, data in enumerate(fit.shooting.data):
@@ -188,7 +188,7 @@ def _inertia(problem: Problem, coordinate: int) -> float:
     return float(problem.robot.model.dof_M0[problem.robot.qvel[joint]])
 
 
-def _path(problem: Problem, fit: Polished, data: WindowData) -> FloatArray:
+def _path(problem: Problem, fit: Refined, data: WindowData) -> FloatArray:
     """Return the set-points of an episode at a fit's values, (1, S, A)."""
     batch = problem.batch(1)
     batch.set_parameters(fit.theta[None])
@@ -197,7 +197,7 @@ def _path(problem: Problem, fit: Polished, data: WindowData) -> FloatArray:
 
 def _predict(
     problem: Problem,
-    fit: Polished,
+    fit: Refined,
     data: WindowData,
     e: int,
     path: FloatArray,

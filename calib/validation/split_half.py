@@ -1,7 +1,8 @@
-"""Do two halves of the data agree? Each is polished alone from the whole's estimate.
+"""Do two halves of the data agree? Each is refined alone from the whole's estimate.
 
-The halves are alternating blocks of the polish's own windows, so no sample is predicted in both and both hold
-every phase of the motion. It costs some iterations over each half, less than one stage of the polish.
+The halves are alternating blocks of the refinement's own windows, so no sample is predicted in both and both
+hold every phase of the motion. It costs some iterations over each half, less than one stage of the
+refinement.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish_windows
-from deal_hw.calib.fit.residual import Point, Shooting, taken
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, statement, widened_to, with_rows
-from deal_hw.calibration import Alarm, listed
+from deal_hw.calib.data.problem import Problem, taken
+from deal_hw.calib.fit.refinement import Refined, refine_windows
+from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.uncertainty.intervals import Uncertainty, uncertainty_at, widened_to, with_rows
+from deal_hw.calibration import Z90, Alarm, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -45,7 +46,7 @@ SETTINGS = SplitHalfSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HalvesRow:
+class SplitHalfRow:
     """What two halves of the data say of one parameter when each is calibrated alone.
 
     Attributes:
@@ -65,7 +66,7 @@ class HalvesRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Halves:
+class SplitHalf:
     """What two halves of the data say.
 
     Attributes:
@@ -76,7 +77,7 @@ class Halves:
         note: Why it was not made.
     """
 
-    rows: tuple[HalvesRow, ...]
+    rows: tuple[SplitHalfRow, ...]
     flagged: tuple[str, ...]
     reach: FloatArray
     steps: int = 0
@@ -111,22 +112,22 @@ class Halves:
         )
 
 
-def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> Halves:
-    """Polish two halves of the windows alone and compare; the latency stays what it is.
+def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> SplitHalf:
+    """Refine two halves of the windows alone and compare; the latency stays what it is.
 
     Args:
         problem: The problem.
-        polished: Where the polish of all windows ended.
+        refined: Where the refinement of all windows ended.
         known: What is known there; what the data cannot tell is not compared.
     """
-    shooting, K = polished.shooting, len(problem.space)
+    shooting, K = refined.shooting, len(problem.space)
     nothing = np.zeros(K)
     windows = sum(len(d.windows) for d in shooting.data)
     if windows < SETTINGS.fewest_windows:
-        return Halves((), (), nothing, note=f"{windows} windows are too few to halve: record longer")
+        return SplitHalf((), (), nothing, note=f"{windows} windows are too few to halve: record longer")
     cost = _steps(problem, shooting)
     if cost > SETTINGS.most_steps:
-        return Halves((), (), nothing, note=f"left out: it would take {cost:.1g} physics steps")
+        return SplitHalf((), (), nothing, note=f"left out: it would take {cost:.1g} physics steps")
     before = problem.steps
     block = 1
     if known.clustered is not None:
@@ -135,17 +136,17 @@ def compare_halves(problem: Problem, polished: Polished, known: Uncertainty) -> 
         block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
     estimates, stds, intervals = [], [], []
     for half in range(2):
-        found = polish_windows(
-            *half_of(shooting, polished.point, half, block), SETTINGS.iterations, fixed_latency=True
+        found = refine_windows(
+            *half_of(shooting, refined.point, half, block), SETTINGS.iterations, fixed_latency=True
         )
-        told = statement(problem, with_rows(found), fixed_latency=True)
+        told = uncertainty_at(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: what all of them say of clustering holds for it, too.
         std = np.sqrt(np.diag(told.covariance)) * np.maximum(known.widened / told.widened, 1.0)
         told = widened_to(problem, told, found.theta, std)
         estimates.append(found.theta)
         stds.append(np.sqrt(np.diag(told.covariance)))
         intervals.append(told.interval)
-    return agreement(problem, polished.theta, known, estimates, stds, intervals, problem.steps - before)
+    return agreement(problem, refined.theta, known, estimates, stds, intervals, problem.steps - before)
 
 
 def agreement(
@@ -156,7 +157,7 @@ def agreement(
     stds: Sequence[FloatArray],
     intervals: Sequence[FloatArray],
     steps: int,
-) -> Halves:
+) -> SplitHalf:
     """Return whether two halves agree.
 
     Args:
@@ -173,16 +174,20 @@ def agreement(
     def three(half: int, k: int) -> tuple[float, float, float]:
         return float(estimates[half][k]), float(intervals[half][k, 0]), float(intervals[half][k, 1])
 
-    rows = tuple(HalvesRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names))
+    rows = tuple(
+        SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
+    )
     told = ~known.shape.blind
     least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(told.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
     far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
     flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
-    return Halves(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
+    return SplitHalf(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
 
 
-def heed(problem: Problem, known: Uncertainty, theta: FloatArray, halves: Halves) -> Uncertainty:
+def widened_by_halves(
+    problem: Problem, known: Uncertainty, theta: FloatArray, halves: SplitHalf
+) -> Uncertainty:
     """Return what is known, flagged parameters' intervals holding the estimates of both halves."""
     if not halves.flagged:
         return known

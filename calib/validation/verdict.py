@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished
+from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, ended_at_bound
 from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import diagnose
-from deal_hw.calib.validation.split_half import compare_halves, heed
+from deal_hw.calib.validation.split_half import check_split_half, widened_by_halves
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
@@ -43,19 +43,19 @@ SETTINGS = VerdictSettings()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Validation:
-    """Which checks follow a polish."""
+    """Which checks follow a refinement."""
 
     local_first: bool = True
     """Refine the model's own values first; where that explains the recordings there is no search."""
 
-    folds: bool = True
-    """Where the residual is unexplained, keep the polish only if it predicts better on inner folds."""
+    cross_validation: bool = True
+    """Where the residual is unexplained, keep the refinement only if it predicts better on inner folds."""
 
     robust: bool = False
     """Try Huber's loss on those folds, too, where the residual has heavy tails."""
 
-    halves: bool = True
-    """Polish two halves of the data alone and compare."""
+    split_half: bool = True
+    """Refine two halves of the data alone and compare."""
 
     physics_step: bool = True
     """Predict with half the physics step; intervals count what the step moves."""
@@ -93,28 +93,28 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
     )
 
 
-def unexplained(polished: Polished) -> bool:
+def unexplained(refined: Refined) -> bool:
     """Return whether the residual is larger, or autocorrelated longer, than noise is."""
-    if polished.chi2 <= MISMATCH.negligible_chi2:
+    if refined.chi2 <= MISMATCH.negligible_chi2:
         return False
-    if polished.chi2 > MISMATCH.chi2:
+    if refined.chi2 > MISMATCH.chi2:
         return True
-    return correlation_time(polished.normal.residual) > MISMATCH.correlation_samples
+    return correlation_time(refined.normal.residual) > MISMATCH.correlation_samples
 
 
 def judge(
-    problem: Problem, polished: Polished, known: Uncertainty, settings: Validation
+    problem: Problem, refined: Refined, known: Uncertainty, settings: Validation
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Check and return what is then known, and facts for the provenance.
 
     Args:
         problem: The problem.
-        polished: Where the polish ended, with linearised residuals.
+        refined: Where the refinement ended, with linearised residuals.
         known: What is known there.
         settings: Which checks.
     """
     facts: dict[str, Any] = {"inflation": known.inflation}
-    ended = np.flatnonzero(ended_at_bound(problem.space, polished.theta))
+    ended = np.flatnonzero(ended_at_bound(problem.space, refined.theta))
     facts["at_bound"] = [problem.space.names[k] for k in ended]
     if known.clustered is not None:
         cluster = known.clustered
@@ -125,38 +125,38 @@ def judge(
             "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
         }
     if settings.physics_step:
-        known, facts["physics_step"] = with_step(problem, polished, known, polished.theta)
-    if settings.halves:
-        halves = compare_halves(problem, polished, known)
-        known = heed(problem, known, polished.theta, halves)
-        facts["halves"] = halves.to_json()
-    if settings.diagnosis and unexplained(polished):
-        known, facts["diagnosis"] = with_causes(problem, polished, known)
+        known, facts["physics_step"] = with_step(problem, refined, known, refined.theta)
+    if settings.split_half:
+        halves = check_split_half(problem, refined, known)
+        known = widened_by_halves(problem, known, refined.theta, halves)
+        facts["split_half"] = halves.to_json()
+    if settings.diagnosis and unexplained(refined):
+        known, facts["diagnosis"] = with_causes(problem, refined, known)
     return known, facts
 
 
 def with_step(
-    problem: Problem, polished: Polished, known: Uncertainty, theta: FloatArray
+    problem: Problem, refined: Refined, known: Uncertainty, theta: FloatArray
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Return what is known, the physics step counted, and what the check found, as plain JSON values.
 
     Args:
         problem: The problem.
-        polished: Where a fit of windows ended, with linearised residuals.
+        refined: Where a fit of windows ended, with linearised residuals.
         known: What was known before.
         theta: The estimate that is about, (K,).
     """
-    step = check_step(problem, polished)
+    step = check_step(problem, refined)
     alarms = step_alarm(problem, known, step)
     known = counted(problem, known, theta, step)
     return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), step.to_json()
 
 
 def with_causes(
-    problem: Problem, polished: Polished, known: Uncertainty
+    problem: Problem, refined: Refined, known: Uncertainty
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Return what is known, alarmed by what the residual looks like, and all causes as plain JSON values."""
-    found = diagnose(problem, polished)
+    found = diagnose(problem, refined)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
     return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
 

@@ -1,9 +1,9 @@
 """The calibration benches: methods against hidden truths, one row a cell.
 
-- honest: each seed's truth lies off the centre of a fixed range whose centre is the wrong nominal model.
+- honest: each seed's truth lies off the centre of a fixed range whose midpoint is the wrong nominal model.
 - mismatch: the same on robots that do what no simulator here does (profile ``realistic``).
 - paper: ranges [theta / xi, xi theta] on a linear scale around the truth itself, as DEAL's tables have it. A
-  searcher that ignores the data and returns the centre of the log range scores 0 there.
+  searcher that ignores the data and returns the midpoint of the log range scores 0 there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["honest", "mismatch", "paper"]
 PAPER_NOTE = "centred target: a searcher that ignores the data scores 0 here"
-KEY = ("task", "space", "profile", "demonstration", "method", "polish", "xi", "seed")
+KEY = ("task", "space", "profile", "demonstration", "method", "refined", "xi", "seed")
 """What names a cell."""
 
 
@@ -36,7 +36,7 @@ class Cell:
         profile: Profile of the robot.
         demonstration: "excite" or "policy".
         method: Name of the method.
-        polish: Whether the polish follows.
+        refined: Whether the refinement follows.
         xi: Ratio of the search range.
         seed: Decides everything.
     """
@@ -47,7 +47,7 @@ class Cell:
     profile: str
     demonstration: str
     method: str
-    polish: bool
+    refined: bool
     xi: float
     seed: int
 
@@ -66,7 +66,7 @@ def make_cells(
     seeds: Sequence[int],
     *,
     space: str = "",
-    polish_all: bool = False,
+    refine_all: bool = False,
     demonstration: str = "excite",
 ) -> list[Cell]:
     """Return the cells of a bench, seed by seed, so that a stopped bench has whole seeds.
@@ -84,7 +84,7 @@ def make_cells(
     return [
         Cell(
             protocol=protocol, task=task, space=space, profile=profile, demonstration=demonstration,
-            method=method, polish=polish_all or method == "default", xi=xi, seed=seed,
+            method=method, refined=refine_all or method == "default", xi=xi, seed=seed,
         )
         for task, xi, seed, method in itertools.product(tasks, xis, seeds, methods)
     ]  # fmt: skip
@@ -105,7 +105,7 @@ def run_cell(cell: Cell, *, population: int, generations: int, threads: int | No
     row |= {name: getattr(cell, name) for name in KEY} | {"error": ""}
     if cell.protocol == "paper":
         row["note"] = PAPER_NOTE
-    budget = Budget(population=population, generations=generations, polish=cell.polish)
+    budget = Budget(population=population, generations=generations, refine=cell.refined)
     try:
         case = make_case(
             cell.task, cell.profile, cell.seed, cell.xi, cell.space,

@@ -23,7 +23,7 @@ from deal_hw.bench.rows import Cells, Row
 from deal_hw.calibration import Budget, Progress
 from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
 from deal_hw.cli.calibrate_model import Recordings
-from deal_hw.cli.calibrate_run import Work
+from deal_hw.cli.calibrate_run import CalibrationInputs
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
@@ -274,7 +274,7 @@ class _Shown:
 
 
 def _compared(
-    work: Work,
+    work: CalibrationInputs,
     config: Calibrate,
     seed: int,
     budget: Budget,
@@ -290,7 +290,7 @@ def _compared(
 
     # Imports are not counted.
     method = usual_method(config, work.robot)
-    make_method(method, polish=True)
+    make_method(method, refine=True)
     require_sysid()
     load, shown, since = os.getloadavg()[0], list[_Shown](), _Stopwatch.start()
 

@@ -29,8 +29,8 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
 
 TASK_EPISODES = 5
-SEARCHES = ("deal", "eki", "deal-paper", "deal-paper-flat", "centre")
-"""Run without the polish, beside the default with everything."""
+SEARCHES = ("deal", "eki", "deal-paper", "deal-paper-flat", "midpoint")
+"""Run without the refinement, beside the default with everything."""
 
 
 def demonstrate(profile: str, seed: int, xi: float) -> Case:
@@ -197,23 +197,23 @@ def loop_row(
     Args:
         profile: Profile of the emulated robot.
         seed: Seed of its truth.
-        method: "default" is polished and, where asked, trained and deployed; the others run without polish.
+        method: "default" is refined and, where asked, trained and deployed; the others are not.
         xi: Ratio of the search range.
         train: Whether the default trains and deploys policies.
         folder: Where policies go.
         threads: Simulation threads.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    polish = method == "default"
+    refine = method == "default"
     row: dict[str, Any] = {
-        "bench": "loop", "task": "cartpole", "profile": profile, "method": method, "polish": polish, "xi": xi,
-        "seed": seed, "error": "",
+        "bench": "loop", "task": "cartpole", "profile": profile, "method": method, "refined": refine,
+        "xi": xi, "seed": seed, "error": "",
     }  # fmt: skip
     try:
         demonstration = demonstrate(profile, seed, xi)
-        part, result = calibration_row(demonstration, method, Budget(polish=polish), threads)
+        part, result = calibration_row(demonstration, method, Budget(refine=refine), threads)
         row |= part
-        if polish and train:
+        if refine and train:
             row |= transfer_row(demonstration, result, folder)
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"

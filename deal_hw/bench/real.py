@@ -20,15 +20,15 @@ from deal_hw.bench.rows import Cells, Row
 from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget
 from deal_hw.cli.calibrate_model import HELDOUT_PART, Recordings, prepare_model
-from deal_hw.cli.calibrate_run import Narrowing, Work, calibrate_episodes, residual_std
+from deal_hw.cli.calibrate_run import CalibrationInputs, SpaceOverrides, calibrate_episodes, residual_std
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
 
-KEY = ("task", "split", "method", "polish", "xi", "seed")
-METHODS = ("nominal", "open-loop", "eki", "mujoco-sysid", "least-squares-multistart")
+KEY = ("task", "split", "method", "refined", "xi", "seed")
+METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
 """Rows where nothing else is asked for."""
 
-UNTOLD = frozenset({"nominal", "open-loop"})
+UNTOLD = frozenset({"nominal", "output-error"})
 """Methods that need not be told what a prediction may be off."""
 
 
@@ -40,7 +40,7 @@ def prepare(
     *,
     threads: int | None,
     quiet: bool,
-) -> Work:
+) -> CalibrationInputs:
     """Read and check model, recordings and parameters once for all cells.
 
     Raises:
@@ -52,11 +52,11 @@ def prepare(
             "bench real needs --model robot.xml --data rec.csv ... (docs/any-robot.md), and --holdout "
             "other.csv or a part of each recording (--holdout-part)"
         )
-    narrowing = Narrowing(free=(), known={}, ranges=(), xi=xi)
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=xi)
     return prepare_model(
         recordings,
         holdout,
-        narrowing,
+        overrides,
         std=lambda robot: residual_std(std, robot),
         threads=threads,
         quiet=quiet,
@@ -71,7 +71,9 @@ def split_name(recordings: Recordings, holdout: Sequence[Path]) -> str:
     return f"last {share:.0%}"
 
 
-def expected_std(work: Work, words: Sequence[str], threads: int | None) -> Callable[[str], FloatArray | None]:
+def expected_std(
+    work: CalibrationInputs, words: Sequence[str], threads: int | None
+) -> Callable[[str], FloatArray | None]:
     """Return what tells a method what a prediction may be off, (2 C,): as it is given, or a first fit's."""
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.fit.output_error import expected_residual
@@ -96,7 +98,7 @@ def cells(
     seeds: Sequence[int],
     xi: float,
     std: Sequence[str],
-    polish_all: bool,
+    refine_all: bool,
     budget: Budget,
     window_s: float,
     threads: int | None,
@@ -117,28 +119,28 @@ def cells(
     work = prepare(recordings, holdout, ratio, std, threads=threads, quiet=quiet)
     split, expected = split_name(recordings, holdout), expected_std(work, std, threads)
 
-    def make(method: str, seed: int, polish: bool) -> Callable[[], Row]:
+    def make(method: str, seed: int, refine: bool) -> Callable[[], Row]:
         return lambda: run_cell(
-            work, task, split, method, seed, xi, polish=polish, std=expected(method), threads=threads,
+            work, task, split, method, seed, xi, refine=refine, std=expected(method), threads=threads,
             budget=budget, window_s=window_s,
         )  # fmt: skip
 
     runs = []
     for seed, method in itertools.product(seeds, methods):
-        polish = method == "default" or polish_all
-        runs.append(((task, split, method, polish, xi, seed), make(method, seed, polish)))
+        refine = method == "default" or refine_all
+        runs.append(((task, split, method, refine, xi, seed), make(method, seed, refine)))
     return Cells(names=KEY, runs=runs)
 
 
 def run_cell(
-    work: Work,
+    work: CalibrationInputs,
     task: str,
     split: str,
     method: str,
     seed: int,
     xi: float,
     *,
-    polish: bool,
+    refine: bool,
     budget: Budget,
     std: FloatArray | None,
     window_s: float,
@@ -153,7 +155,7 @@ def run_cell(
         method: Name of the method.
         seed: Of everything random.
         xi: Ratio of the search range, for the row.
-        polish: Whether the polish follows.
+        refine: Whether the refinement follows.
         budget: What the search may use.
         std: What a prediction may be off, (2 C,); None: the sensor noise, or what the method finds itself.
         window_s: Held-out predictions restart this often [s].
@@ -161,12 +163,12 @@ def run_cell(
     """
     row: dict[str, Any] = {
         "bench": "real", "task": task, "split": split, "profile": "real", "method": method,
-        "polish": polish, "xi": xi, "seed": seed, "error": "",
+        "refined": refine, "xi": xi, "seed": seed, "error": "",
     }  # fmt: skip
     try:
         result = calibrate_episodes(
             work.robot, work.space, work.episodes, work.holdout, method=method,
-            budget=dataclasses.replace(budget, polish=polish),
+            budget=dataclasses.replace(budget, refine=refine),
             rng=np.random.default_rng(seed), threads=threads, heldout_window_s=window_s,
             known_std=std,
             # A model that nobody calibrated has no latency.
@@ -192,7 +194,10 @@ def run_cell(
             name for name, u in zip(work.space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6
         ],
         "null_directions": list(result.null_directions),
-        **{name: result.provenance.get(name) for name in ("folds", "halves", "confounded", "heldout_rmse")},
+        **{
+            name: result.provenance.get(name)
+            for name in ("cross_validation", "split_half", "confounded", "heldout_rmse")
+        },
         "estimate": dict(zip(work.space.names, map(float, result.estimate), strict=True)),
     }
     return row

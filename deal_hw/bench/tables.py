@@ -129,5 +129,5 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a line of the summary stands for."""
-    method = row["method"] + (" + polish" if row.get("polish") and row["method"] != "default" else "")
+    method = row["method"] + (" + refinement" if row.get("refined") and row["method"] != "default" else "")
     return row.get("task", "cartpole"), row["profile"], f"{row['xi']:g}", method

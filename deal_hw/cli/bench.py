@@ -30,7 +30,7 @@ class Bench:
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
-    simulator here does. paper: DEAL's protocol, whose target is the centre of the range. real: recordings
+    simulator here does. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings
     of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
     without deliberate faults: is a right model called right, and a wrong one wrong? first-answer:
     seconds until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. go2-codec: what
@@ -72,13 +72,13 @@ class Bench:
     """Seeds, comma separated; ranges as 1000-1009. 0-99 are for tuning, 1000 and up for reporting."""
 
     methods: str = ""
-    """Methods, comma separated; by default the default with training, and each search without polish."""
+    """Methods, comma separated; by default the default with training, and each search without refinement."""
 
     xi: str = "5"
     """Ratios of the search range, comma separated (loop: one)."""
 
-    polish_all: bool = False
-    """Polish every method; by default only `default` is."""
+    refine_all: bool = False
+    """Refine every method; by default only `default` is."""
 
     demonstration: Literal["excite", "policy"] = "excite"
     """How ant and Go2 are demonstrated: by motions that excite, or by their shipped policies."""
@@ -255,7 +255,7 @@ def _calibration(config: Bench, out: Path) -> _Table:
         parse_ratios(config.xi),
         parse_seeds(config.seeds),
         space=config.space,
-        polish_all=config.polish_all,
+        refine_all=config.refine_all,
         demonstration=config.demonstration,
     )
     cells = calibration.cells(
@@ -270,7 +270,7 @@ def _real(config: Bench, out: Path) -> _Table:
     (xi,) = parse_ratios(config.xi)[:1]
     cells = real.cells(
         config.recordings, config.holdout, methods=_methods(config, real.METHODS),
-        seeds=parse_seeds(config.seeds), xi=xi, std=config.residual_std, polish_all=config.polish_all,
+        seeds=parse_seeds(config.seeds), xi=xi, std=config.residual_std, refine_all=config.refine_all,
         budget=_budget(config), window_s=config.heldout_window, threads=config.threads, quiet=config.quiet,
     )  # fmt: skip
     return _Table(cells=cells, line=tables.line, summary=tables.print_real)

@@ -17,14 +17,14 @@ from deal_hw.cli.calibrate_model import Recordings, prepare_model, write_paramet
 from deal_hw.cli.calibrate_run import (
     HELDOUT_WINDOW_S,
     CalibrateReport,
-    Narrowing,
-    Work,
+    CalibrationInputs,
+    SpaceOverrides,
     calibrate_episodes,
     finish,
     residual_std,
 )
-from deal_hw.cli.excite import balancer
 from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.cli.run_plan import balancer
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
@@ -78,9 +78,9 @@ class Calibrate(Checked):
     """Held-out predictions restart from the measured state this often [s]."""
 
     method: str = DEFAULT
-    """How to search: default, open-loop, eki, deal, deal-paper, ... (an unknown name lists all). The default
-    is eki and its polish; with --model, for a robot that servos hold on a fixed base, it is open-loop unless
-    --residual-std or --no-polish say how to treat what no model explains."""
+    """How to search: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
+    default is eki and its refinement; with --model, for a robot that servos hold on a fixed base, it is
+    output-error unless --residual-std or --no-refine say how to treat what no model explains."""
 
     space: str = ""
     """Which parameters of a robot of ours, such as k9 or k11 (docs/parameters.md); the first by default."""
@@ -123,7 +123,7 @@ class Calibrate(Checked):
     generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of the search."""
 
-    polish: bool = True
+    refine: bool = True
     """Follow the search by multiple shooting on prediction error."""
 
     seed: Seed = 0
@@ -190,7 +190,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
-    budget = Budget(population=config.population, generations=config.generations, polish=config.polish)
+    budget = Budget(population=config.population, generations=config.generations, refine=config.refine)
     work = prepare(config)
     known_std = residual_std(config.residual_std, work.robot)
     method = usual_method(config, work.robot)
@@ -240,7 +240,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     )
 
 
-def prepare(config: Calibrate) -> Work:
+def prepare(config: Calibrate) -> CalibrationInputs:
     """Read and check what is to be calibrated.
 
     Raises:
@@ -253,16 +253,16 @@ def usual_method(config: Calibrate, robot: RobotModel) -> str:
     """Return the method, where none is named that which suits the recordings."""
     if config.method != DEFAULT or config.recordings.model is None:
         return config.method
-    if config.residual_std or not config.polish:
+    if config.residual_std or not config.refine:
         return config.method
     facts = robot.description
     held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
     if robot.base is not None or not held:
-        # Predictions of seconds, which open-loop compares, mean nothing for a robot that falls.
+        # Predictions of seconds, which output-error compares, mean nothing for a robot that falls.
         return config.method
     if not config.quiet:
-        print("method: open-loop (--method eki to search and polish to the sensor noise)", file=sys.stderr)
-    return "open-loop"
+        print("method: output-error (--method eki to search and refine to the sensor noise)", file=sys.stderr)
+    return "output-error"
 
 
 def _run_folder(config: Calibrate) -> Path:
@@ -273,11 +273,11 @@ def _run_folder(config: Calibrate) -> Path:
     return Path("runs") / Path(config.recordings.model or "model").stem
 
 
-def _narrowing(config: Calibrate, xi: float | None) -> Narrowing:
-    return Narrowing(free=config.free, known=dict(config.known), ranges=config.range, xi=xi)
+def _overrides(config: Calibrate, xi: float | None) -> SpaceOverrides:
+    return SpaceOverrides(free=config.free, known=dict(config.known), ranges=config.range, xi=xi)
 
 
-def _prepare_model(config: Calibrate) -> Work:
+def _prepare_model(config: Calibrate) -> CalibrationInputs:
     refuse(
         given(config, Calibrate(), ("episodes", "space", "sample_hz")),
         "only datasets take that; with --model use --data and --parameters",
@@ -286,7 +286,7 @@ def _prepare_model(config: Calibrate) -> Work:
     return prepare_model(
         config.recordings,
         holdout,
-        _narrowing(config, config.xi),
+        _overrides(config, config.xi),
         std=lambda robot: residual_std(config.residual_std, robot),
         spikes=SpikeSettings(ratio=config.spike_ratio),
         threads=config.threads,
@@ -294,7 +294,7 @@ def _prepare_model(config: Calibrate) -> Work:
     )
 
 
-def prepare_dataset(config: Calibrate) -> Work:
+def prepare_dataset(config: Calibrate) -> CalibrationInputs:
     """Read a dataset of a robot of ours.
 
     Raises:
@@ -331,7 +331,7 @@ def prepare_dataset(config: Calibrate) -> Work:
             print(f"episode {index}: {jumps[0]}", file=sys.stderr)
     recordings = {index: without_spikes(trajectory, spikes) for index, trajectory in recordings.items()}
     robot, episodes = _simulation(dataset, recordings, config.sample_hz)
-    return Work(
+    return CalibrationInputs(
         robot=robot,
         space=space,
         episodes=[episodes[i] for i in fit],
@@ -400,7 +400,7 @@ def make_space(robot: str, config: Calibrate) -> ParameterSpace:
     if name not in table:
         raise UnknownNameError("parameter set", name, table)
     xi = XI if config.xi is None else config.xi
-    return _narrowing(config, xi).apply(table[name]())
+    return _overrides(config, xi).apply(table[name]())
 
 
 def _simulation(

@@ -144,7 +144,7 @@ def warn_of_gravity(
             )
 
 
-def require_visible_parameters(
+def require_sensitive_parameters(
     robot: RobotModel,
     space: ParameterSpace,
     episodes: Sequence[Episode],
@@ -154,9 +154,8 @@ def require_visible_parameters(
     say: Callable[[str], None],
 ) -> None:
     """Check before any search that the recordings are long enough, move, and show every parameter."""
-    from deal_hw.calib.data.checks import check_excitation
+    from deal_hw.calib.data.checks import check_excitation, jumps, look, require_sensitive
     from deal_hw.calib.data.problem import Problem, samples_in
-    from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
     # Raises where not even one window of that length fits.
@@ -171,7 +170,7 @@ def require_visible_parameters(
             str(err).partition("; record again with")[0] + "; record more motion"
         ) from err
     found = look(problem)
-    require_visible(found)
+    require_sensitive(found)
     if found.faint:
         say(
             f"warning: hardly visible: {', '.join(found.faint)}. From one end of its range to the other "

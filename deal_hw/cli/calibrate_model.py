@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from deal_hw.cli.calibrate_checks import (
     examine_recording,
     require_base,
-    require_visible_parameters,
+    require_sensitive_parameters,
     warn_of_gravity,
 )
 from deal_hw.cli.calibrate_recordings import (
@@ -25,7 +25,7 @@ from deal_hw.cli.calibrate_recordings import (
     seconds_of,
     without,
 )
-from deal_hw.cli.calibrate_run import Narrowing, Work
+from deal_hw.cli.calibrate_run import CalibrationInputs, SpaceOverrides
 from deal_hw.cli.options import Checked, Range
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -107,19 +107,19 @@ def write_parameters(config: Recordings) -> int:
 def prepare_model(
     config: Recordings,
     holdout: Sequence[Path],
-    narrowing: Narrowing,
+    overrides: SpaceOverrides,
     *,
     std: Callable[[RobotModel], FloatArray | None],
     spikes: SpikeSettings = DEFAULT_SPIKES,
     threads: int | None = None,
     quiet: bool = False,
-) -> Work:
+) -> CalibrationInputs:
     """Read and check everything that a calibration of any robot needs; nothing here takes long.
 
     Args:
         config: Model and recordings.
         holdout: Recordings that only judge the result.
-        narrowing: What the command line changes about the parameters.
+        overrides: What the command line changes about the parameters.
         std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
         spikes: What counts as a spike.
         threads: Simulation threads.
@@ -153,7 +153,7 @@ def prepare_model(
             print(text, file=sys.stderr)
 
     model = compile_mjcf(config.model)
-    space = _space(config, narrowing, model)
+    space = _space(config, overrides, model)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
     fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
@@ -180,8 +180,8 @@ def prepare_model(
     judge = [aligned(r, robot, config.feet) for r in held_recordings]
     episodes, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
     warn_of_gravity(robot, space, episodes, say)
-    require_visible_parameters(robot, space, episodes, std(robot), config.window, threads, say)
-    return Work(
+    require_sensitive_parameters(robot, space, episodes, std(robot), config.window, threads, say)
+    return CalibrationInputs(
         robot=robot,
         space=space,
         episodes=episodes,
@@ -215,7 +215,7 @@ def _holdout_share(config: Recordings, holdout: Sequence[Path]) -> float:
     return share
 
 
-def _space(config: Recordings, narrowing: Narrowing, model: Any) -> ParameterSpace:
+def _space(config: Recordings, overrides: SpaceOverrides, model: Any) -> ParameterSpace:
     from deal_hw.sim.parameters import check_space
     from deal_hw.sim.parameters.template import template
     from deal_hw.sim.parameters.yaml_space import parse_space, read_space
@@ -224,6 +224,6 @@ def _space(config: Recordings, narrowing: Narrowing, model: Any) -> ParameterSpa
         space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
     else:
         space = read_space(config.parameters, model)
-    space = narrowing.apply(space)
+    space = overrides.apply(space)
     check_space(model, space)
     return space

@@ -41,7 +41,7 @@ HELDOUT_WINDOW_S = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Work:
+class CalibrationInputs:
     """What is to be calibrated, read and checked.
 
     Attributes:
@@ -70,7 +70,7 @@ class Work:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Narrowing:
+class SpaceOverrides:
     """What the command line changes about a parameter space.
 
     Attributes:
@@ -189,7 +189,7 @@ def calibrate_episodes(
 
     judge = None if held_out is None else lambda *fit: held_out.errors(beside_nominal(*fit)).nrmse
     best = BestSoFar(space, judge, quiet)
-    searcher = make_method(method, polish=budget.polish)
+    searcher = make_method(method, refine=budget.refine)
     # The matrices are small: a second BLAS thread only spins, and where processors are shared each
     # decomposition then takes ten times as long.
     with (
@@ -285,7 +285,7 @@ def _positive(word: str) -> float:
 
 
 def finish(
-    work: Work,
+    work: CalibrationInputs,
     result: CalibrationResult,
     folder: Path,
     settings: Mapping[str, Any],
@@ -333,7 +333,7 @@ def finish(
 
 
 def _judged(
-    work: Work,
+    work: CalibrationInputs,
     result: CalibrationResult,
     settings: Mapping[str, Any],
     *,

@@ -19,6 +19,7 @@ from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.episode_report import RunReport
+from deal_hw.cli.link import LinkOptions
 from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.control.cadence import CadenceReport
@@ -29,10 +30,13 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Checked):
-    """Record, calibrate, retrain, deploy and compare on an emulated cart-pole over its serial port."""
+    """Record, calibrate, retrain, deploy and compare on an emulated cart-pole over its wire."""
 
     out: Path = Path("runs/demo")
     """Run folder; a former demo in it is replaced."""
+
+    transport: str = "serial"
+    """The wire: serial, can, odrive or dynamixel."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """What stands between the emulated mechanics and the wire."""
@@ -42,6 +46,9 @@ class Demo(Checked):
 
     episodes: Annotated[int, Range(1, 1000)] = 3
     """Deployments of each policy, 10 s each."""
+
+    firmware: Literal["python", "host", "avr"] = "python"
+    """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps; by default those of the shipped UDR policy."""
@@ -98,24 +105,37 @@ def demo(config: Demo) -> DemoReport:
     truth_file = config.out / "truth.json"
     with folder:
         folder.start(
-            {"kind": "demo", "profile": config.profile, "episodes": config.episodes, "steps": config.steps},
+            {
+                "kind": "demo",
+                "transport": config.transport,
+                "profile": config.profile,
+                "episodes": config.episodes,
+                "steps": config.steps,
+            },
             {"demo": config.seed},
         )
-        options = ("--profile", config.profile, "--seed", str(config.seed), "--reveal-to", str(truth_file))
+        options = (
+            "--transport", config.transport, "--profile", config.profile, "--seed", str(config.seed),
+            "--firmware", config.firmware, "--reveal-to", str(truth_file),
+        )  # fmt: skip
+        link = LinkOptions(transport=config.transport)
         with EmulatorProcess("cartpole", *options) as emulator:
             port = emulator.port
             print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
             with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
                 for kind in ("rich", "chirp"):
                     collect(
-                        Collect(robot="cartpole", port=port, out=config.out, profile=kind, seed=config.seed)
-                    )
-            with stages.stage("calibrate", "search, polish, latency, intervals"):
+                        Collect(
+                            robot="cartpole", port=port, link=link, out=config.out, profile=kind,
+                            seed=config.seed,
+                        )
+                    )  # fmt: skip
+            with stages.stage("calibrate", "search, refinement, latency, intervals"):
                 found = calibrate(Calibrate(dataset=folder.dataset, out=config.out, seed=config.seed))
             with stages.stage("calibrate deal", "the adversarial search alone, to compare with"):
                 beside = calibrate(
                     Calibrate(
-                        dataset=folder.dataset, out=config.out / "deal", method="deal", polish=False,
+                        dataset=folder.dataset, out=config.out / "deal", method="deal", refine=False,
                         seed=config.seed, quiet=True,
                     )
                 )  # fmt: skip
@@ -132,8 +152,8 @@ def demo(config: Demo) -> DemoReport:
                 with stages.stage(f"deploy {name}", f"{config.episodes} times 10 s over the port"):
                     runs[name] = deploy(
                         Deploy(
-                            robot="cartpole", port=port, policy=file, dataset=config.out / f"deploy_{name}",
-                            episodes=config.episodes, task="balance",
+                            robot="cartpole", port=port, link=link, policy=file,
+                            dataset=config.out / f"deploy_{name}", episodes=config.episodes, task="balance",
                         )
                     )  # fmt: skip
         with stages.stage("inspect", "real, nominal and calibrated on one screen"):

@@ -13,11 +13,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from deal_hw.cli.doctor_can import examine_can, list_adapters
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.cli.options import Range, check_ranges
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
+from deal_hw.drivers import CAN_NODES, TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
@@ -36,7 +37,7 @@ class Doctor:
     """The robot to listen to, such as go2."""
 
     port: str = ""
-    """Where it is: a network interface (dds), an endpoint (zenoh) or a serial port."""
+    """Where it is: a network interface (dds), an endpoint (zenoh), a serial port or a CAN bus."""
 
     transport: str = ""
     """How it is reached; by default the robot's usual way."""
@@ -114,6 +115,7 @@ def _wrapped(lead: str, text: str) -> str:
 
 def _examine(config: Doctor) -> Iterator[Finding]:
     yield from examine_machine()
+    yield from list_adapters()
     yield from _interfaces(config.port)
     if not config.robot:
         return
@@ -121,6 +123,8 @@ def _examine(config: Doctor) -> Iterator[Finding]:
     clock = MonotonicClock()
     try:
         if name not in TOPIC_TRANSPORTS:
+            if name in CAN_NODES:
+                yield from examine_can(config.port, clock, min(1.0, config.seconds), *CAN_NODES[name])
             robot = make_robot(config.robot, name, config.port, clock, config.wire)
             yield from examine_robot(config.robot, robot, clock, config.seconds)
             return

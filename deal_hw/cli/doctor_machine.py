@@ -17,7 +17,7 @@ from deal_hw.findings import Finding, Level
 
 PACKAGES: Final = (
     ("eclipse-zenoh", ""), ("cyclonedds", "dds"), ("mujoco", "sim"), ("torch", "calib"), ("rerun-sdk", "viz"),
-    ("onnxruntime", ""),
+    ("onnxruntime", ""), ("python-can", ""), ("cantools", ""),
 )  # fmt: skip
 """Distribution, extra that installs it ("": the base install)."""
 _LEAST_LOCK_BYTES: Final = 512 << 20

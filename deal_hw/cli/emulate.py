@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import sys
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import tyro
 
@@ -17,12 +19,40 @@ from deal_hw.cli.emulate_common import (
     signalled,
 )
 from deal_hw.cli.emulate_go2 import emulate_go2
-from deal_hw.cli.emulate_settings import CARTPOLE_XI, Emulate
+from deal_hw.cli.emulate_settings import CARTPOLE_EMULATORS, CARTPOLE_XI, ON_CAN, Emulate
 from deal_hw.errors import MissingExtraError
 
 if TYPE_CHECKING:
     from deal_hw.drivers.cartpole.emulator import Hazards
     from deal_hw.drivers.cartpole.truth import Truth
+
+
+class CartpoleOnAWire(Protocol):
+    """What the verb needs of an emulated cart-pole, whatever its wire."""
+
+    slips: int
+    dropped: int
+    changes: list[tuple[int, int, str]]
+
+    def open(self) -> str:
+        """Make the port; return what a host gives as ``--port``."""
+        ...
+
+    def close(self) -> None:
+        """Remove the port."""
+        ...
+
+    def step(self) -> bool:
+        """Run until the next tick; return whether there is still a port."""
+        ...
+
+    def cut(self) -> None:
+        """Cut the wire from now on, for as long as the hazards say."""
+        ...
+
+    def report(self) -> dict[str, Any]:
+        """Return what happened, as plain JSON values."""
+        ...
 
 
 def emulate(config: Emulate) -> int:
@@ -37,15 +67,16 @@ def emulate(config: Emulate) -> int:
 
 
 def _emulate_cartpole(config: Emulate, stop: threading.Event, cut: threading.Event) -> int:
+    module, _, function = CARTPOLE_EMULATORS[config.transport or "serial"].partition(":")
     try:
-        from deal_hw.drivers.cartpole.device import CartpoleDevice
-        from deal_hw.drivers.cartpole.emulator import CartpoleEmulator
+        make = getattr(importlib.import_module(module), function)
     except ModuleNotFoundError as error:
         if error.name in ("mujoco", "scipy"):
             raise MissingExtraError(error.name, "sim") from error
         raise
     truth = _truth(config)
-    emulator = CartpoleEmulator(CartpoleDevice(truth), link=config.link, hazards=_hazards(config))
+    own = {"firmware": config.firmware} if config.firmware != "python" else {}
+    emulator: CartpoleOnAWire = make(truth, link=config.link, hazards=_hazards(config), **own)
     try:
         print(f"port {emulator.open()}", flush=True)
         print(
@@ -85,8 +116,11 @@ def _truth(config: Emulate) -> Truth:
 def _hazards(config: Emulate) -> Hazards:
     import numpy as np
 
-    from deal_hw.drivers.cartpole.emulator import Hazards
+    from deal_hw.drivers.cartpole.emulator import CanFaults, Hazards
     from deal_hw.testing.faults import FaultRates, FrameFaults
+
+    # A frame of a serial CAN adapter is a line.
+    end = b"\r" if config.transport in ON_CAN else b"\0"
 
     rates = FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate)
     return Hazards(
@@ -95,9 +129,10 @@ def _hazards(config: Emulate) -> Hazards:
         cut_s=config.cut_s,
         vanish_after_s=config.vanish_after_s,
         return_after_s=config.return_after_s,
-        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]))
+        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]), end)
         if rates != FaultRates()
         else None,
+        can=CanFaults(**dataclasses.asdict(config.can)),
     )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from deal_hw.cli.options import Range, Ratio, Seed, Share, check_ranges
+from deal_hw.cli.options import Range, Ratio, Seed, Share, check_ranges, given
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
@@ -84,7 +84,54 @@ class Go2Options:
         ]
 
 
-TRANSPORTS = {"cartpole": ("serial",), "go2": tuple(DEFAULT_PORTS)}
+@dataclass(frozen=True, kw_only=True)
+class CanOptions:
+    """An emulated CAN bus and what goes wrong on it, so long after the motor was first armed."""
+
+    node: Annotated[int, Range(1, 62)] = 1
+    """CAN: number of the device on the bus."""
+
+    bitrate: Literal[125000, 250000, 500000, 800000, 1000000] = 500000
+    """CAN: bit rate of the bus; a host that sets another one hears nothing."""
+
+    bus_off_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """CAN: the adapter's controller goes bus-off [s]."""
+
+    bus_off_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
+    """CAN: for how long opening the bus again does not help [s]."""
+
+    tx_full_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """CAN: the adapter's transmit buffer is full [s]."""
+
+    tx_full_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
+    """CAN: for how long [s]."""
+
+    lost_node_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """CAN: the device's wire to the bus breaks [s]; the adapter stays."""
+
+    no_acknowledge: bool = False
+    """CAN: nobody else is on the bus."""
+
+    duplicate_node: bool = False
+    """CAN: a second device has the same number."""
+
+    dbc_version: Annotated[int, Range(1, 255)] = 1
+    """CAN: version of the protocol that the device speaks."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+CARTPOLE_EMULATORS = {
+    "serial": "deal_hw.drivers.cartpole.emulator:serial_emulator",
+    "can": "deal_hw.drivers.cartpole.can_emulator:can_emulator",
+    "odrive": "deal_hw.drivers.cartpole.odrive_emulator:odrive_emulator",
+}
+"""Wires of the cart-pole -> "module:function"; the function is called as
+``function(truth, link=..., hazards=...)`` and returns an emulator that is not opened yet."""
+ON_CAN = ("can", "odrive")
+"""Wires of the cart-pole with a CAN bus."""
+TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
 """Robots to emulate and the wires that each speaks on; the first is the default."""
 CARTPOLE_XI = 5.0
 
@@ -97,7 +144,8 @@ class Emulate:
     """The robot to emulate."""
 
     transport: str | None = None
-    """The wire to speak on. Cart-pole: "serial", a pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
+    """The wire to speak on. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a
+    pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
 
     port: str | None = None
     """Go2: network interface or its address (dds), or end point to listen at (zenoh; number 0: a free
@@ -118,6 +166,10 @@ class Emulate:
 
     truth_from: Path | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
+
+    firmware: Literal["python", "host", "avr"] = "python"
+    """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
+    under simavr (docs/firmware.md)."""
 
     link: Path | None = None
     """Make a symbolic link to the port here."""
@@ -163,6 +215,9 @@ class Emulate:
     parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
 
+    can: tyro.conf.OmitArgPrefixes[CanOptions] = field(default_factory=CanOptions)
+    """The CAN bus of a cart-pole."""
+
     go2: tyro.conf.OmitArgPrefixes[Go2Options] = field(default_factory=Go2Options)
     """Options of the Go2 alone."""
 
@@ -173,7 +228,8 @@ class Emulate:
         if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:
             raise UnknownNameError("transport to emulate on", self.transport, TRANSPORTS[self.robot])
         if foreign := self._foreign():
-            raise ConfigurationError(f"emulate {self.robot} has no {', '.join(foreign)}")
+            where = f" on {self.transport or TRANSPORTS[self.robot][0]}" if self.robot == "cartpole" else ""
+            raise ConfigurationError(f"emulate {self.robot}{where} has no {', '.join(foreign)}")
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
         if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
@@ -183,11 +239,16 @@ class Emulate:
 
     def _foreign(self) -> list[str]:
         """Return the flags given that belong to another robot."""
+        bus = given(self.can, CanOptions())
         if self.robot == "cartpole":
-            return self.go2.given() + (["--port"] if self.port is not None else [])
+            foreign = bus if self.transport not in ON_CAN else []
+            if self.firmware != "python" and self.transport not in (None, "serial"):
+                foreign = [*foreign, "--firmware"]
+            return foreign + self.go2.given() + (["--port"] if self.port is not None else [])
         own = {
+            "--firmware": None if self.firmware == "python" else self.firmware,
             "--link": self.link,
             "--vanish-after-s": self.vanish_after_s,
             "--return-after-s": self.return_after_s,
         }
-        return [flag for flag, value in own.items() if value is not None]
+        return bus + [flag for flag, value in own.items() if value is not None]

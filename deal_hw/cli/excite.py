@@ -12,8 +12,8 @@ import numpy as np
 import tyro
 
 from deal_hw.cli.options import Range, Ratio, Seed, Threads, check_ranges, given, refuse
-from deal_hw.cli.run_plan import shipped_policy
-from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
+from deal_hw.cli.run_plan import balancer
+from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import (
     ExcitationBehaviour,
@@ -203,18 +203,6 @@ def _given_design(config: Excite, balances: bool) -> ExcitationDesign:
         seed=config.seed,
         balance_s=_balance_s(config.seconds) if balances else 0.0,
     )
-
-
-def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
-    """Return what makes a robot's balancing behaviour; None where the robot has no policy."""
-    path = policy or shipped_policy(description.name)
-    if path is None:
-        return None
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-    from deal_hw.policies.trial import check_policy
-
-    digest = check_policy(path, description).digest
-    return lambda: PolicyBehaviour(OnnxPolicy(path, digest), description)
 
 
 def _balance_s(seconds: float) -> float:

@@ -45,7 +45,8 @@ class LinkOptions:
     """How the robot is reached, beyond the port."""
 
     transport: str = ""
-    """How the robot is reached: serial, dds or zenoh; by default the robot's usual way."""
+    """How the robot is reached. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the
+    default) or zenoh."""
 
     state_check: Literal["strict", "length"] = "strict"
     """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
@@ -63,8 +64,9 @@ class RunOptions(Checked):
     """What every verb that runs a robot needs to be told."""
 
     port: str
-    """Where the robot is: a serial port such as /dev/ttyUSB0, a network interface (dds) or an endpoint such
-    as tcp/127.0.0.1:7447 (zenoh)."""
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
+    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
+    tcp/127.0.0.1:7447 (zenoh)."""
 
     link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
     """How the robot is reached, beyond the port."""

@@ -245,3 +245,15 @@ def _loaded(plan: RunPlan, load: Callable[[RunPlan], Policy]) -> Policy:
             "give --policy FILE, or use --profile chirp or hold"
         )
     return load(plan)
+
+
+def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
+    """Return what makes a robot's balancing behaviour; None where the robot has no policy."""
+    path = policy or shipped_policy(description.name)
+    if path is None:
+        return None
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.policies.trial import check_policy
+
+    digest = check_policy(path, description).digest
+    return lambda: PolicyBehaviour(OnnxPolicy(path, digest), description)

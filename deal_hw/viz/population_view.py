@@ -1,6 +1,6 @@
 """A search while it runs: spread of the population in each parameter, trace, real against predicted motion.
 
-Entities, over the timeline ``generation`` (polish and latency scan count on)::
+Entities, over the timeline ``generation`` (refinement and latency scan count on)::
 
     /parameters/<name>/{p95,median,p05}        in the parameter's own unit
     /spread/<name>                             standard deviation over that of the whole range: 1 at the start

@@ -6,12 +6,14 @@ import contextlib
 import os
 import select
 import tty
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.firmwares import device_of
+from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
 
@@ -19,6 +21,35 @@ STALL_NS = 50_000_000
 """Behind by more than this, the device's time stands still instead of catching up."""
 
 _MOST_CHANGES = 2000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanFaults:
+    """How an emulated CAN bus is set up, and what goes wrong on it, counted from the first arming.
+
+    Attributes:
+        node: Number of the device.
+        bitrate: Of the bus [bit/s]; an adapter that is set to another one hears nothing.
+        bus_off_after_s: The adapter's controller goes bus-off [s]; None for never.
+        bus_off_s: From then on for so long it cannot be brought back on the bus [s].
+        tx_full_after_s: The adapter's transmit buffer is full [s]; None for never.
+        tx_full_s: For how long [s].
+        lost_node_after_s: The device loses its wire to the bus, the adapter stays [s]; None for never.
+        no_acknowledge: Nobody is on the bus from the start.
+        duplicate_node: A second device has the same number.
+        dbc_version: Version of the protocol that the device speaks.
+    """
+
+    node: int = 1
+    bitrate: int = 500_000
+    bus_off_after_s: float | None = None
+    bus_off_s: float = 1.0
+    tx_full_after_s: float | None = None
+    tx_full_s: float = 1.0
+    lost_node_after_s: float | None = None
+    no_acknowledge: bool = False
+    duplicate_node: bool = False
+    dbc_version: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +65,7 @@ class Hazards:
         return_after_s: It comes back so long after that, as a new port under the same link [s]; None: never,
             and the emulator ends.
         faults: What happens to frames from the device.
+        can: A CAN bus and its faults.
     """
 
     freeze_after_s: float | None = None
@@ -42,6 +74,51 @@ class Hazards:
     vanish_after_s: float | None = None
     return_after_s: float | None = None
     faults: FrameFaults | None = None
+    can: CanFaults = CanFaults()
+
+
+class PtyDevice(Protocol):
+    """What is behind the port: characters in, characters out, in device time.
+
+    Attributes:
+        received_bytes: How many have come from the host.
+        trouble: What is wrong with its wire now; "" for nothing.
+    """
+
+    received_bytes: int
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with its wire now."""
+        ...
+
+    @property
+    def device_ns(self) -> int:
+        """Device time at which the next tick runs [ns]."""
+        ...
+
+    @property
+    def armed(self) -> bool:
+        """Whether the motor follows targets."""
+        ...
+
+    @property
+    def mode(self) -> str:
+        """What the motor does."""
+        ...
+
+    @property
+    def watchdog(self) -> bool:
+        """Whether the motor was stopped because commands stayed away."""
+        ...
+
+    def receive(self, data: bytes) -> None:
+        """Take characters from the host."""
+        ...
+
+    def advance_to(self, device_ns: int) -> bytes:
+        """Run every tick up to a device time [ns]; return the characters sent meanwhile."""
+        ...
 
 
 class CartpoleEmulator:
@@ -53,25 +130,28 @@ class CartpoleEmulator:
         slips: Times that this process was stalled and device time stood still.
         dropped: Writes that found no room.
         changes: What the motor and the port did, and when: device ms, host ns, and a mode of the device,
-            "frozen", "cut", "gone" or "back"; the first 2000.
+            "frozen", "cut", "gone" or "back", or what is wrong with a bus; the first 2000.
 
     Args:
         device: The device.
         link: A symbolic link to make to the port; None for none.
         hazards: What goes wrong on purpose.
         clock: Real time.
+        port: Makes of the path what a host gives as ``--port``.
     """
 
     def __init__(
         self,
-        device: CartpoleDevice,
+        device: PtyDevice,
         link: Path | None = None,
         hazards: Hazards | None = None,
         clock: Clock | None = None,
+        port: Callable[[str], str] = str,
     ) -> None:
         self.slips = 0
         self.dropped = 0
         self._device = device
+        self._port = port
         self._link = link
         self._hazards = hazards or Hazards()
         self._clock = clock or MonotonicClock()
@@ -83,10 +163,10 @@ class CartpoleEmulator:
         self._freeze_after_s, self._frozen = self._hazards.freeze_after_s, False
         self._cut_end_ns, self._gone_ns = 0, -1
         self.changes: list[tuple[int, int, str]] = []
-        self._mode = device.mode
+        self._mode, self._trouble = device.mode, ""
 
     def open(self) -> str:
-        """Make the pty; return the path of the port."""
+        """Make the pty; return what a host gives as its port."""
         self._origin_ns = self._clock.now_ns() - self._device.device_ns
         return self._open_port()
 
@@ -105,7 +185,7 @@ class CartpoleEmulator:
                     f"{self._link} exists and is not a symbolic link; choose another --link"
                 )
             self._link.symlink_to(port)
-        return port if self._link is None else str(self._link)
+        return self._port(port if self._link is None else str(self._link))
 
     def close(self) -> None:
         """Remove the pty and the link."""
@@ -196,6 +276,9 @@ class CartpoleEmulator:
         if (mode := self._device.mode) != self._mode:
             self._mode = mode
             self._note(now_ns, mode)
+        if (trouble := self._device.trouble) != self._trouble:
+            self._trouble = trouble
+            self._note(now_ns, trouble or "bus well")
 
     def _note(self, now_ns: int, what: str) -> None:
         if len(self.changes) < _MOST_CHANGES:
@@ -219,6 +302,17 @@ class CartpoleEmulator:
             self.dropped += 1
             return
         self._unsent = data[written:]
+
+
+def serial_emulator(
+    truth: Truth, *, link: Path | None, hazards: Hazards, firmware: str = "python"
+) -> CartpoleEmulator:
+    """Return an emulated cart-pole with a serial port.
+
+    Raises:
+        ConfigurationError: Its firmware needs a compiler, which is missing.
+    """
+    return CartpoleEmulator(device_of(truth, firmware), link, hazards)
 
 
 def _passed(limit_s: float | None, time_s: float) -> bool:

@@ -6,8 +6,9 @@ import numpy as np
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.device import START_ANGLE_RAD, CartpoleDevice
+from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.lqr import TARGET_LIMIT_M, LqrController, design_lqr
+from deal_hw.drivers.cartpole.mechanics import START_ANGLE_RAD
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import Truth, candidate_truth

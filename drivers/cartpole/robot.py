@@ -5,15 +5,16 @@ from __future__ import annotations
 import contextlib
 import io
 from collections import deque
+from collections.abc import Callable
 from typing import ClassVar
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.link import HostLink, SerialLink
 from deal_hw.drivers.cartpole.units import from_target, to_robot_state, to_target
 from deal_hw.errors import (
-    ProtocolError,
     SafetyError,
     TransportTimeoutError,
     VersionMismatchError,
@@ -34,7 +35,7 @@ _REFUSALS = {
 
 
 class CartpoleRobot(Robot):
-    """A cart-pole that speaks the serial protocol of docs/protocol-cartpole-serial.md.
+    """A cart-pole that speaks the protocol of docs/protocol-cartpole-serial.md, on serial frames or others.
 
     ``connect`` says hello to the device, which switches its motor off; on an inherited port a child process
     connects again, with a transport that adopted the descriptor, and so starts from the passive state. Over a
@@ -45,24 +46,27 @@ class CartpoleRobot(Robot):
         resent: Requests that had to be sent again because no answer came within :data:`RETRY_S`.
 
     Args:
-        transport: A byte stream.
+        transport: A stream of the link's bytes.
         clock: The clock of the transport's stamps.
+        link: Makes the wire's codec, new for each connection.
     """
 
     description: ClassVar[RobotDescription] = DESCRIPTION
     watchdog_s: ClassVar[float] = 0.2
 
-    def __init__(self, transport: Transport, clock: Clock) -> None:
+    def __init__(
+        self, transport: Transport, clock: Clock, *, link: Callable[[], HostLink] = SerialLink
+    ) -> None:
         self.info: protocol.Info | None = None
         self.resent = 0
         self._transport = transport
         self._clock = clock
-        self._decoder = protocol.FrameDecoder()
+        self._make_link = link
+        self._link = link()
         self._states: deque[RobotState] = deque(maxlen=_QUEUE)
         self._wire: deque[Message] = deque(maxlen=_QUEUE)
         self._request = 0
         self._ack: protocol.Ack | None = None
-        self._foreign = 0
         self._gaps = 0
         self._next_state: int | None = None
         self._sequence = -1
@@ -88,7 +92,7 @@ class CartpoleRobot(Robot):
         """Close the transport."""
         self._transport.close()
         self.info, self._connected = None, False
-        self._decoder = protocol.FrameDecoder()
+        self._link = self._make_link()
 
     def reopen(self) -> None:
         """Open the port again where the device vanished; bytes from before make no frame with new ones."""
@@ -114,7 +118,7 @@ class CartpoleRobot(Robot):
             except TransportTimeoutError as error:
                 raise TransportTimeoutError(
                     f"cartpole: no state within {timeout_s:g} s; is the device powered, is the cable good "
-                    f"({self.link_errors} link errors so far)?"
+                    f"({self.link_errors} link errors so far)?{self._trouble}"
                 ) from error
         return self._states.popleft()
 
@@ -125,8 +129,8 @@ class CartpoleRobot(Robot):
             SafetyError: A value is not finite.
         """
         sequence = (self._sequence + 1) % protocol.NO_COMMAND
-        target = to_target(command, sequence)
-        self._send(protocol.encode(target))
+        target = self._link.feasible(to_target(command, sequence))
+        self._send(self._link.encode(target))
         self._sequence = sequence
         return from_target(target)
 
@@ -137,7 +141,7 @@ class CartpoleRobot(Robot):
         """
         self._states.clear()
         self._torn = True
-        self._send(protocol.encode(protocol.Stop(self._next_request())))
+        self._send(self._link.encode(protocol.Stop(self._next_request())))
 
     @property
     def last_sequence(self) -> int:
@@ -147,7 +151,12 @@ class CartpoleRobot(Robot):
     @property
     def link_errors(self) -> int:
         """Corrupt or foreign frames and missing state samples so far."""
-        return self._decoder.errors + self._foreign + self._gaps
+        return self._link.errors + self._gaps
+
+    @property
+    def fault(self) -> str:
+        """What was heard that forbids going on."""
+        return self._link.fault
 
     def fileno(self) -> int:
         """Return the descriptor of the transport."""
@@ -167,7 +176,7 @@ class CartpoleRobot(Robot):
         deadline_ns = self._clock.now_ns() + round(HELLO_TIMEOUT_S * 1e9)
         while (now_ns := self._clock.now_ns()) < deadline_ns:
             self._torn = True
-            self._send(protocol.encode(protocol.Hello(self._next_request())))
+            self._send(self._link.encode(protocol.Hello(self._next_request())))
             retry_ns = min(deadline_ns, now_ns + round(RETRY_S * 1e9))
             while (left_ns := retry_ns - self._clock.now_ns()) > 0:
                 try:
@@ -178,14 +187,15 @@ class CartpoleRobot(Robot):
                 if info is not None:
                     self._check_info(info)
                     return info
+                if self._link.fault:
+                    raise WrongDeviceError(f"{self._where}: {self._link.fault}")
         if received:
             raise WrongDeviceError(
-                f"{self._where}: {received} bytes came but no answer to hello; is another device on it, "
-                f"or does it use another baud rate than {protocol.BAUD_RATE}?"
+                f"{self._where}: {received} bytes came but no answer to hello; {self._link.hint}"
             )
         raise TransportTimeoutError(
             f"{self._where}: no answer to hello within {HELLO_TIMEOUT_S:g} s; is the device powered "
-            "and is this its port?"
+            f"and is this its port?{self._trouble}"
         )
 
     def _hear_info(self, timeout_s: float) -> tuple[protocol.Info | None, int]:
@@ -193,18 +203,14 @@ class CartpoleRobot(Robot):
         message = self._transport.receive(timeout_s)
         self._wire.append(Message("rx", message.payload, message.stamp_ns))
         info = None
-        for payload in self._decoder.feed(message.payload):
-            try:
-                found = protocol.decode(payload)
-            except ProtocolError:
-                continue
+        for found in self._link.decode(message.payload):
             if info is not None:
                 self._take(found, message.stamp_ns)
             elif isinstance(found, protocol.Info):
                 info = found
                 # The device forgot earlier commands; what it said before that hello is of no interest.
-                self._sequence, self._next_state, self._foreign, self._gaps = -1, None, 0, 0
-                self._decoder.errors = 0
+                self._sequence, self._next_state, self._gaps = -1, None, 0
+                self._link.errors = 0
                 self._states.clear()
         return info, len(message.payload)
 
@@ -225,7 +231,7 @@ class CartpoleRobot(Robot):
         self, request: protocol.Arm | protocol.Home, timeout_s: float, reached: Status, without: Status
     ) -> None:
         what = request.TYPE.name.lower()
-        frame = protocol.encode(request)
+        frame = self._link.encode(request)
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         self._ack = self._after_ack = None
         next_send_ns, sent = 0, 0
@@ -251,12 +257,7 @@ class CartpoleRobot(Robot):
     def _pump(self, timeout_s: float) -> None:
         message = self._transport.receive(timeout_s)
         self._wire.append(Message("rx", message.payload, message.stamp_ns))
-        for payload in self._decoder.feed(message.payload):
-            try:
-                found = protocol.decode(payload)
-            except ProtocolError:
-                self._foreign += 1
-                continue
+        for found in self._link.decode(message.payload):
             self._take(found, message.stamp_ns)
 
     def _take(self, message: protocol.AnyMessage, stamp_ns: int) -> None:
@@ -274,8 +275,8 @@ class CartpoleRobot(Robot):
             self._ack = message
 
     def _send(self, frame: bytes) -> None:
-        # After a write that was cut short, a delimiter keeps the torn frame from swallowing this one.
-        data = protocol.DELIMITER + frame if self._torn else frame
+        # A write that was cut short must not let the torn frame swallow this one.
+        data = self._link.resync + frame if self._torn else frame
         message = Message("", data, self._clock.now_ns())
         self._torn = True
         self._transport.send(message)
@@ -285,6 +286,11 @@ class CartpoleRobot(Robot):
     def _next_request(self) -> int:
         self._request = (self._request + 1) & 0xFF
         return self._request
+
+    @property
+    def _trouble(self) -> str:
+        trouble = getattr(self._transport, "trouble", "")
+        return f" The adapter reports: {trouble}" if trouble else ""
 
     @property
     def _where(self) -> str:

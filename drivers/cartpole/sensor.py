@@ -12,6 +12,13 @@ from deal_hw.drivers.cartpole.profiles import Profile
 _I32 = 0x7FFF_FFFF
 
 
+class Motor(NamedTuple):
+    """What the motor's own encoder says at once: position of the cart and its velocity [m, m/s]."""
+
+    position: float
+    velocity: float
+
+
 class Sample(NamedTuple):
     """What the device knows at one control tick, before the physics step [m, m/s, rad, rad/s, m]."""
 
@@ -23,13 +30,14 @@ class Sample(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What a state frame says [um, um/s, urad, urad/s], and the set-point of that moment [m]."""
+    """What a state frame says [um, um/s, urad, urad/s], the set-point of that moment [m]; end stop."""
 
     cart_um: int
     cart_um_s: int
     pole_urad: int
     pole_urad_s: int
     setpoint: float
+    at_end_stop: bool = False
 
 
 class Sensor:

@@ -80,6 +80,11 @@ class Truth:
             )
 
 
+def unique_id(truth: Truth) -> int:
+    """Return the serial number of the device with this truth."""
+    return 0xE000_0000 + truth.seed % 2**28
+
+
 def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:
     """Return a truth that equals the description, without latency unless given among the changes."""
     parameters = {p.name: p.nominal for p in parameter_space().parameters}

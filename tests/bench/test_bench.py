@@ -12,7 +12,7 @@ from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
 from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
 
 FIELDS = {
-    "bench", "task", "profile", "method", "polish", "xi", "seed", "error_percent", "log_error_x100",
+    "bench", "task", "profile", "method", "refined", "xi", "seed", "error_percent", "log_error_x100",
     "null_error_percent", "null_log_error_x100", "coverage90", "width90", "heldout_nrmse_nominal",
     "heldout_nrmse_calibrated", "latency_true", "latency_found", "steps", "seconds", "flagged", "error",
 }  # fmt: skip
@@ -27,22 +27,22 @@ def test_seeds() -> None:
 
 
 def test_rows_have_the_fields_of_the_benchmark_and_are_not_run_twice(tmp_path: Path) -> None:
-    """The centre of the range scores its own null error; a second run recomputes nothing."""
+    """The midpoint of the range scores its own null error; a second run recomputes nothing."""
     out = tmp_path / "loop.json"
     settings = Bench(
-        bench="loop", profile="sensor", seeds="0", methods="centre", out=out, threads=1, quiet=True
+        bench="loop", profile="sensor", seeds="0", methods="midpoint", out=out, threads=1, quiet=True
     )
     assert bench(settings) == 0
     values = json.loads(out.read_text())
     (row,) = values["rows"]
     assert set(row) >= FIELDS
-    assert row["error"] == "" and row["polish"] is False
+    assert row["error"] == "" and row["refined"] is False
     assert row["error_percent"] == pytest.approx(row["null_error_percent"])
     assert row["heldout_nrmse_calibrated"] > 0
     assert "processors" in values["machine"] and "mujoco" in values["machine"]["versions"]
     assert out.with_suffix(".png").stat().st_size > 1000
     with out.with_suffix(".csv").open() as file:
-        assert [r["method"] for r in csv.DictReader(file)] == ["centre"]
+        assert [r["method"] for r in csv.DictReader(file)] == ["midpoint"]
     before = row["seconds"]
     assert bench(settings) == 0
     assert json.loads(out.read_text())["rows"][0]["seconds"] == before
@@ -59,7 +59,7 @@ def test_foreign_file_is_not_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "notes.json"
     out.write_text('{"a": 1}')
     with pytest.raises(DatasetError, match="cannot be read as rows of a bench"):
-        bench(Bench(bench="loop", methods="centre", out=out))
+        bench(Bench(bench="loop", methods="midpoint", out=out))
     assert out.read_text() == '{"a": 1}'
 
 
@@ -72,7 +72,7 @@ def test_ratios() -> None:
 
 
 def test_honest_rows_for_every_task(tmp_path: Path) -> None:
-    """Cells are tasks by methods; null rows score the centre's error everywhere."""
+    """Cells are tasks by methods; no-data baselines score the centre's error everywhere."""
     out = tmp_path / "honest.json"
     settings = Bench(
         bench="honest", task="cartpole,ant,go2", profile="ideal", seeds="3", methods="centre,nominal",
@@ -82,7 +82,7 @@ def test_honest_rows_for_every_task(tmp_path: Path) -> None:
     rows = json.loads(out.read_text())["rows"]
     assert len(rows) == 3 * 2
     for row in rows:
-        assert set(row) >= FIELDS and row["bench"] == "honest" and not row["polish"]
+        assert set(row) >= FIELDS and row["bench"] == "honest" and not row["refined"]
         assert row["log_error_x100"] == pytest.approx(row["null_log_error_x100"])
         assert row["log_error_x100"] > 10, "an honest truth is not the centre"
     assert bench(settings) == 0
@@ -99,15 +99,15 @@ def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> No
     rows = {row["method"]: row for row in json.loads(out.read_text())["rows"]}
     assert rows["nominal"]["error_percent"] == 0.0
     # The centre of a linear range [p / 5, 5 p] is 2.6 p.
-    assert rows["centre"]["error_percent"] == pytest.approx(160.0)
-    assert "scores 0" in rows["centre"]["note"]
+    assert rows["midpoint"]["error_percent"] == pytest.approx(160.0)
+    assert "scores 0" in rows["midpoint"]["note"]
 
 
 def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:
     """One cell's error does not stop the others, and the exit code says that one failed."""
     out = tmp_path / "mismatch.json"
     settings = Bench(
-        bench="mismatch", task="ant,cartpole", seeds="3", methods="centre", out=out, threads=1, quiet=True
+        bench="mismatch", task="ant,cartpole", seeds="3", methods="midpoint", out=out, threads=1, quiet=True
     )
     assert bench(settings) == 1
     errors = {row["task"]: row["error"] for row in json.loads(out.read_text())["rows"]}

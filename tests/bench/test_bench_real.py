@@ -66,7 +66,7 @@ def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
     nominal, fitted = rows["nominal"], rows["default"]
     assert list(nominal["estimate"].values()) == [pytest.approx(0.2)]
     assert fitted["heldout_rmse_calibrated"] < 0.2 * fitted["heldout_rmse_nominal"]
-    assert fitted["at_bound"] == [] and fitted["polish"]
+    assert fitted["at_bound"] == [] and fitted["refined"]
     assert next(iter(fitted["estimate"].values())) == pytest.approx(0.4, rel=0.05)
 
 

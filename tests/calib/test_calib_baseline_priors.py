@@ -1,4 +1,4 @@
-"""What is expected of a parameter counts in the baselines that minimise squares, as it does in the polish."""
+"""What is expected of a parameter counts in the baselines that minimise squares, as in the refinement."""
 
 from __future__ import annotations
 

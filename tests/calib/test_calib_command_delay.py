@@ -7,7 +7,7 @@ import pytest
 
 from deal_hw.calib.data.checks import check_delays
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -41,9 +41,9 @@ def problem(space: ParameterSpace, latency_s: float | None, *, sensor: bool = Fa
     )
 
 
-def test_polish_recovers_the_delay() -> None:
+def test_refinement_recovers_the_delay() -> None:
     """Truth recovery: the robot is late by 7 ms, 3 ms of which are the given latency."""
-    found = polish(problem(space_with(DELAY), 0.003), [60.0, 0.002], 0.003, fixed_latency=True)
+    found = refine(problem(space_with(DELAY), 0.003), [60.0, 0.002], 0.003, fixed_latency=True)
     assert found.theta[1] == pytest.approx(0.004, abs=1e-5)
 
 

@@ -1,4 +1,4 @@
-"""The polish's solver where feet touch the floor: windows whose start states follow one by one."""
+"""The refinement's solver where feet touch the floor: windows whose start states follow one by one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.contacts import Sticking, settle
-from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.uncertainty.intervals import MISMATCH, correlation_time
 from deal_hw.calib.validation.verdict import unexplained
@@ -41,7 +41,7 @@ def test_smoothed_start_states_settle_to_the_noise(
     before = shooting.start(truth, sensed.latency_s)
     after, cost = settle(shooting, before, 6)
     np.testing.assert_array_equal(after.value, before.value)
-    windows = np.array([w for p in (before, after) for (w,) in shooting.each_cost([p])])
+    windows = np.array([w for p in (before, after) for w in shooting.window_costs(p)])
     assert np.all(windows[1] <= windows[0])
     assert cost == pytest.approx(windows[1].sum())
     normal = shooting.normal(after)
@@ -53,7 +53,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three
     """From eight percent off the residual becomes noise, and the parameters come back."""
     space, truth = three_unknown(sensed.space, sensed.theta)
     problem = Problem(sensed.robot, space, [beginning(sensed.fit, 1.7)], threads=1)
-    found = polish(
+    found = refine(
         problem, truth * [1.08, 0.92, 1.08], sensed.latency_s, (0.4,), iterations=8, fixed_latency=True
     )
     assert found.chi2 < MISMATCH.chi2
@@ -105,7 +105,7 @@ def test_strategy_keeps_the_best_point_and_hands_the_solver_its_residual(
     fit = Sticking(shooting, start, 1.0)
     residual = fit.residual(start.value)
     assert fit.best_cost == pytest.approx(residual @ residual)
-    assert fit.best_cost <= shooting.costs([start])[0]
+    assert fit.best_cost <= shooting.cost(start)
     jacobian = fit.jacobian(start.value)
     assert jacobian.shape == (len(residual), len(start.value))
     step = np.append(0.3 * np.linalg.lstsq(jacobian[:, :-1], residual, rcond=None)[0], 0.0)
@@ -115,10 +115,12 @@ def test_strategy_keeps_the_best_point_and_hands_the_solver_its_residual(
     np.testing.assert_array_equal(fit.best.value, start.value - step)
 
 
-def test_costs_are_the_sums_of_windows(small_problem: Callable[..., Problem]) -> None:
-    """One cost a point, one a window, from the same prediction."""
-    problem = small_problem()
-    shooting = Shooting(problem, 10)
-    points = [shooting.start(problem.space.nominal * f, 0.0) for f in (1.0, 1.3)]
-    total = sum(of_episode.sum(axis=1) for of_episode in shooting.each_cost(points))
-    np.testing.assert_allclose(shooting.costs(points), total + shooting.prior_costs(points))
+def test_the_cost_is_the_sum_of_windows(small_problem: Callable[..., Problem]) -> None:
+    """And that of all whitened residuals, from the same prediction."""
+    shooting = Shooting(small_problem(), 10)
+    point = shooting.start(1.3 * shooting.problem.space.nominal, 0.0)
+    residual = shooting.vector(point)
+    assert shooting.cost(point) == pytest.approx(residual @ residual)
+    assert shooting.cost(point) == pytest.approx(
+        sum(of_episode.sum() for of_episode in shooting.window_costs(point))
+    )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.calib.validation import diagnosis
@@ -203,7 +203,7 @@ def test_random_forces_are_no_delays(slow: bool) -> None:
     assert found is not None and found.gain < 0
 
 
-def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Problem, Polished]:
+def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Problem, Refined]:
     """Return a simulated robot's recordings, and what a fit from its own values makes of them."""
     robot = make_robot(kind, 3, fault)
     model, paths, held_out = write(robot, folder, seconds=5.0)
@@ -211,7 +211,7 @@ def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Pr
     work = prepare(config)
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
     theta = np.array([robot.truth[name] for name in work.space.names])
-    return robot, problem, with_rows(polish(problem, theta, robot.delay_s, (0.4,), iterations=4))
+    return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
 
 
 def test_a_right_model_has_no_cause(tmp_path: Path) -> None:

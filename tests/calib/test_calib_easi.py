@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.baselines.easi import Box, Easi, EasiSettings, EliteGaussian, elite_weights, published
-from deal_hw.calib.data.coordinates import Coordinates
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FITNESSES
+from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError

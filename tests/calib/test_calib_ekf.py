@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman, only
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman
+from deal_hw.calib.data.problem import Problem, taken
 from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -149,7 +149,7 @@ def test_passes_start_with_the_prior_that_a_parameter_has(recorded: Callable[...
 def test_one_window_of_several_is_that_window(small_problem: Callable[..., Problem]) -> None:
     """Arrays keep their shape but for the count."""
     data = small_problem(seconds=0.8).windows(3)[0]
-    one = only(data, 4)
+    one = taken(data, np.array([4]))
     assert len(one.windows) == 1
     assert one.windows.start[0] == data.windows.start[4]
     np.testing.assert_array_equal(one.measured[0], data.measured[4])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.search.ensemble_kalman import EnsembleKalman
+from deal_hw.calib.search.eki import EnsembleKalman
 
 
 def test_tempered_ensemble_samples_the_linear_gaussian_posterior() -> None:

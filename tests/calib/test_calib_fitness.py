@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings
 from deal_hw.calib.deal_paper.fitness import (
@@ -85,7 +85,7 @@ def test_trajectory_is_the_logarithm_of_the_mean_square(problem: Problem) -> Non
 
 
 def test_flat_sees_nothing(problem: Problem) -> None:
-    """The null row: one score for all, no simulation."""
+    """The no-data baseline: one score for all, no simulation."""
     steps = problem.steps
     fitness = make_fitness("flat", problem, np.random.default_rng(0))
     np.testing.assert_array_equal(fitness.score(members(problem)), np.zeros(3))

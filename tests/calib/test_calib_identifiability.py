@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.uncertainty.intervals import Z90, Uncertainty, ended_at_bound, uncertainty
+from deal_hw.calib.fit.residual import Normal
+from deal_hw.calib.uncertainty.intervals import Uncertainty, ended_at_bound, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_space, sparse_basis
+from deal_hw.calibration import Z90
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -29,10 +31,10 @@ def _told(
     whole = np.zeros((len(space) + 1,) * 2)
     whole[: len(space), : len(space)] = hessian
     white = np.random.default_rng(0).normal(size=(4, 50, 2))
-    return uncertainty(
-        space, np.array(theta), 0.0, whole, 1.0, (white,), (0.0, 0.04), fixed_latency=True,
-        gradient=gradient, prior=prior,
-    )  # fmt: skip
+    nothing = np.zeros(len(whole))
+    slope, known = (nothing if given is None else given for given in (gradient, prior))
+    normal = Normal(1.0, 1, whole, slope, (white,), known)
+    return uncertainty(space, np.array(theta), 0.0, normal, 1.0, (0.0, 0.04), fixed_latency=True)
 
 
 def test_a_parameter_at_its_bound_is_fixed_there_for_the_others() -> None:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.gauss_newton import damped_step
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.output_error import SHORT, HorizonFit, fit_horizon
-from deal_hw.calib.fit.refinement import Polished, local_fit, polish
+from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, fit_output_error
+from deal_hw.calib.fit.refinement import Refined, local_fit, refine
+from deal_hw.calib.fit.solver import SolverSettings, minimise
 from deal_hw.calib.validation.verdict import latency_alarms
 from deal_hw.errors import ConfigurationError
 
@@ -20,16 +20,28 @@ LATE = 85
 """Device ticks of 1 ms by which the robot of these tests is late."""
 
 
-def shooting(problem: Problem) -> Polished:
+def shooting(problem: Problem) -> Refined:
     """Return the local fit of the pipeline."""
     found = local_fit(problem, None)
     assert found is not None
     return found
 
 
-def output_error(problem: Problem) -> HorizonFit:
-    """Return the first fit of the open-loop method."""
-    return fit_horizon(problem, problem.space.nominal, problem.first_latency_s, SHORT)
+class Pull:
+    """A fit that draws the parameter and the latency away from where they are."""
+
+    def residual(self, value: np.ndarray) -> np.ndarray:
+        """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
+        return value + np.array([0.5, 1.0])
+
+    def jacobian(self, value: np.ndarray) -> np.ndarray:
+        """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
+        return np.eye(2)
+
+
+def output_error(problem: Problem) -> OutputErrorFit:
+    """Return the first fit of the output-error method."""
+    return fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.045, 0.085, 0.5])
@@ -39,8 +51,8 @@ def test_a_given_latency_is_never_moved(small_problem: MakeProblem, latency_s: f
     low, high = problem.latency_range_s
     assert low <= latency_s <= high and problem.first_latency_s == latency_s
     ends = (np.array([-1.0, 0.0]), np.array([1.0, 0.04]))
-    step = damped_step(np.array([0.5, latency_s]), np.array([1.0, 50.0]), np.eye(2), 0.1, *ends, True)
-    assert step[1] == 0.0 and step[0] < 0.0
+    value, _ = minimise(Pull(), np.array([0.5, latency_s]), ends, SolverSettings(), fixed_latency=True)
+    assert value[1] == latency_s and value[0] < 0.5
 
 
 def test_given_latency_of_85_ms_is_the_one_that_is_fitted_with(
@@ -48,10 +60,10 @@ def test_given_latency_of_85_ms_is_the_one_that_is_fitted_with(
 ) -> None:
     """From 10 % off the truth is found to 1 %; with 40 ms given the residual stays far above the noise."""
     truth = recorded(1.2, LATE)[1]
-    fit = polish(small_problem(1.2, LATE, 0.085), truth * 1.1, 0.085, fixed_latency=True)
+    fit = refine(small_problem(1.2, LATE, 0.085), truth * 1.1, 0.085, fixed_latency=True)
     assert fit.latency_s == 0.085
     np.testing.assert_allclose(fit.theta, truth, rtol=0.01)
-    wrong = polish(small_problem(1.2, LATE, 0.04), truth * 1.1, 0.04, fixed_latency=True)
+    wrong = refine(small_problem(1.2, LATE, 0.04), truth * 1.1, 0.04, fixed_latency=True)
     assert wrong.chi2 > 100 * max(fit.chi2, 1e-3)
 
 

@@ -38,7 +38,7 @@ def test_memory_stays_flat(name: str, small_problem: Callable[..., Problem]) -> 
     tracemalloc.start()
     try:
         for seed in range(TO):
-            budget = Budget(population=MEMBERS, generations=TO, polish=False)
+            budget = Budget(population=MEMBERS, generations=TO, refine=False)
             make_method(name).run(problem, budget, np.random.default_rng(seed), note)
     except Enough:
         pass

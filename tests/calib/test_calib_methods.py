@@ -11,7 +11,7 @@ import pytest
 from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.methods import METHODS, NULL_METHODS, check_method, make_method
+from deal_hw.calib.methods import METHODS, NO_DATA_METHODS, check_method, make_method
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
@@ -133,14 +133,14 @@ class TestRandom(MethodSuite):
         return case_of("random", Budget(population=60, generations=10), 0.25)
 
 
-class TestCentre(MethodSuite):
-    """`centre` keeps the contract without reading the data."""
+class TestMidpoint(MethodSuite):
+    """`midpoint` keeps the contract without reading the data."""
 
     @pytest.fixture(scope="class")
     @classmethod
     def case(cls) -> MethodCase:
         """Return the method under test."""
-        return case_of("centre", Budget(population=10, generations=1), None)
+        return case_of("midpoint", Budget(population=10, generations=1), None)
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -148,8 +148,8 @@ def test_every_name_in_the_table_makes_a_method(name: str) -> None:
     """Each row imports, and names its result after itself; the default is one of the others."""
     method = make_method(name)
     assert method.name == name or name == "default"
-    whole = make_method(name, polish=True)
-    assert isinstance(whole, Calibration) == (name not in NULL_METHODS | {"mujoco-sysid"})
+    whole = make_method(name, refine=True)
+    assert isinstance(whole, Calibration) == (name not in NO_DATA_METHODS | {"mujoco-sysid"})
     assert whole.name == name
 
 
@@ -163,11 +163,11 @@ def test_unknown_method_lists_the_names() -> None:
 
 
 def test_nominal_and_centre_are_what_they_say() -> None:
-    """The null rows: the user's model, and the middle of the range on its own scale."""
+    """The no-data baselines: the user's model, and the middle of the range on its own scale."""
     problem = small_problem()
     rng = np.random.default_rng(0)
     nominal = make_method("nominal").run(problem, Budget(), rng)
-    centre = make_method("centre").run(problem, Budget(), rng)
+    centre = make_method("midpoint").run(problem, Budget(), rng)
     np.testing.assert_array_equal(nominal.estimate, problem.space.nominal)
     np.testing.assert_array_equal(centre.estimate, problem.space.center)
     assert nominal.steps == centre.steps == 0

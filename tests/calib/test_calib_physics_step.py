@@ -9,7 +9,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import local_fit
-from deal_hw.calib.uncertainty.intervals import Uncertainty, statement, with_rows
+from deal_hw.calib.uncertainty.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.uncertainty.time_steps import (
     StepCheck,
     StepSettings,
@@ -19,7 +19,7 @@ from deal_hw.calib.uncertainty.time_steps import (
     step_alarm,
 )
 from deal_hw.cli.calibrate_model import Recordings, prepare_model
-from deal_hw.cli.calibrate_run import Narrowing
+from deal_hw.cli.calibrate_run import SpaceOverrides
 from deal_hw.types import FloatArray
 
 HINGE = """
@@ -70,13 +70,18 @@ def checked(
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    narrowing = Narrowing(free=(), known={}, ranges=(), xi=None)
-    work = prepare_model(source, (), narrowing, std=lambda robot: None, threads=1, quiet=True)
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=None)
+    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1, quiet=True)
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = local_fit(problem, None)
     assert fit is not None
     fit = with_rows(fit)
-    return problem, fit.theta, statement(problem, fit, fixed_latency=True), check_step(problem, fit, settings)
+    return (
+        problem,
+        fit.theta,
+        uncertainty_at(problem, fit, fixed_latency=True),
+        check_step(problem, fit, settings),
+    )
 
 
 def test_a_step_that_is_too_coarse_is_named_and_counted(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def space(count: int = 2, name: str = "p") -> ParameterSpace:
 
 
 def result(searched: ParameterSpace, **changes: Any) -> CalibrationResult:
-    """Return a result at the centre of its range."""
+    """Return a result at the midpoint of its range."""
     K = len(searched)
     values = {
         "method": "eki",
@@ -123,7 +123,9 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
             "dataset": HOSTILE,
             HOSTILE: {HOSTILE: HOSTILE},
             "settings": {HOSTILE: HOSTILE},
-            "halves": {"parameters": {HOSTILE: {"first": [1, 0, 2], "second": [3, 2.5, 4], "agree": False}}},
+            "split_half": {
+                "parameters": {HOSTILE: {"first": [1, 0, 2], "second": [3, 2.5, 4], "agree": False}}
+            },
         },
     )
     given_ = dataclasses.replace(

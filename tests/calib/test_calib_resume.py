@@ -1,4 +1,4 @@
-"""Stopped and resumed searches end bit for bit where they would have: stages, restarts, polish."""
+"""Stopped and resumed searches end bit for bit where they would have: stages, restarts, refinement."""
 
 from __future__ import annotations
 

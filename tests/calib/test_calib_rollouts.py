@@ -9,8 +9,7 @@ import pytest
 
 from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
-from deal_hw.calib.data.coordinates import Coordinates, Members, logistic, logit
-from deal_hw.calib.data.innovations import explained, linearise, predict
+from deal_hw.calib.data.innovations import Members, explained, linearise, predict
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.rollouts import (
     TransitionScale,
@@ -19,6 +18,8 @@ from deal_hw.calib.deal_paper.rollouts import (
     rollout_population,
     transitions,
 )
+from deal_hw.calib.search.base import Coordinates
+from deal_hw.calib.search.eki import logistic, logit
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 

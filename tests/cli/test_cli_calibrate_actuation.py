@@ -58,7 +58,7 @@ def test_the_other_kind_is_refused(
 ) -> None:
     """By `calibrate` and by `data import`, with what to change; --force imports it all the same."""
     files = ["--model", str(folder / f"{model}.xml")]
-    words = ["calibrate", *files, "--data", str(folder / f"{data}.csv"), "--generations", "1", "--no-polish"]
+    words = ["calibrate", *files, "--data", str(folder / f"{data}.csv"), "--generations", "1", "--no-refine"]
     words += ["--out", str(tmp_path / "out")]
     assert main(words) == EXIT_ERROR
     told = capsys.readouterr().err.splitlines()[-1]

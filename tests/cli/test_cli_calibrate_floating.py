@@ -61,7 +61,7 @@ def command(folder: Path, *more: str) -> list[str]:
     """Return the arguments of a short calibration."""
     words = ["calibrate", "--model", str(DESCRIPTION.mjcf), "--data", str(folder / "rec.npz")]
     words += ["--columns", str(folder / "columns.yaml"), "--parameters", str(folder / "params.yaml")]
-    words += ["--latency", "0", "--population", "12", "--generations", "8", "--no-polish", "--no-report"]
+    words += ["--latency", "0", "--population", "12", "--generations", "8", "--no-refine", "--no-report"]
     return [*words, "--out", str(folder / "out"), "--quiet", "--threads", "1", *more]
 
 

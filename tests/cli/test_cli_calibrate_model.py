@@ -111,7 +111,7 @@ def test_mjcf_and_csv_give_a_report(folder: Path, tmp_path: Path, capsys: pytest
     calibration = tmp_path / "calibration"
     assert (calibration / "report.html").stat().st_size > 10_000
     found = json.loads((calibration / "result.json").read_text())
-    assert found["method"] == "open-loop" and "method: open-loop" in told.err
+    assert found["method"] == "output-error" and "method: output-error" in told.err
     assert found["parameters"]["shoulder.damping"]["estimate"] == pytest.approx(0.35, rel=0.1)
     assert found["parameters"]["shoulder.frictionloss"]["estimate"] == pytest.approx(0.06, rel=0.1)
     assert found["latency_s"] == pytest.approx(0.006, abs=0.002)
@@ -124,7 +124,7 @@ def test_mjcf_and_csv_give_a_report(folder: Path, tmp_path: Path, capsys: pytest
 
 def test_last_part_is_held_out_and_noise_can_be_said(folder: Path, tmp_path: Path) -> None:
     """Without --holdout the last quarter judges; --residual-std is what residuals are measured by."""
-    words = command(folder, "--no-polish", "--no-report", "--quiet", "--residual-std", "0.005")
+    words = command(folder, "--no-refine", "--no-report", "--quiet", "--residual-std", "0.005")
     assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
     found = json.loads((tmp_path / "calibration" / "result.json").read_text())
     assert found["provenance"]["fitted_s"] == pytest.approx(4.48, abs=0.03)
@@ -134,7 +134,7 @@ def test_last_part_is_held_out_and_noise_can_be_said(folder: Path, tmp_path: Pat
 
 def test_stretches_are_left_out(folder: Path, tmp_path: Path) -> None:
     """Two of six seconds: 100 of 300 samples are gone, and the recording is in two parts."""
-    words = command(folder, "--leave-out", "rec", "2", "4", "--no-polish", "--no-report", "--quiet")
+    words = command(folder, "--leave-out", "rec", "2", "4", "--no-refine", "--no-report", "--quiet")
     words += ["--generations", "1", "--holdout-part", "0"]
     assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
     provenance = json.loads((tmp_path / "calibration" / "result.json").read_text())["provenance"]
@@ -150,7 +150,7 @@ def test_speed_limit_of_a_servo_is_found(folder: Path, tmp_path: Path) -> None:
     write(folder / "slewed.csv", record(6.0, 1, 1.2))
     more = "  - {kind: servo_speed_limit, elements: servo_a, nominal: 3.0, name: shoulder.speed}\n"
     (folder / "slewed.yaml").write_text(PARAMETERS + more, encoding="utf-8")
-    words = command(folder, "--method", "near", "--no-report", "--no-advise", "--quiet", data="slewed.csv")
+    words = command(folder, "--method", "local", "--no-report", "--no-advise", "--quiet", data="slewed.csv")
     words[words.index("--parameters") + 1] = str(folder / "slewed.yaml")
     assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
     found = json.loads((tmp_path / "calibration" / "result.json").read_text())["parameters"]
@@ -172,7 +172,7 @@ def test_spikes_do_not_move_the_estimate(
     found = {}
     for name in ("rec", "spiked"):
         words = command(
-            folder, "--method", "near", "--no-report", "--out", str(tmp_path / name), data=f"{name}.csv"
+            folder, "--method", "local", "--no-report", "--out", str(tmp_path / name), data=f"{name}.csv"
         )
         assert main([*words, "--holdout", str(folder / "other.csv")]) == EXIT_OK
         found[name] = json.loads((tmp_path / name / "calibration" / "result.json").read_text())
@@ -187,7 +187,7 @@ def test_spikes_do_not_move_the_estimate(
         )
 
 
-@pytest.mark.parametrize("method", ["near", "eki"])
+@pytest.mark.parametrize("method", ["local", "eki"])
 def test_latency_at_the_end_of_its_range(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:
@@ -364,7 +364,7 @@ def test_wrong_sign_and_gain_show_under_gravity(
     params.write_text("parameters: [{kind: servo_stiffness, elements: '*'}]\n")
     for data, model, message in (("mirror.csv", "arm.xml", "hangs against gravity"),
                                  ("rec.csv", "stiff.xml", "hangs as with a gain of about")):  # fmt: skip
-        words = command(folder, "--out", str(tmp_path / "out"), "--generations", "2", "--no-polish",
+        words = command(folder, "--out", str(tmp_path / "out"), "--generations", "2", "--no-refine",
                         "--no-report", "--parameters", str(params), data=data, model=model)  # fmt: skip
         main(words)
         assert message in capsys.readouterr().err

@@ -102,6 +102,6 @@ def test_a_row_is_flagged_where_a_parameter_is_given_no_value(monkeypatch: pytes
 
     case = make_case("cartpole", "ideal", 3, 3.0)
     monkeypatch.setattr(bench_loop, "calibrate_episodes", told)
-    row, _ = bench_loop.calibration_row(case, "centre", Budget(polish=False), 1)
+    row, _ = bench_loop.calibration_row(case, "midpoint", Budget(refine=False), 1)
     assert row["untold"] == ["servo.effort_limit"] and row["flagged"] and not row["alarms"]
     assert row["vigors"] == list(case.vigors)

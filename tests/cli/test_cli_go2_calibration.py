@@ -90,7 +90,7 @@ def dataset(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def calibrated(dataset: Path) -> CalibrateReport:
     """Calibrate the hips."""
     config = Calibrate(
-        dataset=dataset, holdout=(1,), method="near", sample_hz=100.0, free=HIPS, threads=1, report=False,
+        dataset=dataset, holdout=(1,), method="local", sample_hz=100.0, free=HIPS, threads=1, report=False,
         advise=False, quiet=True,
     )  # fmt: skip
     return calibrate(config)

@@ -268,7 +268,7 @@ def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
     class Deaf(CartpoleDevice):
         def receive(self, data: bytes) -> None:
             """Hear nothing, and be spared by the watchdog."""
-            self._alive_tick = 10**9
+            self._firmware._alive_tick = 10**9  # type: ignore[attr-defined]
 
     armed.device.__class__ = Deaf
     assert not armed.make_passive(timeout_s=7.0)

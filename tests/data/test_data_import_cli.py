@@ -211,7 +211,7 @@ def test_go2_converter(tmp_path: Path) -> None:
     assert table.joint_names[:4] == ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint", "FR_hip_joint")
     np.testing.assert_array_equal(table.position, q)
     np.testing.assert_array_equal(table.target, q + 0.5)
-    halves = tmp_path / "halves"
+    halves = tmp_path / "split_half"
     assert convert.main([str(tmp_path / "traj_0.pt"), "--out", str(halves), "--parts", "2"]) == 0
     parts = [np.load(halves / f"traj_0_part{i}.npz")["dof_pos"] for i in (1, 2)]
     np.testing.assert_array_equal(np.concatenate(parts), q)

@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.drivers.cartpole import protocol
+from deal_hw.drivers.cartpole.controller import WATCHDOG_TICKS
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.device import HOMING_TICKS, WATCHDOG_TICKS, CartpoleDevice
+from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.mechanics import HOMING_TICKS, Mechanics
 from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
 from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
 from deal_hw.types import Status
@@ -274,12 +276,12 @@ def test_jittered_commands_keep_their_order() -> None:
 
 def test_backlash_keeps_the_motor_within_half_the_play() -> None:
     """The motor's encoder stays put until the play of 0.4 mm is used up."""
-    device = CartpoleDevice(nominal_truth("realistic"))
-    device._motor_m = 0.0
-    assert device._motor_position(0.0001) == 0.0
-    assert device._motor_position(0.0005) == pytest.approx(0.0003)
-    assert device._motor_position(0.0001) == pytest.approx(0.0003)
-    assert device._motor_position(-0.0005) == pytest.approx(-0.0003)
+    mechanics = Mechanics(nominal_truth("realistic"))
+    found = []
+    for cart in (0.0, 0.0001, 0.0005, 0.0001, -0.0005):
+        mechanics._sim.set_state((cart, 0.0), (0.0, 0.0))
+        found.append(mechanics.motor().position)
+    np.testing.assert_allclose(found[1:], [found[0], 0.0003, 0.0003, -0.0003], atol=1e-12)
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:

@@ -30,7 +30,13 @@ def test_every_robot_is_described_under_its_name(name: str) -> None:
     assert description.digest() == driver_description(name).digest()
 
 
-NOWHERE = {"serial": "/dev/ttyNOPE", "dds": "nope0", "zenoh": "tcp/127.0.0.1:1"}
+NOWHERE = {
+    "serial": "/dev/ttyNOPE",
+    "can": "slcan:/dev/ttyNOPE",
+    "odrive": "slcan:/dev/ttyNOPE",
+    "dds": "nope0",
+    "zenoh": "tcp/127.0.0.1:1",
+}
 PAIRS = [(name, transport) for name in ROBOTS for transport in REACHED_BY[name]]
 
 
@@ -50,7 +56,8 @@ def test_descriptors_are_inherited_where_there_are_any(name: str, transport: str
         with pytest.raises(ConfigurationError, match="make_robot"):
             adopt_robot(name, transport, 999, MonotonicClock())
     else:
-        assert isinstance(adopt_robot(name, transport, 999, MonotonicClock()), Robot)
+        made = adopt_robot(name, transport, 999, MonotonicClock(), port=NOWHERE[transport])
+        assert isinstance(made, Robot)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -21,7 +21,10 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("deal_hw", "drivers", "calib", "policies")
 SOURCES = "\n".join(
     path.read_text(encoding="utf-8")
-    for path in [ROOT / "Makefile", *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))]
+    for path in [
+        ROOT / "Makefile",
+        *(path for folder in FOLDERS for kind in ("*.py", "*.[ch]") for path in (ROOT / folder).rglob(kind)),
+    ]
 )
 DATA_FORMAT = (ROOT / "docs" / "data-format.md").read_text(encoding="utf-8")
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -32,6 +34,8 @@ BASE_MODULES = (
     "deal_hw.drivers.cartpole.description",
     "deal_hw.drivers.cartpole.protocol",
     "deal_hw.drivers.cartpole.robot",
+    "deal_hw.drivers.cartpole.can_robot",
+    "deal_hw.drivers.transports.slcan_transport",
     "deal_hw.drivers.go2.doctor",
     "deal_hw.drivers.go2.descriptions.driver",
     "deal_hw.drivers.go2.descriptions.on_stand",
@@ -197,3 +201,17 @@ def test_versions_agree() -> None:
     from deal_hw import __version__
 
     assert project()["project"]["version"] == __version__  # type: ignore[index]
+
+
+def test_the_wires_of_the_cart_pole_add_little_to_the_base_install() -> None:
+    """python-can, cantools and what they need take less than 15 MB (measured: 5.5 MB)."""
+    named = {"python-can", "cantools", "bitstruct", "crccheck", "textparser", "argparse-addons", "wrapt"}
+    sizes = {}
+    for name in named:
+        files = importlib.metadata.distribution(name).files or []
+        paths = [Path(str(file.locate())) for file in files]
+        sizes[name] = sum(path.stat().st_size for path in paths if path.is_file())
+    assert all(sizes.values())
+    assert sum(sizes.values()) < 15e6, sizes
+    wanted = project()["project"]["dependencies"]  # type: ignore[index]
+    assert {"python-can", "cantools"} <= {re.split("[><=]", entry)[0] for entry in wanted}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.calib.data.coordinates import Members
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings
 from deal_hw.calib.deal_paper.rollouts import control_ticks, rollout_population
@@ -118,7 +118,7 @@ def test_the_paper_takes_pi_0_in_the_loop(robot: str) -> None:
     problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0)
     population = PopulationDemonstration(demonstration_policy(robot), model.description, WALK)
     method = DealPaper(PaperSettings(ticks=20), population)
-    budget = Budget(population=4, generations=2, polish=False)
+    budget = Budget(population=4, generations=2, refine=False)
     found = method.run(problem, budget, np.random.default_rng(0))
     assert (found.estimate >= space.low).all() and (found.estimate <= space.high).all()
 

@@ -53,7 +53,7 @@ def test_each_generation_is_shown_once() -> None:
     view = PopulationView(space, stream)
     for number in (1, 2, 3):
         view.show(generation(number))
-    view.show(Progress("polish", 1, 1, "chi2 1", values={"chi2": float("nan")}))
+    view.show(Progress("refinement", 1, 1, "chi2 1", values={"chi2": float("nan")}))
     view.close()
     for name in space.names:
         for path in (
@@ -62,7 +62,7 @@ def test_each_generation_is_shown_once() -> None:
         ):
             assert stream.logged[path] == 3
     assert stream.logged["/trace/search/misfit"] == 3
-    assert stream.logged["/trace/polish/chi2"] == 0
+    assert stream.logged["/trace/refinement/chi2"] == 0
     assert stream.logged["/log"] == 4
     assert view.left_out == 0
 

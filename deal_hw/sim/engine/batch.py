@@ -34,7 +34,7 @@ SERVO_PLAY = "servo_play"
 """Kind that no MuJoCo field holds: width of the play in the gear between an actuator and its joint."""
 
 SIZES_KEPT = 6
-"""Simulators of so many sizes are kept: one iteration of a search or polish needs up to four."""
+"""Simulators of so many sizes are kept: one iteration of a search or refinement needs up to four."""
 
 
 def default_threads() -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.fit.residual import Normal, WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import clustered, eliminated
 from deal_hw.calib.uncertainty.intervals import uncertainty
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -139,17 +139,16 @@ def _coverage(wild: float, windows: int, draws: int) -> tuple[float, float, floa
         theta = np.linalg.solve(hessian[:K, :K], np.einsum("whp,wh->p", design[..., :K], y))
         left = design[..., :K] @ theta - y
         chi2 = float(np.sum(left**2) / (left.size - K))
+        nothing = np.zeros(K + 1)
         told = [
             uncertainty(
                 space,
                 theta,
                 0.0,
-                hessian,
+                Normal(1.0, 1, hessian, nothing, (left[..., None],), nothing, rows=rows),
                 chi2,
-                (left[..., None],),
                 (0.0, 0.04),
                 fixed_latency=True,
-                rows=rows,
             ).interval
             for rows in ((), (_rows(left, design),))
         ]

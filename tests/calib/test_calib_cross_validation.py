@@ -9,7 +9,7 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, at_parameters, polish, polish_robust, polish_windows
+from deal_hw.calib.fit.refinement import Refined, at_parameters, refine, refine_robust, refine_windows
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline import Calibration
@@ -68,9 +68,9 @@ def problem(case: Case) -> Problem:
 
 
 @pytest.fixture(scope="module")
-def polished(case: Case, problem: Problem) -> Polished:
-    """Where the polish ends, in windows of 0.2 s."""
-    found = polish(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
+def refined(case: Case, problem: Problem) -> Refined:
+    """Where the refinement ends, in windows of 0.2 s."""
+    found = refine(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
     return with_rows(found)
 
 
@@ -85,16 +85,16 @@ def test_folds_are_disjoint_and_cover_everything(problem: Problem) -> None:
     assert part.starts is problem.starts and problem.episodes[0].usable.sum() > part.episodes[0].usable.sum()
 
 
-def test_folds_keep_the_polish_where_it_helps_and_drop_it_where_not(case: Case, problem: Problem) -> None:
-    """From 10 % off the polish predicts better over all; what costs too much is left out with a note."""
+def test_folds_keep_the_refinement_where_it_helps_and_drop_it_where_not(case: Case, problem: Problem) -> None:
+    """From 10 % off the refinement predicts better over all; what costs too much is left out with a note."""
     off = choose(problem, At(case.theta * 1.1, case.latency_s), Budget(), 0, 40, 0)
-    assert off.chosen == "polish"
-    assert np.prod(off.errors["polish"]) < 0.75 * np.prod(off.errors["search"])
+    assert off.chosen == "refinement"
+    assert np.prod(off.errors["refinement"]) < 0.75 * np.prod(off.errors["search"])
     assert set(off.to_json()) == {"chosen", "errors", "window_s", "steps"}
     truth = prediction_error(problem, [(case.theta, case.latency_s), (case.theta * 1.1, case.latency_s)], 40)
     assert truth[0] < truth[1]
     dear = choose(problem, At(case.theta, case.latency_s), Budget(), 0, 40, 10**10)
-    assert dear.chosen == "polish" and "left out" in dear.note
+    assert dear.chosen == "refinement" and "left out" in dear.note
 
 
 def test_a_search_that_is_kept_gets_start_states_and_intervals(case: Case, problem: Problem) -> None:
@@ -104,7 +104,7 @@ def test_a_search_that_is_kept_gets_start_states_and_intervals(case: Case, probl
     smoothed = shooting.smoothed()
     there = at_parameters(problem, searched.estimate, searched.latency_s, 40, smoothed)
     assert there.theta == pytest.approx(case.theta)
-    assert there.normal.cost < shooting.costs([shooting.start(case.theta, case.latency_s, smoothed)])[0]
+    assert there.normal.cost < shooting.cost(shooting.start(case.theta, case.latency_s, smoothed))
     assert there.chi2 < 1.3 and not unexplained(there)
 
 
@@ -113,12 +113,12 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> 
     wrong = case.latency_s + 0.01
     problem = Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=wrong)
     search = At(case.theta, wrong)
-    result = Calibration(search, settings=Validation(halves=False)).run(
+    result = Calibration(search, settings=Validation(split_half=False)).run(
         problem, Budget(generations=16), np.random.default_rng(0)
     )
     assert search.runs >= 3
-    folds = result.provenance["folds"]
-    assert folds["chosen"] in ("search", "polish") and set(folds["errors"]) == {"search", "polish"}
+    folds = result.provenance["cross_validation"]
+    assert folds["chosen"] in ("search", "refinement") and set(folds["errors"]) == {"search", "refinement"}
     assert "diagnosis" in result.provenance
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
@@ -130,12 +130,12 @@ def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(case: Case) 
         case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s, known_std=chosen
     )
     search = At(case.theta * 1.05, case.latency_s)
-    result = Calibration(search, settings=Validation(halves=False, diagnosis=False)).run(
+    result = Calibration(search, settings=Validation(split_half=False, diagnosis=False)).run(
         problem, Budget(generations=15), np.random.default_rng(0)
     )
     assert result.chi2 < 0.5
-    folds = result.provenance["folds"]
-    assert set(folds["errors"]) == {"search", "polish"} and search.runs == 3
+    folds = result.provenance["cross_validation"]
+    assert set(folds["errors"]) == {"search", "refinement"} and search.runs == 3
     means = {name: np.prod(errors) for name, errors in folds["errors"].items()}
     assert folds["chosen"] == min(means, key=lambda name: means[name])
 
@@ -148,7 +148,7 @@ def test_huber_weights_by_hand() -> None:
     assert kurtosis([np.array([1.0, -1.0])]) == 1.0
 
 
-def test_robust_polish_shrugs_off_wild_samples(case: Case, problem: Problem, polished: Polished) -> None:
+def test_robust_refinement_shrugs_off_wild_samples(case: Case, problem: Problem, refined: Refined) -> None:
     """A cart sample in the middle of each window off by 10 mm: Huber's loss stays nearer to the clean fit."""
     wild = case.fit.position.copy()
     wild[20::40, 0] += 1e-2
@@ -158,12 +158,12 @@ def test_robust_polish_shrugs_off_wild_samples(case: Case, problem: Problem, pol
     )  # fmt: skip
     # The noise is that of the clean recording: an outlier is what noise does not make.
     spoilt.noise, spoilt.starts = problem.noise, problem.starts
-    shooting = Shooting(spoilt, polished.shooting.length)
-    point = shooting.start(polished.theta, case.latency_s, polished.shooting.states(polished.point))
-    plain = polish_windows(shooting, point, 6, fixed_latency=True)
+    shooting = Shooting(spoilt, refined.shooting.length)
+    point = shooting.start(refined.theta, case.latency_s, refined.shooting.states(refined.point))
+    plain = refine_windows(shooting, point, 6, fixed_latency=True)
     assert kurtosis(plain.normal.residual) > 6.0
-    robust = polish_robust(plain, fixed_latency=True)
-    scaled = [spoilt.space.to_scale(p.theta) for p in (polished, plain, robust)]
+    robust = refine_robust(plain, fixed_latency=True)
+    scaled = [spoilt.space.to_scale(p.theta) for p in (refined, plain, robust)]
     assert np.linalg.norm(scaled[2] - scaled[0]) < 0.5 * np.linalg.norm(scaled[1] - scaled[0])
     # What it leaves out of the loss it does not leave out of the verdict.
     assert robust.chi2 > 1.3

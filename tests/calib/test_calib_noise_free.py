@@ -1,4 +1,4 @@
-"""The polish from exact states: its basin, the whole step of latency, windows that nothing explains."""
+"""The refinement from exact states: its basin, the whole step of latency, windows that nothing explains."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import polish
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.uncertainty.intervals import MISMATCH
 from deal_hw.calib.uncertainty.time_steps import scan_latency
 from deal_hw.errors import InsufficientDataError
@@ -48,7 +48,7 @@ def test_a_factor_of_eight_off_and_a_step_late_comes_out_exact(seen: Seen) -> No
     """No search: from eight times the truth and the wrong whole step, all to 1e-6 and the latency right."""
     problem = Problem(seen.robot, seen.space, [seen.episode], threads=1)
     start = np.clip(seen.truth * [8.0, 0.15, 8.0], seen.space.low, seen.space.high)
-    found = polish(problem, start, 1.2 * STEP_S)
+    found = refine(problem, start, 1.2 * STEP_S)
     np.testing.assert_allclose(found.theta, seen.truth, rtol=1e-6)
     assert found.latency_s == 0.0
     assert found.chi2 < 1e-9
@@ -60,18 +60,18 @@ def test_a_window_that_nothing_explains_bends_no_parameter_and_is_not_silenced(s
     position[20:23, -1] += 1e-3
     wrong = dataclasses.replace(seen.episode, position=position)
     problem = Problem(seen.robot, seen.space, [wrong], threads=1, fixed_latency_s=0.0)
-    found = polish(problem, seen.truth * [1.1, 0.9, 1.1], 0.0, fixed_latency=True)
+    found = refine(problem, seen.truth * [1.1, 0.9, 1.1], 0.0, fixed_latency=True)
     np.testing.assert_allclose(found.theta, seen.truth, rtol=1e-4)
     assert found.chi2 > MISMATCH.chi2
 
 
-def test_the_scan_takes_the_polish_itself_at_its_own_step(seen: Seen) -> None:
-    """Only the neighbour is polished anew, and no weight is left for it."""
+def test_the_scan_takes_the_refinement_itself_at_its_own_step(seen: Seen) -> None:
+    """Only the neighbour is refined anew, and no weight is left for it."""
     problem = Problem(seen.robot, seen.space, [seen.episode], threads=1)
-    found = polish(problem, seen.truth * 1.05, 0.0)
+    found = refine(problem, seen.truth * 1.05, 0.0)
     scan = scan_latency(problem, found, None)
     assert scan.ticks == (0, 1)
-    assert scan.polished[0] is found
+    assert scan.refined[0] is found
     np.testing.assert_allclose(scan.weights, [1.0, 0.0], atol=1e-12)
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deal_hw.calib.data.checks import jumps, look, require_sensitive
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.sensitivity import jumps, look, require_visible
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -65,10 +65,10 @@ def test_parameters_are_told_apart_by_what_they_change(robot: RobotModel) -> Non
         ]
     )  # fmt: skip
     found = look(Problem(robot, space, [steps_of(robot)], threads=1, known_std=STD))
-    assert found.invisible == ("limit",) and found.faint == ("friction",)
+    assert found.unseen == ("limit",) and found.faint == ("friction",)
     assert found.effect[0] > 10
     with pytest.raises(ConfigurationError, match="sees limit"):
-        require_visible(found)
+        require_sensitive(found)
 
 
 def test_heldout_errors_are_in_metres(robot: RobotModel) -> None:

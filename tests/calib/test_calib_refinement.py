@@ -1,4 +1,4 @@
-"""The polish and what is said about its result, on recordings of the real device core with hidden truths."""
+"""The refinement and what is said of its result, on recordings of the real device core with hidden truths."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish
-from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.pipeline import Calibration, CalibrationRun, Refinement, conclusive, needs_no_search
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import SETTINGS, correlation_time, intervals, uncertainty
@@ -35,7 +35,7 @@ from deal_hw.types import FloatArray
 class Near(CalibrationMethod[Problem]):
     """A search that starts some percent off the truth: what is tested is what comes after it."""
 
-    name = "near"
+    name = "local"
 
     def __init__(self, theta: FloatArray, latency_s: float) -> None:
         self._theta, self._latency_s = theta, latency_s
@@ -53,7 +53,7 @@ class Near(CalibrationMethod[Problem]):
         theta = self._theta * np.exp(rng.normal(0.0, 0.05, len(self._theta)))
         interval = np.stack([problem.space.low, problem.space.high], axis=1)
         return CalibrationResult(
-            method="near",
+            method="local",
             space=problem.space,
             estimate=theta,
             interval=interval,
@@ -76,12 +76,12 @@ def noisy() -> Demonstration:
 def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[..., Problem]) -> None:
     """Residuals of the noise's size end the calibration only where they are white as noise is."""
     problem = small_problem()
-    found = polish(problem, problem.space.nominal, 0.0, fixed_latency=True)
+    found = refine(problem, problem.space.nominal, 0.0, fixed_latency=True)
     white = np.random.default_rng(0).normal(size=(8, 400, 2))
     # The same power with a memory, x[t] = 0.2 x[t - 1] + sqrt(1 - 0.2 ** 2) w[t]: autocorrelation time 1.5.
     pattern = lfilter([np.sqrt(1 - 0.2**2)], [1, -0.2], white, axis=1)
 
-    def leaving(residual: FloatArray) -> Polished:
+    def leaving(residual: FloatArray) -> Refined:
         normal = dataclasses.replace(found.normal, residual=(residual,))
         return dataclasses.replace(found, normal=normal, chi2=float(np.mean(residual**2)))
 
@@ -98,7 +98,7 @@ def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: De
     Refined from there the answer is up to 190 % off, at a chi2 of 1.68 instead of 0.92.
     """
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
-    best = polish(problem, noisy.theta, noisy.truth.latency_s)
+    best = refine(problem, noisy.theta, noisy.truth.latency_s)
     search = Near(problem.space.center, 0.0)
     run = CalibrationRun(
         problem=problem,
@@ -106,23 +106,23 @@ def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: De
         rng=np.random.default_rng(0),
         search=search,
         attempts=Restarts(search, np.random.default_rng(0), None),
-        settings=Validation(folds=False),
+        settings=Validation(cross_validation=False),
         local=best,
     )
     assert Refinement().best(run).theta == pytest.approx(best.theta, rel=0.01)
 
 
-def test_polish_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
+def test_refinement_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
     """Truth recovery: from 10 % off, all parameters within 0.01 % and the latency within a microsecond."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
     start = ideal.theta * np.exp(0.1 * np.cos(np.arange(9)))
-    found = polish(problem, start, 1e-3)
+    found = refine(problem, start, 1e-3)
     assert error_percent(found.theta, ideal.theta) < 0.01
     assert abs(found.latency_s - ideal.truth.latency_s) < 1e-6
     assert found.chi2 < 2.0
 
 
-def test_polish_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
+def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
     """Truth recovery with noise: mean error within 3 %, latency to the tick, 7 of 9 intervals hold."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     stages: list[str] = []
@@ -244,9 +244,10 @@ def test_intervals_of_what_the_data_cannot_see_are_the_ranges() -> None:
 def test_a_parameter_at_its_bound_is_reported() -> None:
     """The alarm names the parameter and says to widen the range."""
     space = _two()
+    residual = (np.random.default_rng(0).normal(size=(4, 50, 2)),)
     told = uncertainty(
-        space, np.array([1.0, 5.0]), 0.01, np.diag([1e4, 1e4, 1e8]), 1.0,
-        (np.random.default_rng(0).normal(size=(4, 50, 2)),), (0.0, 0.04),
+        space, np.array([1.0, 5.0]), 0.01,
+        Normal(1.0, 1, np.diag([1e4, 1e4, 1e8]), np.zeros(3), residual, np.zeros(3)), 1.0, (0.0, 0.04),
     )  # fmt: skip
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
     assert told.verdicts == ("identifiable", "identifiable")
@@ -291,7 +292,7 @@ def test_diverged_members_are_nan_and_the_others_untouched() -> None:
 def test_latency_scan_weighs_ticks_by_their_cost(ideal: Demonstration) -> None:
     """Costs 10 and 12 at chi2 1 weigh 1 : exp(-1)."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
-    at = polish(problem, ideal.theta, 0.0, (0.2,), iterations=1)
+    at = refine(problem, ideal.theta, 0.0, (0.2,), iterations=1)
     import dataclasses
 
     costs = [

@@ -1,4 +1,4 @@
-"""Open-loop fits, folds by motion and what goes with what, on two motions of a hinge with a hidden truth."""
+"""Output-error fits, folds by motion, what goes with what: two motions of a hinge with a hidden truth."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_horizon, prediction_rmse
-from deal_hw.calib.output_error_fits import OutputErrorFits, open_loop
+from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_output_error, prediction_rmse
+from deal_hw.calib.output_error_fits import OutputErrorFits, output_error_method
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Checkpoint
@@ -23,7 +23,7 @@ from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
 from deal_hw.cli.calibrate_model import Recordings, prepare_model
-from deal_hw.cli.calibrate_run import Narrowing
+from deal_hw.cli.calibrate_run import SpaceOverrides
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
@@ -82,8 +82,8 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    narrowing = Narrowing(free=(), known={}, ranges=(), xi=None)
-    work = prepare_model(source, (), narrowing, std=lambda robot: None, threads=1, quiet=True)
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=None)
+    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1, quiet=True)
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 
@@ -91,7 +91,7 @@ def test_a_long_fit_finds_parameters_and_latency_and_says_how_far_predictions_ar
     problem: Problem,
 ) -> None:
     """Damping and friction come within 2 and 10 %, the latency within 1 ms, the residual near the noise."""
-    fit = fit_horizon(problem, problem.space.nominal, 0.0, Recipe())
+    fit = fit_output_error(problem, problem.space.nominal, 0.0, Recipe())
     assert fit.theta[0] == pytest.approx(TRUTH[0], rel=0.02)
     assert fit.theta[1] == pytest.approx(TRUTH[1], rel=0.1)
     assert fit.latency_s == pytest.approx(LATE_S, abs=1e-3)
@@ -111,7 +111,8 @@ def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem
     )
     spoilt.starts = problem.starts
     plain, robust = (
-        fit_horizon(spoilt, TRUTH, LATE_S, Recipe(seconds=1.0, robust=wanted)) for wanted in (False, True)
+        fit_output_error(spoilt, TRUTH, LATE_S, Recipe(seconds=1.0, robust=wanted))
+        for wanted in (False, True)
     )
     off = [np.abs(np.log(fit.theta / TRUTH)).max() for fit in (plain, robust)]
     assert off[1] < 0.05 and off[1] < off[0]
@@ -126,7 +127,9 @@ def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
 
 def searching(folds: bool = True) -> Calibration:
     """Return the method without a local fit before its search."""
-    return Calibration(Eki(), "open-loop", Validation(local_first=False, folds=folds), fits=OutputErrorFits())
+    return Calibration(
+        Eki(), "output-error", Validation(local_first=False, cross_validation=folds), fits=OutputErrorFits()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +140,8 @@ def result(problem: Problem) -> CalibrationResult:
 
 def test_a_right_model_needs_no_search(problem: Problem) -> None:
     """The refined nominal values explain the recordings: no search, no alarm, the truth in the intervals."""
-    found = open_loop().run(problem, BUDGET, np.random.default_rng(0))
-    assert found.provenance["search"] == "local fit" and "folds" not in found.provenance
+    found = output_error_method().run(problem, BUDGET, np.random.default_rng(0))
+    assert found.provenance["search"] == "local fit" and "cross_validation" not in found.provenance
     assert found.alarms == () and 0.5 < found.chi2 < 1.3
     assert np.all(found.interval[:, 0] <= TRUTH) and np.all(found.interval[:, 1] >= TRUTH)
     assert found.estimate == pytest.approx(TRUTH, rel=0.02)
@@ -146,7 +149,7 @@ def test_a_right_model_needs_no_search(problem: Problem) -> None:
 
 def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationResult) -> None:
     """Every candidate has an error in each fold, a fit wins, and the truth lies in the intervals."""
-    folds = result.provenance["folds"]
+    folds = result.provenance["cross_validation"]
     assert set(folds["errors"]) == {
         "search", "short", "long", "long, wide prior", "long, robust", "long, no latency",
         "mean of horizons", "mean of horizons, wide prior",
@@ -161,7 +164,7 @@ def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationRes
 
 def test_halves_of_a_right_model_agree(problem: Problem, result: CalibrationResult) -> None:
     """Two motions of one hinge: every parameter is compared, none is flagged."""
-    halves = result.provenance["halves"]
+    halves = result.provenance["split_half"]
     assert set(halves["parameters"]) == set(problem.space.names) and halves["flagged"] == []
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Polished, polish
+from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline import foretell
-from deal_hw.calib.uncertainty.intervals import statement, with_rows
-from deal_hw.calib.validation.split_half import Halves, compare_halves, half_of, heed
+from deal_hw.calib.uncertainty.intervals import uncertainty_at, with_rows
+from deal_hw.calib.validation.split_half import SplitHalf, check_split_half, half_of, widened_by_halves
 from deal_hw.calib.validation.verdict import Validation, judge
 from deal_hw.calibration import BEFORE_SEARCH, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
@@ -31,58 +31,58 @@ def problem(case: Case) -> Problem:
 
 
 @pytest.fixture(scope="module")
-def polished(case: Case, problem: Problem) -> Polished:
-    """Where the polish ends, in windows of 0.2 s."""
-    found = polish(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
+def refined(case: Case, problem: Problem) -> Refined:
+    """Where the refinement ends, in windows of 0.2 s."""
+    found = refine(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
     return with_rows(found)
 
 
-def test_halves_share_no_window_and_hold_all(problem: Problem, polished: Polished) -> None:
+def test_halves_share_no_window_and_hold_all(problem: Problem, refined: Refined) -> None:
     """Blocks of two windows go to either half in turn, with their start states."""
-    halves = [half_of(polished.shooting, polished.point, half, 2) for half in range(2)]
+    halves = [half_of(refined.shooting, refined.point, half, 2) for half in range(2)]
     starts = [set(s.data[0].windows.start.tolist()) for s, _ in halves]
     assert not starts[0] & starts[1]
-    assert starts[0] | starts[1] == set(polished.shooting.data[0].windows.start.tolist())
-    whole = polished.shooting.costs([polished.point])[0]
-    assert sum(s.costs([p])[0] for s, p in halves) == pytest.approx(whole)
+    assert starts[0] | starts[1] == set(refined.shooting.data[0].windows.start.tolist())
+    whole = refined.shooting.cost(refined.point)
+    assert sum(s.cost(p) for s, p in halves) == pytest.approx(whole)
     first = halves[0][0].data[0]
     assert len(first.measured) == len(first.windows) == len(halves[0][1].position[0])
 
 
-def test_halves_of_a_right_model_agree(problem: Problem, polished: Polished) -> None:
+def test_halves_of_a_right_model_agree(problem: Problem, refined: Refined) -> None:
     """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
-    known = statement(problem, polished, fixed_latency=True)
-    halves = compare_halves(problem, polished, known)
+    known = uncertainty_at(problem, refined, fixed_latency=True)
+    halves = check_split_half(problem, refined, known)
     assert halves.flagged == () and halves.alarms(problem.space) == () and halves.steps > 0
     assert [r.name for r in halves.rows] == list(problem.space.names)
     assert all(r.first[1] <= r.first[0] <= r.first[2] for r in halves.rows)
     assert set(halves.to_json()["parameters"]) == set(problem.space.names)
-    assert heed(problem, known, polished.theta, halves) is known
+    assert widened_by_halves(problem, known, refined.theta, halves) is known
 
 
 def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
-    case: Case, problem: Problem, polished: Polished
+    case: Case, problem: Problem, refined: Refined
 ) -> None:
     """A half whose stiffness lies ten standard deviations off: its interval is widened to it, and said."""
-    known = statement(problem, polished, fixed_latency=True)
+    known = uncertainty_at(problem, refined, fixed_latency=True)
     k = problem.space.names.index("servo.stiffness")
     std = np.sqrt(known.covariance[k, k])
-    far = problem.space.to_scale(polished.theta)
+    far = problem.space.to_scale(refined.theta)
     far = problem.space.from_scale(far + 10 * std * np.eye(len(problem.space))[k])[k]
     reach = np.zeros(len(problem.space))
     reach[k] = 10 * std
-    wide = heed(problem, known, polished.theta, Halves((), ("servo.stiffness",), reach))
+    wide = widened_by_halves(problem, known, refined.theta, SplitHalf((), ("servo.stiffness",), reach))
     assert wide.interval[k, 1] == pytest.approx(far)
     assert wide.interval[0] == pytest.approx(known.interval[0])
     assert any("disagree about servo.stiffness" in alarm.seen for alarm in wide.alarms)
 
 
-def test_too_few_windows_are_not_halved(case: Case, problem: Problem, polished: Polished) -> None:
+def test_too_few_windows_are_not_halved(case: Case, problem: Problem, refined: Refined) -> None:
     """Three windows: a note instead of rows."""
     few = dataclasses.replace(case.fit, usable=np.arange(len(case.fit.sample)) < 130)
     short = Problem(case.robot, case.space, [few], threads=1, fixed_latency_s=case.latency_s)
-    found = polish(short, case.theta, case.latency_s, (0.2,), iterations=1, fixed_latency=True)
-    halves = compare_halves(short, found, statement(short, found, fixed_latency=True))
+    found = refine(short, case.theta, case.latency_s, (0.2,), iterations=1, fixed_latency=True)
+    halves = check_split_half(short, found, uncertainty_at(short, found, fixed_latency=True))
     assert halves.rows == () and "too few" in halves.note
 
 
@@ -97,8 +97,8 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     assert case.truth is not None
     theta = np.array([case.truth.parameters[name] for name in space.names])
     problem = Problem(case.robot, space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
-    found = with_rows(polish(problem, theta, case.latency_s, (0.2, 0.4), iterations=4, fixed_latency=True))
-    known, _ = judge(problem, found, statement(problem, found, fixed_latency=True), Validation())
+    found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4), iterations=4, fixed_latency=True))
+    known, _ = judge(problem, found, uncertainty_at(problem, found, fixed_latency=True), Validation())
     assert len(known.null_directions) == 2
     # The same is said before a search begins.
     said: list[Progress] = []

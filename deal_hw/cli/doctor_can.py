@@ -1,0 +1,126 @@
+"""What `deal-hw doctor` looks at on CAN: adapters, the bit rate, and what else is on the bus."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.transports.can_transport import CanAddress, CanTransport, can_links, open_can
+from deal_hw.drivers.transports.slcan_transport import serial_adapters
+from deal_hw.errors import TransportTimeoutError
+from deal_hw.findings import Finding, Level
+
+_BUSY = 0.7
+"""Share of the bus from which on late frames are to be expected."""
+
+
+def list_adapters() -> Iterator[Finding]:
+    """Yield the CAN adapters of this computer."""
+    details = _ip_details()
+    for name in can_links():
+        yield _judge_link(name, details.get(name, {}))
+    for device, kind in serial_adapters():
+        yield Finding("can", Level.OK, f"slcan:{device}: {kind}")
+
+
+def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
+    """Yield what is heard on a bus while nothing is sent.
+
+    Args:
+        transport: The bus without a filter, not opened.
+        clock: For the waiting.
+        seconds: How long to listen [s].
+        nodes: Numbers that the robot is expected under.
+
+    Raises:
+        TransportError: The adapter cannot be opened, or is lost.
+    """
+    address = transport.address
+    frames: Counter[int] = Counter()
+    bits = 0
+    with transport:
+        end_ns = clock.now_ns() + round(seconds * 1e9)
+        while (left_ns := end_ns - clock.now_ns()) > 0:
+            try:
+                message = transport.receive(left_ns / 1e9)
+            except TransportTimeoutError:
+                break
+            frames[int(message.channel, 16) >> 5] += 1
+            bits += 47 + 8 * len(message.payload)
+    rate = "" if address.interface == "socketcan" else f" at {address.bitrate} bit/s"
+    if not frames:
+        trouble = f" ({transport.trouble})" if transport.trouble else ""
+        yield Finding(
+            "can", Level.WARN, f"{transport.port}: no frame within {seconds:g} s{rate}{trouble}",
+            "is the device powered, is it this bit rate, are CAN-H and CAN-L the right way round, is there a "
+            "resistor of 120 ohm at both ends?",
+        )  # fmt: skip
+        return
+    share = bits / seconds / address.bitrate
+    busy = share > _BUSY
+    yield Finding(
+        "can", Level.WARN if busy else Level.OK,
+        f"{transport.port}: {sum(frames.values()) / seconds:.0f} frames a second{rate}, "
+        f"at least {share:.0%} of {address.bitrate} bit/s",
+        "use a higher bit rate, or take other devices off the bus" if busy else "",
+    )  # fmt: skip
+    if foreign := sorted(set(frames) - set(nodes)):
+        told = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])
+        yield Finding("can", Level.NOTE, f"other nodes on the bus: {told}", "they are filtered out")
+    if missing := sorted(set(nodes) - set(frames)):
+        heard = ", ".join(map(str, sorted(frames)))
+        yield Finding(
+            "can", Level.WARN, f"nothing comes from node {', '.join(map(str, missing))}; heard: {heard}",
+            f"give the number in the port: {transport.port.partition('?')[0]}?node=NUMBER",
+        )  # fmt: skip
+    if transport.error_frames:
+        yield Finding(
+            "can", Level.WARN, f"{transport.error_frames} errors on the bus; the last: {transport.trouble}",
+            "check wiring, termination and bit rate",
+        )  # fmt: skip
+
+
+def examine_can(port: str, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
+    """Yield what is heard on the bus of a port; arguments and errors as :func:`listen_to_bus`."""
+    address = CanAddress.parse(port)
+    given = (address.node, address.encoder)
+    expected = [usual if own is None else own for usual, own in zip(nodes, given, strict=False)]
+    yield from listen_to_bus(open_can(port, clock), clock, seconds, *expected)
+
+
+def _ip_details() -> dict[str, dict[str, Any]]:
+    """Return what ``ip`` tells of CAN interfaces; nothing where it is missing."""
+    if shutil.which("ip") is None:
+        return {}
+    done = subprocess.run(
+        ["ip", "-details", "-json", "link", "show", "type", "can"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    try:
+        links = json.loads(done.stdout or "[]")
+        return {link["ifname"]: link.get("linkinfo", {}).get("info_data", {}) for link in links}
+    except (ValueError, KeyError, AttributeError, TypeError):
+        return {}
+
+
+def _judge_link(name: str, details: dict[str, Any]) -> Finding:
+    state = str(details.get("state", "")) or "state unknown"
+    bitrate = details.get("bittiming", {}).get("bitrate")
+    text = f"socketcan:{name}: {state.lower()}" + (f", {bitrate} bit/s" if bitrate else "")
+    if state == "STOPPED":
+        remedy = f"ip link set {name} up type can bitrate 500000 restart-ms 100"
+        return Finding("can", Level.WARN, text, remedy)
+    if state in ("BUS-OFF", "ERROR-PASSIVE", "ERROR-WARNING"):
+        remedy = f"check wiring, termination and bit rate; ip link set {name} type can restart-ms 100"
+        return Finding("can", Level.WARN, text, remedy)
+    if details and not details.get("restart_ms"):
+        remedy = f"after bus-off it stays off: ip link set {name} type can restart-ms 100"
+        return Finding("can", Level.NOTE, text, remedy)
+    return Finding("can", Level.OK, text)

@@ -1,0 +1,317 @@
+"""The cart-pole's messages as classic CAN frames: assets/cartpole.dbc and docs/protocol-cartpole-can.md.
+
+A state takes five frames, a target three and an info five. The last frame of each carries a CRC over all of
+them: a sample that lost a frame, or mixes two samples, is refused as a whole.
+"""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import cantools
+from fastcrc import crc16
+
+from deal_hw.drivers.cartpole import protocol
+from deal_hw.errors import ConfigurationError, FrameError
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message as DbcMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Angle:
+    """The pole's encoder alone, where a motor drive has the cart: one sample.
+
+    Attributes:
+        sequence: Low byte of the sample's number.
+        device_us: Low 32 bits of the encoder's time.
+        pole_urad: Pole angle, 0 upright, not wrapped.
+        pole_urad_s: Pole velocity.
+        status: Bits of :class:`deal_hw.types.Status`, of which it knows homing and homed.
+    """
+
+    sequence: int
+    device_us: int
+    pole_urad: int
+    pole_urad_s: int
+    status: int
+
+
+CanMessage = protocol.AnyMessage | Angle
+NODE: Final = 1
+LAST_NODE: Final = 62
+"""Numbers are 1 to 62: 0 would take ids that CANopen uses for its network, 63 is a new ODrive's."""
+STATES_PER_HEARTBEAT: Final = 20
+FRAME: Final = struct.Struct("<IB3x8s")
+"""One frame as bytes: Linux' ``struct can_frame``, id, length and eight data bytes."""
+_NUMBER_BITS: Final = 5
+_DEVICE_TIME: Final = 2**48 - 1
+_DBC_NODE: Final = 1
+_GROUPS: Final[dict[str, type[CanMessage]]] = {
+    "Stop": protocol.Stop, "Target": protocol.Target, "Arm": protocol.Arm, "Home": protocol.Home,
+    "Hello": protocol.Hello, "State": protocol.State, "Ack": protocol.Ack, "Info": protocol.Info,
+    "Angle": Angle,
+}  # fmt: skip
+_LENGTHS: Final = {"Target": 3, "State": 5, "Info": 5, "Angle": 2}
+
+
+@functools.cache
+def database() -> dict[str, DbcMessage]:
+    """Return the frames of assets/cartpole.dbc by name."""
+    loaded = cantools.database.load_file(Path(__file__).parent / "assets" / "cartpole.dbc")
+    assert isinstance(loaded, cantools.database.can.Database)
+    return {message.name: message for message in loaded.messages}
+
+
+def frame_id(name: str, node: int) -> int:
+    """Return the id of a frame of the DBC for a node."""
+    return (node << _NUMBER_BITS) | (database()[name].frame_id & 0x1F)
+
+
+def accept(*nodes: int) -> tuple[tuple[int, int], ...]:
+    """Return the filter, ids and masks, that lets through what nodes with these numbers send and get."""
+    return tuple((node << _NUMBER_BITS, 0x7FF & ~0x1F) for node in nodes)
+
+
+def check_node(node: int) -> int:
+    """Return a node's number.
+
+    Raises:
+        ConfigurationError: It is none.
+    """
+    if not 1 <= node <= LAST_NODE:
+        raise ConfigurationError(f"node {node}: CAN nodes of deal-hw are numbered 1 to {LAST_NODE}")
+    return node
+
+
+class CanLink:
+    """One side of a CAN wire; bytes are whole frames as :data:`FRAME` lays them out.
+
+    Attributes:
+        errors: Messages that were corrupt or unknown so far.
+        torn: Messages that lost a frame so far. A state's number tells a host that it is missing.
+        fault: Two devices under one number; "" for nothing.
+
+    Args:
+        node: The device's number.
+        version: Of the protocol, for devices under test.
+        unique_id: The device's serial number, for its heartbeat; a host has none.
+    """
+
+    resync: ClassVar[bytes] = b""
+
+    def __init__(self, node: int = NODE, version: int = protocol.VERSION, unique_id: int = 0) -> None:
+        self.errors = self.torn = 0
+        self.fault = ""
+        self._node, self._version, self._unique_id = check_node(node), version, unique_id
+        self._names = {frame_id(name, node): name for name in database()}
+        self._parts: dict[str, list[bytes] | None] = {}
+        self._heard: int | None = None
+
+    @property
+    def hint(self) -> str:
+        """What to check where frames come but no answer."""
+        return (
+            f"node {self._node} sends, but does not answer in this protocol; is it another device, or does "
+            "its firmware have another DBC?"
+        )
+
+    def encode(self, message: CanMessage) -> bytes:
+        """Return a message's frames; every twentieth sample is followed by a heartbeat.
+
+        Raises:
+            FrameError: A value does not fit its field.
+        """
+        group = type(message).__name__
+        values = _to_values(message, self._version)
+        names = _frames_of(group)
+        try:
+            parts = [_pack(name, values) for name in names]
+        except (cantools.database.EncodeError, KeyError, UnicodeEncodeError) as error:
+            raise FrameError(f"{message} does not fit its frames: {error}") from error
+        if len(parts) > 1:
+            parts[-1] = parts[-1][:-2] + self._crc(group, parts).to_bytes(2, "little")
+        out = b"".join(self._frame(name, part) for name, part in zip(names, parts, strict=True))
+        if isinstance(message, protocol.State | Angle) and message.sequence % STATES_PER_HEARTBEAT == 0:
+            out += self._status(message)
+        return out
+
+    def decode(self, data: bytes) -> Iterator[protocol.AnyMessage]:
+        """Take frames; return the messages that they complete, and count what is none."""
+        return (message for message in self.decode_all(data) if not isinstance(message, Angle))
+
+    def feasible(self, target: protocol.Target) -> protocol.Target:
+        """Return a target as this wire carries it."""
+        return target
+
+    def decode_all(self, data: bytes) -> Iterator[CanMessage]:
+        """Do the same with messages that only CAN has."""
+        if len(data) % FRAME.size:
+            self.errors += 1
+            return
+        for identifier, length, payload in FRAME.iter_unpack(data):
+            if identifier >> _NUMBER_BITS != self._node:
+                continue
+            name = self._names.get(identifier)
+            if name is None or length != database()[name].length:
+                self.errors += 1
+            elif name == "Heartbeat":
+                self._take_heartbeat(payload)
+            elif name != "Errors" and (message := self._take(name, payload[:length])) is not None:
+                yield message
+
+    def _take(self, name: str, part: bytes) -> CanMessage | None:
+        group = name.rstrip("0123456789")
+        names = _frames_of(group)
+        index = names.index(name)
+        parts = self._parts.get(group)
+        if index == 0:
+            # A first frame while others are missing: that message is torn.
+            self.torn += bool(parts)
+            parts = self._parts[group] = []
+        if parts is None:
+            return None  # The rest of a message whose beginning is lost or was not heard.
+        if len(parts) != index:
+            self.torn += 1
+            self._parts[group] = None
+            return None
+        parts.append(part)
+        if len(parts) < len(names):
+            return None
+        self._parts[group] = None
+        try:
+            return self._assemble(group, names, parts)
+        except (ValueError, FrameError):
+            self.errors += 1
+            return None
+
+    def _assemble(self, group: str, names: Sequence[str], parts: list[bytes]) -> CanMessage:
+        if len(parts) > 1 and self._crc(group, parts) != int.from_bytes(parts[-1][-2:], "little"):
+            raise FrameError(f"{group}: its frames do not belong together, or one is corrupt")
+        values: dict[str, int] = {}
+        for name, part in zip(names, parts, strict=True):
+            values |= database()[name].decode_simple(part, decode_choices=False, scaling=False)  # type: ignore[arg-type]
+        # Who a peer is can be asked, and a motor switched off, in any version.
+        timeless = (protocol.Hello, protocol.Info, protocol.Stop)
+        if _GROUPS[group] not in timeless and values.get("Version", self._version) != self._version:
+            raise FrameError(f"{group}: of version {values['Version']}, this side speaks {self._version}")
+        return _from_values(_GROUPS[group], values)
+
+    def _crc(self, group: str, parts: Sequence[bytes]) -> int:
+        # The version goes in, so that the frames of another version are refused; that of info never does.
+        version = 0 if group == "Info" else self._version
+        return crc16.ibm_3740(bytes([version]) + b"".join(parts)[:-2])
+
+    def _take_heartbeat(self, payload: bytes) -> None:
+        unique_id = int.from_bytes(payload[:4], "little")
+        if self._heard is None:
+            self._heard = unique_id
+        elif unique_id != self._heard:
+            self.fault = (
+                f"two devices use node {self._node} (0x{self._heard:08x} and 0x{unique_id:08x}); give one of "
+                "them another number, or take it off the bus"
+            )
+
+    def _status(self, state: protocol.State | Angle) -> bytes:
+        low = self._unique_id & 0xFFFF_FFFF
+        zero = {"TransmitErrors": 0, "ReceiveErrors": 0}
+        heartbeat = {"UniqueIdLow": low, "Version": self._version, "Status": state.status, **zero}
+        out = self._frame("Heartbeat", _pack("Heartbeat", heartbeat))
+        if self.errors or self.torn:
+            counts = {"ReceiveOverflows": 0, "BusOffs": 0, "TransmitDrops": 0}
+            torn = {"TornMessages": min(self.errors + self.torn, 0xFFFF), **counts}
+            out += self._frame("Errors", _pack("Errors", torn))
+        return out
+
+    def _frame(self, name: str, part: bytes) -> bytes:
+        return FRAME.pack(frame_id(name, self._node), len(part), part)
+
+
+def _frames_of(group: str) -> tuple[str, ...]:
+    count = _LENGTHS.get(group, 0)
+    return tuple(f"{group}{k}" for k in range(1, count + 1)) or (group,)
+
+
+def _pack(name: str, values: dict[str, int]) -> bytes:
+    message = database()[name]
+    return message.encode({s.name: values[s.name] for s in message.signals}, scaling=False, strict=True)
+
+
+def _to_values(message: CanMessage, version: int) -> dict[str, int]:
+    match message:
+        case protocol.State():
+            return {
+                "Sequence": message.sequence, "CommandSequence": message.command_sequence,
+                "DeviceTime": message.device_us & _DEVICE_TIME, "Status": message.status,
+                "SequenceLow": message.sequence & 0xFF, "CartPosition": message.cart_um,
+                "CartVelocity": message.cart_um_s, "PolePosition": message.pole_urad,
+                "PoleVelocity": message.pole_urad_s, "Effort": message.effort_mn,
+                "CommandAge": message.command_age_us, "Crc": 0,
+            }  # fmt: skip
+        case Angle():
+            return {
+                "PoleAngle": message.pole_urad, "PoleRate": message.pole_urad_s,
+                "DeviceTimeLow": message.device_us & 0xFFFF_FFFF, "SequenceByte": message.sequence & 0xFF,
+                "Status": message.status, "Crc": 0,
+            }  # fmt: skip
+        case protocol.Target():
+            return {
+                "Sequence": message.sequence, "Position": message.position_um,
+                "Stiffness": message.stiffness_mn_m, "Damping": message.damping_mns_m,
+                "EffortLimit": message.effort_limit_mn, "SpeedLimit": message.speed_limit_um_s, "Crc": 0,
+            }  # fmt: skip
+        case protocol.Info():
+            kind = message.kind.encode("ascii")
+            if len(kind) > 16:
+                raise FrameError(f"a device kind has at most 16 characters, got {message.kind!r}")
+            major, minor, patch = message.firmware
+            # A device of another version says so, whatever the message was made with.
+            told = version if message.version == protocol.VERSION else message.version
+            return {
+                "Request": message.request, "Version": told, "DeviceRate": message.device_rate_hz,
+                "StateRate": message.state_rate_hz, "Kind1": int.from_bytes(kind[:8], "little"),
+                "Kind2": int.from_bytes(kind[8:], "little"), "UniqueId": message.unique_id,
+                "Major": major, "Minor": minor, "Patch": patch, "Crc": 0,
+            }  # fmt: skip
+        case protocol.Ack():
+            return {
+                "Request": message.request, "Of": message.of, "Result": message.result, "Version": version,
+            }  # fmt: skip
+        case protocol.Hello():
+            return {"Request": message.request, "Version": message.version}
+        case _:
+            return {"Request": message.request, "Version": version}
+
+
+def _from_values(kind: type[CanMessage], v: dict[str, int]) -> CanMessage:
+    if kind is protocol.State:
+        if v["SequenceLow"] != v["Sequence"] & 0xFF:
+            raise FrameError("State: its frames have different numbers")
+        return protocol.State(
+            v["Sequence"], v["DeviceTime"], v["CartPosition"], v["CartVelocity"], v["PolePosition"],
+            v["PoleVelocity"], v["Effort"], v["Status"], v["CommandSequence"], v["CommandAge"],
+        )  # fmt: skip
+    if kind is protocol.Target:
+        return protocol.Target(
+            v["Sequence"], v["Position"], v["Stiffness"], v["Damping"], v["EffortLimit"], v["SpeedLimit"]
+        )
+    if kind is Angle:
+        return Angle(v["SequenceByte"], v["DeviceTimeLow"], v["PoleAngle"], v["PoleRate"], v["Status"])
+    if kind is protocol.Info:
+        text = v["Kind1"].to_bytes(8, "little") + v["Kind2"].to_bytes(8, "little")
+        return protocol.Info(
+            v["Request"], text.rstrip(b"\0").decode("ascii"), (v["Major"], v["Minor"], v["Patch"]),
+            v["DeviceRate"], v["StateRate"], v["UniqueId"], v["Version"],
+        )  # fmt: skip
+    if kind is protocol.Ack:
+        return protocol.Ack(v["Request"], protocol.MessageType(v["Of"]), protocol.Result(v["Result"]))
+    if kind is protocol.Hello:
+        return protocol.Hello(v["Request"], v["Version"])
+    if kind is protocol.Arm:
+        return protocol.Arm(v["Request"])
+    return protocol.Stop(v["Request"]) if kind is protocol.Stop else protocol.Home(v["Request"])

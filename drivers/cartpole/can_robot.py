@@ -1,0 +1,95 @@
+"""The cart-pole on CAN: its robot, and CAN frames as the stream of bytes that it speaks."""
+
+from __future__ import annotations
+
+import contextlib
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink, accept, check_node
+from deal_hw.drivers.cartpole.robot import CartpoleRobot
+from deal_hw.drivers.transports.can_transport import CanAddress, CanTransport, open_can
+from deal_hw.drivers.transports.listen_only import listen_only
+from deal_hw.errors import TransportError
+from deal_hw.transport import Message, Transport
+
+_MOST_AT_ONCE = 256
+
+
+class CanFrames(Transport):
+    """CAN frames as a stream of bytes, each frame as Linux' ``struct can_frame``; the channel is "".
+
+    Args:
+        inner: The bus.
+    """
+
+    def __init__(self, inner: CanTransport) -> None:
+        self._inner = inner
+
+    @property
+    def port(self) -> str:
+        """Where the bus is."""
+        return self._inner.port
+
+    @property
+    def trouble(self) -> str:
+        """What the adapter last reported."""
+        return self._inner.trouble
+
+    @property
+    def error_frames(self) -> int:
+        """How often the adapter reported an error."""
+        return self._inner.error_frames
+
+    def open(self) -> None:
+        """Open the bus."""
+        self._inner.open()
+
+    def close(self) -> None:
+        """Close the bus."""
+        self._inner.close()
+
+    def reopen(self) -> None:
+        """Open the bus again where it was lost."""
+        self._inner.reopen()
+
+    def send(self, message: Message) -> None:
+        """Send frames one after the other; after one that fails the rest stays."""
+        for identifier, length, data in FRAME.iter_unpack(message.payload):
+            self._inner.send(Message(f"{identifier:03X}", data[:length], message.stamp_ns))
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return all frames at hand, waiting for the first; the stamp is that of the last."""
+        frame = self._inner.receive(timeout_s)
+        frames = [_pack(frame)]
+        # What goes wrong after the first frame shows in the next call.
+        with contextlib.suppress(TransportError):
+            while len(frames) < _MOST_AT_ONCE:
+                frame = self._inner.receive(0.0)
+                frames.append(_pack(frame))
+        return Message("", b"".join(frames), frame.stamp_ns)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the bus; -1: each process opens its own path."""
+        return self._inner.fileno()
+
+
+def can_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool = True) -> CartpoleRobot:
+    """Return a cart-pole on a CAN bus; nothing is opened yet.
+
+    Args:
+        port: Such as ``socketcan:can0?node=3`` or ``slcan:/dev/ttyACM0?bitrate=1000000``.
+        clock: Gives the stamps.
+        fd: Descriptor of a serial adapter that a parent process opened.
+        can_send: False for a robot that is only listened to.
+
+    Raises:
+        ConfigurationError: The port means nothing.
+    """
+    given = CanAddress.parse(port).node
+    node = check_node(NODE if given is None else given)
+    frames = CanFrames(open_can(port, clock, accept(node), fd))
+    return CartpoleRobot(frames if can_send else listen_only(frames), clock, link=lambda: CanLink(node))
+
+
+def _pack(message: Message) -> bytes:
+    return FRAME.pack(int(message.channel, 16), len(message.payload), message.payload)

@@ -1,0 +1,160 @@
+"""The firmware's C core, compiled for this host, in place of the one in Python."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable
+
+from deal_hw.drivers.cartpole import native
+from deal_hw.drivers.cartpole.controller import Mode
+from deal_hw.drivers.cartpole.description import (
+    DAMPING_NS_M,
+    EFFORT_LIMIT_N,
+    SPEED_LIMIT_M_S,
+    STIFFNESS_N_M,
+)
+from deal_hw.drivers.cartpole.mechanics import Mechanics
+from deal_hw.drivers.cartpole.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.truth import Truth, unique_id
+
+_I32 = 0x7FFF_FFFF
+_MODES = (Mode.IDLE, Mode.HOMING, Mode.ARMED)
+_ONE = 65536
+_DRAW = ctypes.CFUNCTYPE(ctypes.c_uint16)
+_INSTALL = "apt-get install gcc libc6-dev, or set CC, or use --firmware python"
+
+
+class Settings(ctypes.Structure):
+    """``cartpole_settings`` of cartpole.h."""
+
+    _fields_ = [
+        ("stiffness_trim", ctypes.c_uint32), ("damping_trim", ctypes.c_uint32),
+        ("effort_trim", ctypes.c_uint32), ("speed_trim", ctypes.c_uint32),
+        ("unique_id", ctypes.c_uint32), ("delay_ticks", ctypes.c_uint16),
+    ]  # fmt: skip
+
+
+def settings_of(truth: Truth, delay_ticks: int) -> Settings:
+    """Return the settings of a device with this truth: its trims are what nobody told the host."""
+    nominal = {
+        "stiffness": STIFFNESS_N_M, "damping": DAMPING_NS_M,
+        "effort_limit": EFFORT_LIMIT_N, "speed_limit": SPEED_LIMIT_M_S,
+    }  # fmt: skip
+    trims = [round(truth.parameters[f"servo.{name}"] / value * _ONE) for name, value in nominal.items()]
+    return Settings(*trims, unique_id(truth), delay_ticks)
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """Return the core, compiled on the first call.
+
+    Raises:
+        ConfigurationError: There is no compiler, or it refuses the sources.
+    """
+    command = (native.compiler(), *native.CFLAGS, "-DCARTPOLE_QUEUE=256", "-shared", "-fPIC")
+    core = ctypes.CDLL(str(native.build("core.so", command, (*native.CORE, "host/core.c"), _INSTALL)))
+    device, integer, number, data = ctypes.c_char_p, ctypes.c_int32, ctypes.c_uint32, ctypes.c_char_p
+    for name, result, arguments in (
+        ("host_size", number, []),
+        ("host_init", None, [device, ctypes.POINTER(Settings), _DRAW]),
+        ("host_receive", number, [device, data, number, integer, integer, data]),
+        ("host_control", ctypes.c_int, [device, integer, integer, ctypes.POINTER(ctypes.c_int64)]),
+        ("host_report", number, [device, *[integer] * 5, ctypes.c_int, data]),
+        ("host_look", None, [device, integer * 6]),
+    ):
+        function = getattr(core, name)
+        function.restype, function.argtypes = result, arguments
+    return core
+
+
+class HostFirmware:
+    """The C core behind the interface of the emulator.
+
+    Args:
+        settings: Trims and serial number.
+        command_delay: Called for every accepted target: it acts that many ticks after it was received.
+
+    Raises:
+        ConfigurationError: There is no compiler, or it refuses the sources.
+    """
+
+    def __init__(self, settings: Settings, command_delay: Callable[[], int]) -> None:
+        self._core = library()
+        self._device = ctypes.create_string_buffer(self._core.host_size())
+        self._draw = _DRAW(command_delay)  # The core keeps its address.
+        self._core.host_init(self._device, ctypes.byref(settings), self._draw)
+        self._force = ctypes.c_int64()
+        self._frame = ctypes.create_string_buffer(128)
+        self._looked = (ctypes.c_int32 * 6)()
+        self._look()
+
+    @classmethod
+    def of(cls, truth: Truth, mechanics: Mechanics) -> HostFirmware:
+        """Return the firmware of an emulated device."""
+        return cls(settings_of(truth, 0), mechanics.command_delay)
+
+    @property
+    def mode(self) -> Mode:
+        """What the motor does."""
+        return _MODES[self._looked[0]]
+
+    @property
+    def watchdog(self) -> bool:
+        """Whether the motor was stopped because commands stayed away, since it was last armed."""
+        return bool(self._looked[1])
+
+    @property
+    def frame_errors(self) -> int:
+        """Corrupt frames received so far."""
+        return self._looked[2]
+
+    @property
+    def homings(self) -> int:
+        """How often homing began."""
+        return self._looked[3]
+
+    @property
+    def armings(self) -> int:
+        """How often the motor was armed."""
+        return self._looked[4]
+
+    @property
+    def setpoint(self) -> float:
+        """Set-point of the servo [m]."""
+        return self._looked[5] / 1e9
+
+    def receive(self, data: bytes, motor: Motor) -> bytes:
+        """Handle what the host sent before this tick; return the answers."""
+        out = ctypes.create_string_buffer((len(data) // 5 + 2) * 65)
+        length = self._core.host_receive(self._device, data, len(data), *_integers(motor), out)
+        self._look()
+        return out.raw[:length]
+
+    def control(self, motor: Motor) -> tuple[float, bool]:
+        """Run one tick; return the force on the cart [N], and whether a state frame is due."""
+        due = self._core.host_control(self._device, *_integers(motor), ctypes.byref(self._force))
+        self._look()
+        return self._force.value * 1e-12, bool(due)
+
+    def report(self, reading: Reading) -> bytes:
+        """Return the state frame of the tick that :meth:`control` ran last."""
+        length = self._core.host_report(self._device, *reading[:4], _fit(reading.setpoint * 1e9),
+                                        reading.at_end_stop, self._frame)  # fmt: skip
+        return self._frame.raw[:length]
+
+    def finish_homing(self) -> None:
+        """Take note that the cart is in the middle and the pole upright; nothing happens unless homing."""
+        self._core.cartpole_finish_homing(self._device)
+        self._look()
+
+    def _look(self) -> None:
+        self._core.host_look(self._device, self._looked)
+
+
+def _integers(motor: Motor) -> tuple[int, int]:
+    return _fit(motor.position * 1e9), _fit(motor.velocity * 1e6)
+
+
+def _fit(value: float) -> int:
+    return min(max(round(value), -_I32), _I32)

@@ -1,0 +1,82 @@
+"""CANSimple: the public CAN frames of ODrive motor drives, as firmware 0.6 has them.
+
+An id is ``node * 32 + number``. Only what a cart-pole needs is here; ODrive publishes the whole as a DBC.
+"""
+
+from __future__ import annotations
+
+import enum
+import struct
+from typing import Final
+
+from deal_hw.drivers.cartpole.can_link import FRAME
+
+IDLE, CLOSED_LOOP = 1, 8
+"""States of an ODrive's axis."""
+POSITION_CONTROL, PASSTHROUGH = 3, 1
+READ, WRITE = 0, 1
+"""Opcodes of the frame that reads and writes an ODrive's settings."""
+NODE_SHIFT: Final = 5
+
+
+class Command(enum.IntEnum):
+    """Numbers of CANSimple frames, as firmware 0.6 has them."""
+
+    HEARTBEAT = 0x01
+    ESTOP = 0x02
+    RX_SDO = 0x04
+    TX_SDO = 0x05
+    SET_AXIS_STATE = 0x07
+    ENCODER_ESTIMATES = 0x09
+    SET_CONTROLLER_MODE = 0x0B
+    SET_INPUT_POS = 0x0C
+    SET_LIMITS = 0x0F
+    CLEAR_ERRORS = 0x18
+    SET_POS_GAIN = 0x1A
+    SET_VEL_GAINS = 0x1B
+    TORQUES = 0x1C
+
+
+LAYOUT: Final = {
+    Command.HEARTBEAT: struct.Struct("<IBBBx"), Command.ESTOP: struct.Struct(""),
+    Command.RX_SDO: struct.Struct("<BHx4s"), Command.TX_SDO: struct.Struct("<xHx4s"),
+    Command.SET_AXIS_STATE: struct.Struct("<I"), Command.ENCODER_ESTIMATES: struct.Struct("<ff"),
+    Command.SET_CONTROLLER_MODE: struct.Struct("<II"), Command.SET_INPUT_POS: struct.Struct("<fhh"),
+    Command.SET_LIMITS: struct.Struct("<ff"), Command.CLEAR_ERRORS: struct.Struct("<B"),
+    Command.SET_POS_GAIN: struct.Struct("<f"), Command.SET_VEL_GAINS: struct.Struct("<ff"),
+    Command.TORQUES: struct.Struct("<ff"),
+}  # fmt: skip
+"""Data of each frame; rev, rev/s, N*m, A."""
+
+
+class AxisError(enum.IntFlag):
+    """Error bits of an ODrive, as firmware 0.6 has them."""
+
+    INITIALIZING = 0x1
+    SYSTEM_LEVEL = 0x2
+    TIMING_ERROR = 0x4
+    MISSING_ESTIMATE = 0x8
+    BAD_CONFIG = 0x10
+    DRV_FAULT = 0x20
+    MISSING_INPUT = 0x40
+    DC_BUS_OVER_VOLTAGE = 0x100
+    DC_BUS_UNDER_VOLTAGE = 0x200
+    DC_BUS_OVER_CURRENT = 0x400
+    DC_BUS_OVER_REGEN_CURRENT = 0x800
+    CURRENT_LIMIT_VIOLATION = 0x1000
+    MOTOR_OVER_TEMP = 0x2000
+    INVERTER_OVER_TEMP = 0x4000
+    VELOCITY_LIMIT_VIOLATION = 0x8000
+    POSITION_LIMIT_VIOLATION = 0x1_0000
+    WATCHDOG_TIMER_EXPIRED = 0x100_0000
+    ESTOP_REQUESTED = 0x200_0000
+    SPINOUT_DETECTED = 0x400_0000
+    BRAKE_RESISTOR_DISARMED = 0x800_0000
+    THERMISTOR_DISCONNECTED = 0x1000_0000
+    CALIBRATION_ERROR = 0x4000_0000
+
+
+def pack(node: int, command: Command, *values: float | bytes) -> bytes:
+    """Return a CANSimple frame as :data:`FRAME` lays it out."""
+    data = LAYOUT[command].pack(*values)
+    return FRAME.pack(node << NODE_SHIFT | command, len(data), data)

@@ -1,0 +1,342 @@
+"""CAN frames: what every adapter has in common, and the adapters that python-can drives.
+
+Serial adapters (slcan) are in :mod:`deal_hw.drivers.transports.slcan_transport`.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import errno
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import parse_qsl
+
+import can
+
+from deal_hw.clock import Clock, MonotonicClock
+from deal_hw.errors import (
+    ConfigurationError,
+    PortNotFoundError,
+    TransportError,
+    TransportLostError,
+    TransportTimeoutError,
+    UnknownNameError,
+)
+from deal_hw.transport import Message, Transport
+
+BITRATE: Final = 500_000
+_SETTINGS: Final = (
+    "bitrate", "node", "encoder", "mm_per_turn", "kv", "enable_watchdog", "watchdog_timeout",
+)  # fmt: skip
+_NOT_SET_HERE: Final = ("socketcan", "virtual", "udp_multicast")
+"""Interfaces whose bit rate the system sets (``ip link``), or that have none."""
+_CAN_LINK: Final = "280"
+"""Type of a CAN interface in /sys/class/net (ARPHRD_CAN)."""
+NO_ACKNOWLEDGE: Final = (
+    "no other node acknowledges: is the device powered, does it use this bit rate, are both ends of the bus "
+    "terminated (60 ohm between CAN-H and CAN-L)?"
+)
+BUS_OFF: Final = (
+    "the controller went bus-off after too many errors; check wiring, termination and bit rate. SocketCAN "
+    "recovers by itself after `ip link set {channel} type can restart-ms 100`"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanAddress:
+    """Where a CAN device is, as in ``slcan:/dev/ttyACM0?bitrate=1000000&node=3``.
+
+    Attributes:
+        interface: Name of a python-can interface: "socketcan", "slcan", "virtual", "pcan", ...
+        channel: The interface's name for the bus: "can0", a serial port.
+        bitrate: Bits per second of the bus; socketcan's is set by ``ip link``.
+        node: Number of the device on the bus; None: the driver's usual one.
+        encoder: Number of a second device, the pole's encoder; None: the driver's usual one.
+        mm_per_turn: Travel of the cart a turn of the motor [mm], for a motor drive.
+        kv: Of the motor [rev/min/V], for a motor drive.
+        enable_watchdog: Number of a motor drive's setting, as its firmware numbers them.
+        watchdog_timeout: The same.
+    """
+
+    interface: str
+    channel: str
+    bitrate: int = BITRATE
+    node: int | None = None
+    encoder: int | None = None
+    mm_per_turn: int | None = None
+    kv: int | None = None
+    enable_watchdog: int | None = None
+    watchdog_timeout: int | None = None
+
+    @classmethod
+    def parse(cls, port: str) -> CanAddress:
+        """Return what a port means. ``can0`` alone is socketcan, a path alone is slcan.
+
+        Raises:
+            ConfigurationError: It means nothing.
+            UnknownNameError: A setting after ``?`` does not exist.
+        """
+        place, _, query = port.partition("?")
+        interface, colon, channel = place.partition(":")
+        if not colon:
+            interface, channel = ("slcan" if "/" in place else "socketcan"), place
+        if not interface or not channel:
+            raise ConfigurationError(
+                f"port {port!r}: a CAN port is INTERFACE:CHANNEL, such as socketcan:can0 or "
+                "slcan:/dev/ttyACM0?bitrate=500000"
+            )
+        values: dict[str, int] = {}
+        for name, value in parse_qsl(query, keep_blank_values=True):
+            if name not in _SETTINGS:
+                raise UnknownNameError("setting of a CAN port", name, _SETTINGS)
+            least = 0 if name == "node" else 1
+            if not value.isascii() or not value.isdigit() or not least <= int(value[:9]) <= 1_000_000:
+                raise ConfigurationError(f"port {port!r}: {name} is a whole number, {least} to 1000000")
+            values[name] = int(value)
+        return cls(interface=interface, channel=channel, **values)
+
+
+class CanTransport(Transport):
+    """A CAN bus: a message is one classic frame, its channel the 11-bit id as three hex digits.
+
+    Extended, remote and FD frames are foreign here and are not returned.
+
+    Attributes:
+        port: As it was given.
+        address: What that means.
+        error_frames: How often adapter or controller reported an error.
+        trouble: What it last reported, in words; "" for nothing.
+
+    Args:
+        port: See :meth:`CanAddress.parse`.
+        clock: Gives the stamps.
+        accept: Pairs of id and mask: frames with ``id & mask == wanted & mask`` are received; none: all.
+    """
+
+    def __init__(self, port: str, clock: Clock | None = None, accept: Sequence[tuple[int, int]] = ()) -> None:
+        self.port = port
+        self.address = CanAddress.parse(port)
+        self.error_frames = 0
+        self.trouble = ""
+        self._accept = tuple(accept)
+        self._clock = clock or MonotonicClock()
+        self._off = False
+
+    @abc.abstractmethod
+    def fileno(self) -> int:
+        """Return a descriptor that a child process can inherit; -1: each process opens its own path."""
+
+    def _bus_off(self) -> None:
+        self._off = True
+        self.trouble = BUS_OFF.format(channel=self.address.channel)
+
+    def _report(self, trouble: str) -> None:
+        self.error_frames += 1
+        self.trouble = trouble
+
+    def _check_bus(self) -> None:
+        if self._off:
+            raise TransportLostError(f"{self.port}: {self.trouble}")
+
+    def _timeout(self, timeout_s: float) -> TransportTimeoutError:
+        why = f"; the adapter reports: {self.trouble}" if self.trouble else ""
+        return TransportTimeoutError(f"{self.port}: nothing arrived within {timeout_s:g} s{why}")
+
+
+def open_can(
+    port: str, clock: Clock | None = None, accept: Sequence[tuple[int, int]] = (), fd: int | None = None
+) -> CanTransport:
+    """Return a transport for a port; it is not opened yet.
+
+    Args:
+        port: See :meth:`CanAddress.parse`.
+        clock: Gives the stamps.
+        accept: See :class:`CanTransport`.
+        fd: Descriptor of a serial adapter that a parent process opened and set up.
+
+    Raises:
+        ConfigurationError: The port means nothing.
+    """
+    if CanAddress.parse(port).interface == "slcan":
+        from deal_hw.drivers.transports.slcan_transport import SlcanTransport
+
+        return SlcanTransport(port, clock, accept, fd=fd)
+    return PythonCanTransport(port, clock, accept)
+
+
+class PythonCanTransport(CanTransport):
+    """An adapter that python-can drives: socketcan, virtual, pcan, kvaser and others.
+
+    The adapter's receive stamp is of the wall clock. Its age against the wall clock now is subtracted from
+    our clock; a stamp that is older than ``oldest_stamp_s`` or of the future (the wall clock was set, or the
+    adapter counts from its power-on) is replaced by the time of reading. Stamps never go back.
+
+    Args:
+        port: See :meth:`CanAddress.parse`.
+        clock: Gives the stamps.
+        accept: See :class:`CanTransport`; the kernel or the adapter filters where it can.
+        wall_ns: The clock of the adapter's stamps [ns].
+        oldest_stamp_s: Age up to which a stamp is believed [s]: longer than a frame waits in a buffer.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        clock: Clock | None = None,
+        accept: Sequence[tuple[int, int]] = (),
+        wall_ns: Callable[[], int] = time.time_ns,
+        oldest_stamp_s: float = 1.0,
+    ) -> None:
+        super().__init__(port, clock, accept)
+        self._wall_ns, self._oldest_ns = wall_ns, round(oldest_stamp_s * 1e9)
+        self._bus: can.BusABC | None = None
+        self._last_ns = 0
+
+    def open(self) -> None:
+        """Open the bus."""
+        if self._bus is None:
+            self._bus, self._off = self._open_bus(), False
+
+    def close(self) -> None:
+        """Close the bus."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            with contextlib.suppress(can.CanError, OSError):
+                bus.shutdown()
+
+    def reopen(self) -> None:
+        """Open the bus again where it was lost or went bus-off; one that works is left alone."""
+        if self._bus is not None and not self._off:
+            return
+        fresh = self._open_bus()
+        self.close()
+        self._bus, self._off = fresh, False
+
+    def fileno(self) -> int:
+        """Return -1: python-can takes no descriptor that was inherited."""
+        return -1
+
+    def send(self, message: Message) -> None:
+        """Hand a frame to the adapter; a full transmit buffer is an error, never a wait."""
+        self._check_bus()
+        frame = can.Message(
+            arbitration_id=int(message.channel, 16), is_extended_id=False, data=message.payload, check=True
+        )
+        try:
+            self._open_or_raise().send(frame, timeout=0)
+        except (can.CanError, OSError) as error:
+            raise self._failed(error) from error
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return the next data frame."""
+        bus = self._open_or_raise()
+        deadline_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
+        while True:
+            self._check_bus()
+            left_s = max(0, deadline_ns - self._clock.now_ns()) / 1e9
+            try:
+                frame = bus.recv(left_s)
+            except (can.CanError, OSError) as error:
+                raise self._failed(error) from error
+            if frame is None:
+                raise self._timeout(timeout_s)
+            if frame.is_error_frame:
+                self._take_error(frame)
+            elif not (frame.is_extended_id or frame.is_remote_frame or frame.is_fd):
+                return Message(f"{frame.arbitration_id:03X}", bytes(frame.data), self._stamp(frame.timestamp))
+
+    def _stamp(self, adapter_s: float) -> int:
+        now_ns = self._clock.now_ns()
+        age_ns = self._wall_ns() - round(adapter_s * 1e9)
+        stamp_ns = now_ns - age_ns if 0 <= age_ns <= self._oldest_ns else now_ns
+        self._last_ns = max(self._last_ns, stamp_ns)
+        return self._last_ns
+
+    def _take_error(self, frame: can.Message) -> None:
+        """Read an error frame as linux/can/error.h lays it out."""
+        kind, controller = frame.arbitration_id, (bytes(frame.data) + bytes(2))[1]
+        if kind & 0x040:
+            self._report("")
+            self._bus_off()
+        elif kind & 0x020:
+            self._report(NO_ACKNOWLEDGE)
+        elif kind & 0x004 and controller & 0x03:
+            side = "receive" if controller & 0x01 else "transmit"
+            self._report(f"the adapter's {side} buffer overflowed: frames are lost")
+        elif kind & 0x004 and controller & 0x30:
+            self._report("the controller is error-passive: many frames fail; check wiring and termination")
+        elif kind & 0x100:
+            self.trouble = ""
+        else:
+            self._report(f"bus error (class 0x{kind:03x}); check wiring, termination and bit rate")
+
+    def _open_or_raise(self) -> can.BusABC:
+        if self._bus is None:
+            raise TransportLostError(f"{self.port}: the bus is not open")
+        return self._bus
+
+    def _open_bus(self) -> can.BusABC:
+        name, channel = self.address.interface, self.address.channel
+        if name not in can.VALID_INTERFACES:
+            raise UnknownNameError("CAN interface", name, sorted(can.VALID_INTERFACES))
+        if name == "socketcan":
+            check_link(channel)
+        settings: dict[str, Any] = {} if name in _NOT_SET_HERE else {"bitrate": self.address.bitrate}
+        filters: list[Any] = [{"can_id": i, "can_mask": m, "extended": False} for i, m in self._accept]
+        try:
+            return can.Bus(
+                interface=name, channel=channel, can_filters=filters or None, ignore_config=True, **settings
+            )
+        except ValueError as error:
+            raise ConfigurationError(f"{self.port}: {error}") from error
+        except (can.CanError, OSError, ImportError) as error:
+            if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
+                raise PortNotFoundError(
+                    f"{self.port}: this kernel has no CAN (containers often have none); load the modules "
+                    "can, can_raw and the adapter's, or use a serial adapter: slcan:/dev/ttyACM0"
+                ) from error
+            raise PortNotFoundError(
+                f"{self.port} cannot be opened: {error}; is the adapter plugged in, and its driver installed?"
+            ) from error
+
+    def _failed(self, error: Exception) -> TransportError:
+        code = getattr(error, "error_code", None) or getattr(error, "errno", None)
+        if code == errno.ENOBUFS or "buffer full" in str(error):
+            why = f" (the adapter reports: {self.trouble})" if self.trouble else f"; {NO_ACKNOWLEDGE}"
+            return TransportTimeoutError(f"{self.port}: the transmit buffer is full{why}")
+        return TransportLostError(
+            f"{self.port}: the bus is lost ({error}); is the adapter plugged in, is `ip link` up?"
+        )
+
+
+def can_links(root: Path = Path("/sys/class/net")) -> list[str]:
+    """Return the names of this computer's CAN network interfaces."""
+    found = []
+    for link in sorted(root.iterdir()) if root.is_dir() else ():
+        with contextlib.suppress(OSError):
+            if (link / "type").read_text().strip() == _CAN_LINK:
+                found.append(link.name)
+    return found
+
+
+def check_link(name: str, root: Path = Path("/sys/class/net")) -> None:
+    """Refuse a CAN network interface that is not there or not up.
+
+    Raises:
+        PortNotFoundError: With the command that helps.
+    """
+    if name not in can_links(root):
+        at_hand = ", ".join(can_links(root)) or "none"
+        raise PortNotFoundError(
+            f"there is no CAN interface {name!r}; at hand: {at_hand}. A serial adapter is given as "
+            "slcan:/dev/ttyACM0"
+        )
+    if not int((root / name / "flags").read_text(), 16) & 1:
+        raise PortNotFoundError(
+            f"the CAN interface {name!r} is down; set it up: ip link set {name} up type can bitrate "
+            f"{BITRATE} restart-ms 100"
+        )

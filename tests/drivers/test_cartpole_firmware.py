@@ -1,0 +1,347 @@
+"""The firmware in Python and its C core: recorded outputs, and one equal to the other, bit by bit."""
+
+import hashlib
+import json
+import random
+import re
+import shutil
+import struct
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deal_hw.drivers.cartpole import native, protocol
+from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
+from deal_hw.drivers.cartpole.description import (
+    DAMPING_NS_M,
+    EFFORT_LIMIT_N,
+    SPEED_LIMIT_M_S,
+    STIFFNESS_N_M,
+    parameter_space,
+)
+from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.host_firmware import HostFirmware, Settings, settings_of
+from deal_hw.drivers.cartpole.protocol import Target
+from deal_hw.drivers.cartpole.sensor import Motor, Reading
+from deal_hw.drivers.cartpole.servo import Servo
+from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
+from deal_hw.errors import ConfigurationError
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which(native.compiler()) is None, reason="no C compiler: apt-get install gcc libc6-dev"
+)
+PAGE = Path(__file__).parents[2] / "docs" / "protocol-cartpole-serial.md"
+I32 = st.integers(-(2**31), 2**31 - 1)
+U16, U32 = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
+NOMINAL = {p.name: p.nominal for p in parameter_space().parameters}
+
+
+def script(seed: int, ticks: int) -> Iterator[tuple[bytes, Motor, Reading]]:
+    """Yield what comes from host and sensors in each tick; all floats are exact, so every machine agrees."""
+    rng = random.Random(seed)
+    sequence = request = 0
+    cart = 0
+    for tick in range(ticks):
+        data = b""
+        while rng.random() < 0.06:
+            kind = rng.random()
+            if kind < 0.6:
+                sequence += rng.random() < 0.9
+                data += protocol.encode(
+                    protocol.Target(
+                        sequence, rng.randint(-500_000, 500_000), rng.randint(0, 160_000),
+                        rng.randint(0, 16_000), rng.randint(0, 8_000), rng.randint(0, 3_000_000),
+                    )
+                )  # fmt: skip
+            elif kind < 0.65:
+                data += rng.randbytes(20) + b"\0"
+            else:
+                request += rng.random() < 0.9
+                choice = rng.choices(
+                    (protocol.Arm, protocol.Home, protocol.Stop, protocol.Hello), (16, 2, 1, 1)
+                )
+                data += protocol.encode(choice[0](request % 256))
+        step = rng.randint(-3000, 3000)
+        cart = max(-400_000, min(400_000, cart + step))
+        reading = Reading(
+            cart, step * 1000, rng.randint(-4_000_000, 4_000_000), step, cart / 2**20, tick % 97 == 0
+        )
+        yield data, Motor(cart / 2**20, step / 2**10), reading
+
+
+def outputs(firmware: Firmware, seed: int, ticks: int = 3000) -> Iterator[tuple[bytes, float, str]]:
+    """Run a firmware on a script, homing after 100 ticks; yield bytes, force and mode of each tick."""
+    since = 0
+    for data, motor, reading in script(seed, ticks):
+        out = firmware.receive(data, motor) if data else b""
+        force, report_due = firmware.control(motor)
+        if report_due:
+            out += firmware.report(reading)
+        since = since + 1 if firmware.mode is Mode.HOMING else 0
+        if since >= 100:
+            firmware.finish_homing()
+        yield out, force, firmware.mode.name
+
+
+@pytest.mark.parametrize(
+    ("seed", "recorded"), [(0, "e4b52a0a03a95585"), (1, "ddf512606437f997"), (2, "28e61e054e37046d")],
+)  # fmt: skip
+def test_outputs_are_the_recorded_ones(seed: int, recorded: str) -> None:
+    """Bytes, forces and modes of 3000 ticks of commands, garbage and watchdog stops are as recorded."""
+    delays = random.Random(seed)
+    firmware = Controller(Servo(NOMINAL, 0.001), 7, lambda: delays.randint(5, 8))
+    digest = hashlib.sha256()
+    armed = 0
+    for out, force, mode in outputs(firmware, seed):
+        digest.update(out + struct.pack("<d", force) + mode.encode())
+        armed += mode == "ARMED"
+    assert armed > 200
+    assert digest.hexdigest()[:16] == recorded
+
+
+def cut(value: int, most: int) -> int:
+    return max(-most, min(most, value))
+
+
+class IntegerServo(Servo):
+    """The arithmetic of servo.c, written again from docs/firmware.md."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._trims = settings
+        self._nm = 0
+        self.reset(0.0)
+
+    def reset(self, position: float) -> None:
+        self._nm = self._target_nm = cut(round(position * 1e9), 10**9)
+        self.setpoint = self._nm / 1e9
+        self._step_nm = 0
+        self._sent = self._real = (0, 0, 0)
+
+    def accept(self, target: Target) -> None:
+        def trim(value: int, trim: int, most: int) -> int:
+            return min((value * trim + 2**15) // 2**16, most)
+
+        def gains(stiffness: int, damping: int, limit_un: int) -> tuple[int, int, int]:
+            damping_un = damping * 1000 if damping <= 2_147_483 else 2**31 - 1
+            return min(stiffness, 2**31 - 1), damping_un, limit_un * 10**6
+
+        t, most = self._trims, 2**31 - 1
+        self._target_nm = cut(target.position_um, 400_000) * 1000
+        self._step_nm = trim(target.speed_limit_um_s, t.speed_trim, 500_000_000)
+        limit_un = target.effort_limit_mn * 1000
+        self._sent = gains(target.stiffness_mn_m, target.damping_mns_m, limit_un)
+        self._real = gains(
+            trim(target.stiffness_mn_m, t.stiffness_trim, most),
+            trim(target.damping_mns_m, t.damping_trim, most),
+            trim(limit_un, t.effort_trim, 2**32 - 1),
+        )
+
+    def update(self, position: float, velocity: float) -> float:
+        self._nm += cut(self._target_nm - self._nm, self._step_nm)
+        self.setpoint = self._nm / 1e9
+        error = self._nm - cut(cut(round(position * 1e9), 2**31 - 1), 10**9)
+        return cut(self._demand(self._real, error, round(velocity * 1e6)), self._real[2]) * 1e-12
+
+    @property
+    def slewing(self) -> bool:
+        return self._nm != self._target_nm
+
+    def estimate(self, setpoint: float, position: float, velocity: float) -> tuple[float, bool]:
+        limit = self._sent[2]
+        error = cut(round(setpoint * 1e9), 10**9) - cut(round(position * 1e6), 10**6) * 1000
+        demand = self._demand(self._sent, error, round(velocity * 1e6))
+        micro = cut((cut(demand, limit) + 2**19) >> 20, 2**31 - 1)
+        return ((micro * 4503600 + 2**31) >> 32) / 1e3, limit > 0 and abs(demand) >= limit
+
+    @staticmethod
+    def _demand(gains: tuple[int, int, int], error_nm: int, velocity_um_s: int) -> int:
+        return gains[0] * error_nm - gains[1] * cut(velocity_um_s, 2**25 - 1)
+
+
+def pair(truth: Truth, seed: int, delays: tuple[int, int]) -> tuple[Controller, HostFirmware]:
+    """Return both firmwares, whose commands are late by the same draws."""
+    first, second = random.Random(seed), random.Random(seed)
+    trims = settings_of(truth, 0)
+    return (
+        Controller(IntegerServo(trims), trims.unique_id, lambda: first.randint(*delays)),
+        HostFirmware(trims, lambda: second.randint(*delays)),
+    )
+
+
+@needs_compiler
+@pytest.mark.parametrize("seed", range(6))
+def test_recorded_inputs_give_the_same_outputs(seed: int) -> None:
+    """3000 ticks of commands, garbage and watchdog stops; hidden trims, commands late by 0 to 28 ticks."""
+    truth = candidate_truth("realistic", np.random.default_rng(seed), seed=seed, xi=5.0, refused=0)
+    python, core = pair(truth, seed, (0, 0) if seed == 0 else (seed, 28))
+    modes = []
+    for ours, theirs in zip(outputs(python, seed), outputs(core, seed), strict=True):
+        assert theirs == ours
+        modes.append(ours[2])
+    assert {"IDLE", "HOMING", "ARMED"} == set(modes)
+    assert (core.frame_errors, core.watchdog) == (python.frame_errors, python.watchdog)
+
+
+MOTORS = st.builds(lambda p, v: Motor(p / 2**28, v / 2**18), I32, I32)
+READINGS = st.builds(Reading, I32, I32, I32, I32, I32.map(lambda nm: nm / 2**30), st.booleans())
+MESSAGES = st.one_of(
+    st.builds(lambda *v: protocol.encode(Target(*v)), st.integers(0, 3) | U32, I32, U32, U32, U16, U32),
+    st.builds(
+        lambda *v: protocol.encode(Target(*v)),
+        st.integers(0, 2**32 - 2), st.integers(-400_000, 400_000), st.integers(0, 200_000),
+        st.integers(0, 20_000), st.integers(0, 8000), st.integers(0, 3_000_000),
+    ),
+    st.builds(
+        lambda kind, request: protocol.encode(kind(request)),
+        st.sampled_from([protocol.Arm, protocol.Arm, protocol.Home, protocol.Stop]), st.integers(0, 3),
+    ),
+    st.builds(lambda *v: protocol.encode(protocol.Hello(*v)), st.integers(0, 255), st.integers(0, 255)),
+    st.binary(max_size=70),
+    st.binary(max_size=70).map(lambda data: data + b"\0"),
+)  # fmt: skip
+TICKS = st.lists(st.tuples(st.lists(MESSAGES, max_size=3), MOTORS, READINGS, st.sampled_from((1, 3, 210))))
+
+
+@needs_compiler
+@settings(deadline=None, max_examples=300)
+@given(TICKS, st.tuples(*[st.integers(0, 2**32 - 1) | st.just(65536)] * 4), st.booleans())
+def test_any_inputs_give_the_same_outputs(ticks: list[tuple[list[bytes], Motor, Reading, int]],
+                                          trims: tuple[int, int, int, int], homed: bool) -> None:  # fmt: skip
+    """Any bytes, positions, gains and trims of any size, armed from the start or not."""
+    sent = Settings(*trims, 7, 0)
+    both: list[Firmware] = [Controller(IntegerServo(sent), 7, lambda: 2), HostFirmware(sent, lambda: 2)]
+    found: list[list[object]] = [[], []]
+    for firmware, seen in zip(both, found, strict=True):
+        if homed:
+            firmware.receive(protocol.encode(protocol.Home(254)), Motor(0.0, 0.0))
+            firmware.finish_homing()
+            firmware.receive(protocol.encode(protocol.Arm(255)), Motor(0.0, 0.0))
+        for messages, motor, reading, repeat in ticks:
+            seen.append(firmware.receive(b"".join(messages), motor))
+            for _ in range(repeat):
+                force, due = firmware.control(motor)
+                seen += [force, firmware.report(reading) if due else b"", firmware.mode, firmware.setpoint]
+        seen += [firmware.watchdog, firmware.homings, firmware.armings]
+    assert found[1] == found[0]
+
+
+@needs_compiler
+def test_test_vectors_of_the_protocol_page() -> None:
+    """What a device sends is, byte for byte, what the page has; what it takes, it takes from there."""
+    rows = re.findall(r"^\| `(\w+)\((.+?)\)` \| `([0-9a-f ]+)` \|", PAGE.read_text(), re.MULTILINE)
+    frames = [bytes.fromhex(text) for _, _, text in rows]
+    assert [name for name, _, _ in rows] == [
+        "Hello", "Info", "Arm", "Stop", "Home", "Ack", "Target", "Target", "State", "State",
+    ]  # fmt: skip
+    hello, info, arm, stop, home, refused, *targets, first_state, _ = frames
+    still = Motor(0.0, 0.0)
+    core = HostFirmware(settings_of(nominal_truth(seed=3), 0), lambda: 0)
+    assert core.receive(hello, still) == info
+    assert core.receive(arm, still) == refused
+    assert core.control(still) == (0.0, True)
+    assert core.report(Reading(0, 0, 3141593, 0, 0.0)) == first_state
+    core.receive(home + stop, still)
+    assert core.mode is Mode.IDLE
+    core.receive(protocol.encode(protocol.Home(77)), still)
+    core.finish_homing()
+    core.receive(protocol.encode(protocol.Arm(9)), still)
+    core.receive(targets[0], still)
+    # -12.345 mm lie beyond 1 m/s times 1 ms: 80 N/m times -1 mm.
+    assert core.control(still)[0] == pytest.approx(-0.08, abs=1e-12)
+    core.receive(targets[1], still)
+    assert core.control(still)[0] == 0.0
+    assert core.frame_errors == 0
+
+
+@needs_compiler
+def test_a_full_queue_keeps_the_newest_target() -> None:
+    """300 targets that all wait for 10 ticks: 256 have room, the last one is what acts in the end."""
+    core = HostFirmware(Settings(65536, 65536, 65536, 65536, 1, 0), lambda: 10)
+    still = Motor(0.0, 0.0)
+    core.receive(protocol.encode(protocol.Home(1)), still)
+    core.finish_homing()
+    core.receive(protocol.encode(protocol.Arm(2)), still)
+    for number in range(300):
+        core.receive(protocol.encode(Target(number, number, 80_000, 8_000, 4_000, 2**31)), still)
+    for _ in range(11):
+        core.control(still)
+    assert core.setpoint == pytest.approx(299e-6)
+
+
+@needs_compiler
+@pytest.mark.parametrize("profile", ["ideal", "realistic"])
+def test_the_core_moves_the_same_robot_as_the_float_servo(profile: str) -> None:
+    """One second of random targets with a falling pole: at most 10 um and 1 mrad apart."""
+    truth = candidate_truth(profile, np.random.default_rng(5), seed=5, xi=5.0, refused=0)
+    devices = [CartpoleDevice(truth, keep_truth=True),
+               CartpoleDevice(truth, keep_truth=True, firmware=HostFirmware.of)]  # fmt: skip
+    paths = []
+    for device in devices:
+        rng = np.random.default_rng(0)
+        device.receive(protocol.encode(protocol.Home(1)))
+        device.advance_to(510_000_000)
+        device.receive(protocol.encode(protocol.Arm(2)))
+        for number in range(50):
+            target = int(rng.integers(-200_000, 200_000))
+            device.receive(protocol.encode(Target(number, target, 80_000, 8_000, 4_000, 1_000_000)))
+            device.advance_to(device.device_ns + 20_000_000)
+        assert device.armed
+        paths.append(device.true_trajectory())
+    apart = np.abs(paths[0].position - paths[1].position).max(axis=0)
+    assert np.all(apart < (10e-6, 1e-3))
+    assert np.abs(paths[0].position[:, 0]).max() > 0.02
+
+
+@needs_compiler
+def test_a_host_without_compiler_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The name of the compiler, and the way around it."""
+    monkeypatch.setenv("CC", "no-such-cc")
+    with pytest.raises(ConfigurationError, match="no-such-cc, which is not installed; apt-get install gcc"):
+        native.build("x", (native.compiler(),), (), "apt-get install gcc")
+
+
+@needs_compiler
+def test_sources_that_do_not_compile_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiler's own words come along, and nothing is left in the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(ConfigurationError, match="does not compile"):
+        native.build("x.so", (native.compiler(), "-no-such-option"), native.CORE, "")
+    assert not list(tmp_path.rglob("x.so"))
+
+
+@needs_compiler
+def test_float_servo_and_core_agree_on_nominal_gains() -> None:
+    """80 N/m times 20 mm less 8 N s/m times 0.1 m/s is 0.8 N in both."""
+    servo = Servo(NOMINAL, 0.001)
+    integer = IntegerServo(settings_of(nominal_truth(), 0))
+    for one in (servo, integer):
+        one.accept(Target(0, 20_000, 80_000, 8_000, 4_000, 2**31))
+        assert one.update(0.0, 0.1) == pytest.approx(0.8, abs=1e-9)
+    assert EFFORT_LIMIT_N == 4.0
+    assert (STIFFNESS_N_M, DAMPING_NS_M, SPEED_LIMIT_M_S) == (80.0, 8.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def fuzzer() -> Path:
+    """Build the fuzzer of the core with the sanitizers."""
+    if shutil.which(native.compiler()) is None:
+        pytest.skip("no C compiler: apt-get install gcc libc6-dev")
+    options = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    return native.build(
+        "fuzz", (native.compiler(), *native.CFLAGS, *options), ("host/fuzz.c", *native.CORE), ""
+    )
+
+
+def test_a_fuzz_run_finds_nothing(fuzzer: Path) -> None:
+    """200 000 whole, mutated and random frames: no crash, no frame lost, no corrupt one taken."""
+    done = subprocess.run([fuzzer, "200000", "1"], capture_output=True, text=True, check=True, timeout=120)
+    found = json.loads(done.stdout)
+    assert found["good"] + found["corrupt"] + found["garbage"] > 199_000
+    # A random frame passes a CRC of 16 bits once in 65 536; these are 160 000, most of them no frame at all.
+    assert found["accepted"] + found["garbage_accepted"] <= 8
+    assert found["armed"] > 10_000

@@ -1,0 +1,136 @@
+#!/usr/bin/env python3
+"""Timing of the cart-pole's wires: from a command to the state that names it, and how regular the cycles are.
+
+python tools/measure_cartpole_wires.py --transports serial can odrive --seconds 120 --out wires.json
+python tools/measure_cartpole_wires.py --table wires.json
+
+Each row is an emulator in a process of its own and a control loop here: a command a cycle, all states
+read. Round trip: from sending a command until the first state that names it has been read [ms]; the device
+ticks once a millisecond and sends a state every 5 ms, so 1 to 6 ms are the device's own. Cycle: how late it
+begins [ms]. Wire: how long a command and a state are under way at the bit rate, worst case [ms]; the
+emulators' wires take no time, so this is to be added.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.bench.rows import describe_machine
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.realtime import priority
+from deal_hw.drivers import make_robot
+from deal_hw.errors import TransportTimeoutError
+from deal_hw.testing.robot_suite import default_command
+
+WIRE_MS = {"serial": (0.28, 0.45), "can": (0.81, 1.35), "odrive": (1.0, 1.08)}
+"""Command and state: 28 and 45 bytes at 1 Mbaud; 3 and 5 frames of 135 bits at 500 kbit/s; for the ODrive
+95 + 3 * 135 and 4 * 135 bits."""
+HALF_WAY_M = 0.02
+
+
+def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
+    """Run one row.
+
+    Args:
+        transport: The wire.
+        rate_hz: Commands a second.
+        seconds: How long [s].
+    """
+    clock = MonotonicClock()
+    trips: list[float] = []
+    late: list[float] = []
+    open_at: dict[int, int] = {}
+    with EmulatorProcess("cartpole", "--transport", transport, "--profile", "ideal", "--nominal") as emulator:
+        robot = make_robot("cartpole", transport, emulator.port, clock)
+        with robot, priority(50, children=True):
+            robot.home(5.0)
+            robot.arm(2.0)
+            errors = robot.link_errors
+            period_ns = round(1e9 / rate_hz)
+            begin_ns = clock.now_ns() + period_ns
+            for cycle in range(round(seconds * rate_hz)):
+                deadline_ns = begin_ns + cycle * period_ns
+                while (left_ns := deadline_ns - clock.now_ns()) > 0:
+                    try:
+                        state = robot.read_state(left_ns / 1e9)
+                    except TransportTimeoutError:
+                        continue
+                    if sent_ns := open_at.pop(state.command_sequence, 0):
+                        trips.append((clock.now_ns() - sent_ns) / 1e6)
+                late.append((clock.now_ns() - deadline_ns) / 1e6)
+                command = default_command(robot, HALF_WAY_M * ((cycle * period_ns // 10**9) % 2))
+                now_ns = clock.now_ns()
+                robot.send_command(command)
+                open_at[robot.last_sequence] = now_ns
+            robot.passive()
+            errors = robot.link_errors - errors
+        out, said = emulator.stop()
+    return {
+        "transport": transport, "rate_hz": rate_hz, "seconds": seconds, "commands": len(late),
+        "named": len(trips), "round_trip_ms": spread(trips), "late_ms": spread(late), "link_errors": errors,
+        "wire_ms": WIRE_MS.get(transport), "emulator": (out + said).strip().splitlines()[-1],
+    }  # fmt: skip
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    """Return p50, p99 and max."""
+    array = np.array(values or [np.nan])
+    return {
+        "p50": round(float(np.percentile(array, 50)), 3), "p99": round(float(np.percentile(array, 99)), 3),
+        "max": round(float(array.max()), 3),
+    }  # fmt: skip
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the rows as Markdown."""
+    lines = [
+        "| wire | commands a second | seconds | round trip p50 / p99 / max [ms] | "
+        "cycle late p50 / p99 / max [ms] | command, state on the wire [ms] | link errors |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        trip, late = (" / ".join(f"{row[name][k]:.2f}" for k in ("p50", "p99", "max")) for name in
+                      ("round_trip_ms", "late_ms"))  # fmt: skip
+        wire = ", ".join(f"{value:.2f}" for value in row["wire_ms"] or ())
+        lines.append(
+            f"| {row['transport']} | {row['rate_hz']} | {row['seconds']:g} | {trip} | {late} | {wire} | "
+            f"{row['link_errors']} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Measure the rows and print them as a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--transports", nargs="+", default=["serial", "can", "odrive"])
+    parser.add_argument("--rates", nargs="+", type=int, default=[50, 200])
+    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--out", type=Path, default=None)
+    parser.add_argument("--table", type=Path, default=None, help="print the table of a result")
+    given = parser.parse_args()
+    if given.table is not None:
+        print(table(json.loads(given.table.read_text(encoding="utf-8"))["rows"]))
+        return 0
+    rows = []
+    for transport in given.transports:
+        for rate_hz in given.rates:
+            rows.append(measure(transport, rate_hz, given.seconds))
+            print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
+    print(table(rows))
+    if given.out is not None:
+        # Names of files only: where they lay on this machine is nobody's business.
+        argv = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
+        result = {"argv": argv, "machine": describe_machine(), "rows": rows}
+        given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
