@@ -25,6 +25,7 @@ import numpy as np
 from deal_hw.calib.baselines.simple import Nominal
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
+from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline import Calibration, CalibrationRun, Fits, Outcome
 from deal_hw.calib.search.eki import Eki
@@ -46,7 +47,7 @@ from deal_hw.calib.validation.cross_validation import (
     time_masks,
 )
 from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_halves
-from deal_hw.calib.validation.verdict import Validation, with_causes, with_step
+from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.parts import joined, spread, stretches
@@ -142,9 +143,14 @@ class OutputErrorFits(Fits):
             # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
             local = with_rows(run.local)
             known, facts["physics_step"] = with_step(run.problem, local, known, theta)
-            known, facts["diagnosis"] = with_causes(run.problem, local, known)
-        left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s)).normal
-        chi2 = left.cost / max(left.count, 1)
+        left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
+        chi2 = left.normal.cost / max(left.normal.count, 1)
+        if run.local is not None:
+            # Where the local fit lost its way it has seen a part of the recordings alone.
+            lost = run.local.chi2 >= REFINEMENT.local_hopeless
+            judged = (problem, with_rows(left)) if lost else (run.problem, local)
+            if unexplained(judged[1]):
+                known, facts["diagnosis"] = with_causes(*judged, known)
         found = confounded(problem, fit.normal.hessian / known.inflation)
         names = problem.channel_names
         facts |= {

@@ -27,7 +27,7 @@ from deal_hw.calib.data.noise import (
 )
 from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
-from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
@@ -211,6 +211,17 @@ class Problem:
         other._batches = self._batches
         return other
 
+    def with_more(self, parameters: Sequence[Parameter]) -> Problem:
+        """Return the problem with more parameters, after its own; recordings and noise are shared.
+
+        Args:
+            parameters: They.
+        """
+        other = copy.copy(self)
+        space = other.space = ParameterSpace((*self.space.parameters, *parameters))
+        other._batches = BatchPool(lambda count: ServoBatch(self.robot, space, count, self.threads))
+        return other
+
     def with_robot(self, robot: RobotModel) -> Problem:
         """Return the problem with another model of the same robot; all else is shared."""
         other = copy.copy(self)
@@ -346,8 +357,12 @@ class Problem:
         data: WindowData,
         position: FloatArray | None = None,
         velocity: FloatArray | None = None,
+        force: FloatArray | None = None,
     ) -> Prediction:
-        """Predict windows with members whose parameters are set, along given set-points, (N, S, A)."""
+        """Predict windows with members whose parameters are set, along given set-points, (N, S, A).
+
+        Forces on the coordinates, (N, W, H * stride, C), are those of device periods.
+        """
         x, v = predict_windows(
             batch,
             self.episodes[data.episode],
@@ -355,6 +370,7 @@ class Problem:
             data.start_position if position is None else position,
             data.start_velocity if velocity is None else velocity,
             path,
+            force,
         )
         C, channels = x.shape[-1], self.channels
         if np.array_equal(channels, np.arange(C)):

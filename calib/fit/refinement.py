@@ -350,7 +350,7 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Refined | 
             part, theta, latency_s, stages_s, fixed_latency=fixed, notify=notify, shake=problem.noise_free
         )
 
-    part, nominal = _spread(problem, SETTINGS.local_s), problem.space.nominal
+    part, nominal = part_of(problem, SETTINGS.local_s), problem.space.nominal
     if part is problem or problem.noise_free:
         found = fit(problem, nominal, latency_s, None)
         return found if np.isfinite(found.chi2) else None
@@ -370,7 +370,7 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Refined | 
         return fit(problem, found.theta, found.latency_s, (short,))
 
 
-def _spread(problem: Problem, seconds: float) -> Problem:
+def part_of(problem: Problem, seconds: float) -> Problem:
     """Return the problem with pieces of a second, evenly spread, that add up to about so many seconds."""
     lengths = [len(e.sample) for e in problem.episodes]
     period_s = problem.episodes[0].period_s

@@ -1,31 +1,32 @@
-"""What an unexplained residual looks like, and what to free or mend next.
+"""What an unexplained residual looks like, and what to mend next: chosen on motion that was not fitted.
 
-Each cause of a wrong model leaves a signature: a disturbance that a motion alone determines, such as a force
-against the velocity at low speed. Its effect on the predictions is the convolution of the disturbance with
-the windows' own response to a kick at their start, which the refinement has computed. What parameters and
-start states could explain of it is projected out, and the residual is regressed on what is left. A cause's
-effect is the share of the residual's excess over noise that it explains beyond what as many random columns
-would.
+Three kinds of evidence, one statistic. Play in the gears is a candidate model of its own: refitted on a part
+of the recordings, it predicts the rest. Other causes have signatures, which a regression adds to the
+parameters: found on some windows, they predict the others. A delay that varies at random predicts no sample,
+but it says where the residual is large: a process driven by it is held against one that pushes all the same.
+The statistic is the held-out deviance, twice the logarithm of the likelihood ratio, noise level estimated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from scipy.signal import fftconvolve
-from scipy.stats import chi2 as chi2_law
 
-from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined
+from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
+from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
-from deal_hw.calibration import Alarm
+from deal_hw.calib.uncertainty.intervals import ended_at_bound
+from deal_hw.calib.validation.random_delay import FOLDS, random_delay
+from deal_hw.calib.validation.signatures import Answer, Cause, Signature, answers, signatures
+from deal_hw.calibration import Alarm, listed
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
-
-Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "contact"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,31 +34,36 @@ class DiagnosisSettings:
     """Settings of :func:`diagnose`.
 
     Attributes:
-        noticed: A cause that explains less than this share of the excess is not named [-].
-        by_chance: Nor is one that random columns would match with this probability [-].
-        low_speeds: Speeds, as parts of a joint's rms speed, within which friction's excess at low speed falls
-            to 1/e [-].
-        play_s: After a reversal a gear with play does not drive for about so long [s].
-        delay_piece_s: A varying delay is taken as constant for so long [s].
+        evidence: Held-out deviance that a cause must gain to be named [-]: 20 is odds of 22,000 to 1.
+        noticed: It must explain this share of the held-out squared residual, too [-].
+        most: Most causes that are named.
+        alike: Bodies are named whose mass explains at least this share of what the best one's does [-].
+        decisive: Play that explains this share says what else there is only once it is mended [-].
+        most_play: Widest play that is tried, as a share of what the commands span [-].
+        least_play: Joints are named whose play is at least this share of the widest one [-].
+        play_s: Windows of the candidate with play [s].
+        parameter_prior: Spread of parameters in the regression, as a share of their range [-].
+        latency_prior_s: The same of the latency [s].
         burst_part: Bursts are where so small a part of the time
         burst_share: holds so much of the residual, [-] both,
         burst_kurtosis: and its kurtosis is that high (noise: 3).
         burst_size: A burst's squared residual over the median's [-].
-        certain: Standard errors by which the residual must exceed noise before anything is said of it.
-        still: Part of the rms speed below which a velocity has no direction [-].
     """
 
+    evidence: float = 20.0
     noticed: float = 0.03
-    by_chance: float = 1e-3
-    low_speeds: tuple[float, ...] = (0.1, 0.4)
-    play_s: float = 0.03
-    delay_piece_s: float = 0.1
+    most: int = 3
+    alike: float = 0.8
+    decisive: float = 0.5
+    most_play: float = 0.5
+    least_play: float = 0.2
+    play_s: float = 0.2
+    parameter_prior: float = 0.5
+    latency_prior_s: float = 0.02
     burst_part: float = 0.05
     burst_share: float = 0.4
     burst_kurtosis: float = 8.0
     burst_size: float = 40.0
-    certain: float = 4.0
-    still: float = 1e-3
 
 
 SETTINGS = DiagnosisSettings()
@@ -69,14 +75,14 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
         "Free dof_friction_creep, dof_frictionloss and dof_damping of {}.",
     ),
     "backlash": (
-        "an offset at each reversal",
-        "There is play in the gear.",
-        "Mend the gear of {}, or accept an error of that size.",
+        "play in the gear",
+        "The joint does not follow its motor at once when the motor turns back.",
+        "Mend the gear of {}, or free servo_play there in the parameters.",
     ),
     "delay": (
         "a timing error that changes",
         "The delay of commands or sensors varies; the model's is constant.",
-        "Mend the link, or measure the law of its delay; look at {} first.",
+        "Send commands at an even pace, or time-stamp them where they are received{}.",
     ),
     "damping": (
         "a force that grows with speed",
@@ -93,6 +99,11 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
         "A mass, its centre or an encoder's zero was not free.",
         "Free encoder_bias, body_mass or body_ipos of {}.",
     ),
+    "mass": (
+        "another mass",
+        "The ratio of the bodies' masses is not the model's.",
+        "Weigh {}, correct the model, or free body_mass there.",
+    ),
     "contact": (
         "bursts",
         "The robot touches something that the model does not have.",
@@ -108,297 +119,327 @@ class Finding:
 
     Attributes:
         cause: Which.
-        share: Share of the residual's excess over noise that it explains.
-        joints: Joints that show it most, most first.
+        share: Share of the held-out squared residual that it explains.
+        deviance: Held-out deviance that it gains.
+        joints: Joints or bodies that show it most, most first.
         alarm: For people.
     """
 
     cause: Cause
     share: float
+    deviance: float
     joints: tuple[str, ...]
     alarm: Alarm
 
 
-def _named(cause: Cause, share: float, joints: tuple[str, ...], where: str) -> Finding:
-    looks, means, do = LOOKS[cause]
-    seen = f"{100 * share:.0f} % of what is unexplained looks like {looks}: {cause}."
-    return Finding(cause, share, joints, Alarm(seen, means, do.replace("{}", where)))
-
-
 @dataclass(frozen=True, slots=True)
-class Motion:
-    """One episode's windows: how the joints moved and what a disturbance does.
+class Evidence:
+    """What a residual is judged by.
 
     Attributes:
-        rows: Linearised residuals.
-        velocity: Of the joints at the predicted samples, (W, H, J).
-        response: Whitened channels by a unit of joint velocity at the window's start, (W, H, M, J).
-        direct: Whitened channels by a unit of joint position at the same sample, (W, H, M, J).
+        rows: Linearised residuals, per episode.
+        prior: Information on the parameters and the latency, (P,).
+        found: What causes would do.
+        answers: How the windows answer to commands, per episode; none where that is not known.
         period_s: Time from sample to sample [s].
-        time_s: Time of each sample in its recording, (W, H) [s].
+        time_s: Time of each sample in its recording, per episode (W, H) [s].
     """
 
-    rows: WindowRows
-    velocity: FloatArray
-    response: FloatArray
-    direct: FloatArray
+    rows: Sequence[WindowRows]
+    prior: FloatArray
+    found: Sequence[Signature]
+    answers: Sequence[Answer]
     period_s: float
-    time_s: FloatArray
+    time_s: Sequence[FloatArray]
 
 
-def motions(problem: Problem, refined: Refined) -> list[Motion]:
-    """Return how the joints moved in the refinement's windows.
+def diagnose(problem: Problem, refined: Refined) -> tuple[Finding, ...]:
+    """Return what the residual of a fit looks like, best supported first.
 
     Args:
         problem: The problem.
-        refined: Where the refinement ended, with linearised residuals.
+        refined: Where the fit ended, with linearised residuals.
     """
-    C, joints, channels = problem.coordinates, problem.robot.joints, problem.channels
-    states = refined.shooting.states(refined.point)
-    own = np.zeros((len(channels), C))
-    at = channels < C
-    own[at, channels[at]] = 1.0
-    found = []
-    for data, rows in zip(refined.shooting.data, refined.normal.rows, strict=True):
-        samples = data.windows.samples()
-        W, H = samples.shape
-        episode = problem.episodes[data.episode]
-        direct = own[:, joints] / data.std[..., None]
-        if rows.start.shape[2]:
-            kick = rows.start[:, : H * len(channels)].reshape(W, H, len(channels), 2 * C)
-            response = kick[..., C:][..., joints]
-        else:
-            # Where start states are known no response was computed: a free joint moves on.
-            response = direct * (episode.period_s * np.arange(1, H + 1))[:, None, None]
-        found.append(
-            Motion(
-                rows=rows,
-                velocity=states[data.episode][1][samples][..., joints],
-                response=response,
-                direct=direct,
-                period_s=episode.period_s,
-                time_s=np.asarray(episode.sample[samples] * episode.step_s, dtype=np.float64),
-            )
-        )
-    return found
+    play = find_play(problem, refined)
+    if play is not None and play.share >= SETTINGS.decisive:
+        return (play,)
+    found = name_causes(evidence(problem, refined))
+    return tuple(sorted((*found, *((play,) if play else ())), key=lambda f: -f.deviance))
 
 
-def diagnose(
-    found: Sequence[Motion], hessian: FloatArray, joint_names: Sequence[str], correlation_samples: float = 1.0
-) -> tuple[Finding, ...]:
-    """Regress the residual on each cause's signature; most telling first.
+def evidence(problem: Problem, refined: Refined) -> Evidence:
+    """Return what the residual of a fit is judged by; see :func:`diagnose`."""
+    space, data = problem.space, refined.shooting.data
+    width = np.append(SETTINGS.parameter_prior * space.width, SETTINGS.latency_prior_s)
+    # A parameter at the end of its range explains no more.
+    free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
+    episodes = [problem.episodes[d.episode] for d in data]
+    return Evidence(
+        rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
+        prior=1 / width**2,
+        found=signatures(problem, refined),
+        answers=answers(problem, refined),
+        period_s=problem.episodes[0].period_s,
+        time_s=[
+            np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
+            for e, d in zip(episodes, data, strict=True)
+        ],
+    )
+
+
+def find_play(problem: Problem, refined: Refined) -> Finding | None:
+    """Fit a model with play in every gear to a part of the recordings; return what it says of the rest.
+
+    The model without has seen all of them.
 
     Args:
-        found: How the joints moved, with linearised residuals.
-        hessian: Normal matrix of parameters and latency; fixed ones have zero rows and columns, (P, P).
-        joint_names: Names of the joints.
-        correlation_samples: Autocorrelation time of the residuals: random columns explain the more.
+        problem: The problem.
+        refined: Where its fit ended.
     """
-    gain = np.asarray(np.linalg.pinv(hessian, rcond=1e-12, hermitian=True), dtype=np.float64)
-    moved = np.concatenate([m.velocity.reshape(-1, m.velocity.shape[2]) for m in found])
-    scale = np.asarray(np.sqrt(np.mean(moved**2, axis=0)), dtype=np.float64)
-    left = _Left.of(found, gain)
-    count = sum(_count(m) for m in found)
-    # What white noise leaves is not to be explained; neither is what is not certain to be more.
-    excess = max(left.total - count, (1.0 - 1.0 / correlation_samples) * left.total)
-    if excess < SETTINGS.certain * np.sqrt(2.0 * correlation_samples * count):
-        return ()
-    chance = max(left.total / count, 1.0) * correlation_samples
-    results: list[Finding] = []
-    for cause, make in _SIGNATURES.items():
-        columns = [make(m, scale) for m in found]
-        explained, each, used = _explained(left, columns, gain)
-        results.append(_finding(cause, explained, used, chance, excess, each, joint_names))
-    explained, used = _varying_delay(left)
-    results.append(_finding("delay", explained, used, chance, excess, scale, joint_names))
-    bursts = _bursts(found)
-    if bursts:
-        results.append(_named("contact", bursts[0], (), bursts[1]))
-    told = [f for f in results if f.share >= SETTINGS.noticed]
-    return tuple(sorted(told, key=lambda f: -f.share))
+    description, names = problem.robot.description, problem.robot.actuator_names
+    known = any(p.kind == "servo_play" for p in problem.space.parameters)
+    if description.actuation != "position" or problem.robot.base is not None or problem.noise_free or known:
+        return None
+    span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
+    plays = [
+        Parameter(
+            name=f"{name}.play", kind="servo_play", elements=(name,), unit="-", nominal=0.0, low=0.0,
+            high=SETTINGS.most_play * float(most), scale="linear",
+        )
+        for name, most in zip(names, span, strict=True)
+        if most > 0
+    ]  # fmt: skip
+    wide = problem.with_more(plays)
+    fixed = problem.fixed_latency_s is not None
+    total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
+    part = part_of(wide, min(REFINEMENT.local_s, total_s / 2))
+    seen = [e.usable for e in part.episodes]
+    rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
+    length = samples_in(problem, SETTINGS.play_s)
+    try:
+        first = problem.first_latency_s
+        fit = refine(part, wide.space.nominal, first, (SETTINGS.play_s,), fixed_latency=fixed)
+        without = at_parameters(problem.part(rest), refined.theta, refined.latency_s, length)
+        with_play = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
+    except (InsufficientDataError, CalibrationError):
+        return None
+    found = fit.theta[len(problem.space) :]
+    share = 1 - with_play.chi2 / without.chi2
+    deviance = -without.normal.count * float(np.log(with_play.chi2 / without.chi2))
+    if not (deviance > SETTINGS.evidence and share > SETTINGS.noticed):
+        return None
+    order = [k for k in np.argsort(-found) if found[k] >= SETTINGS.least_play * found.max() > 0]
+    joints = [plays[k].elements[0] for k in order]
+    units = dict(
+        zip(description.joint_names, problem.robot.coordinate_units[problem.robot.joints], strict=True)
+    )
+    acted = dict(zip(names, description.actuated, strict=True))
+    sizes = listed([f"{found[k]:.2g} {units[acted[j]]} at {j}" for k, j in zip(order, joints, strict=True)])
+    seen_words = (
+        f"With play in the gears ({sizes}) the model predicts motion that it was not fitted to with chi2 "
+        f"{with_play.chi2:.3g} instead of {without.chi2:.3g}: backlash."
+    )
+    return _finding("backlash", share, deviance, joints, listed(joints), seen_words)
 
 
-def _count(motion: Motion) -> int:
-    """Return the degrees of freedom of a motion's residuals."""
-    W, R, S = motion.rows.start.shape
-    weighed = int(np.count_nonzero(np.any(motion.rows.start != 0, axis=2))) if S else W * R
-    return int(max(weighed - W * S, 1))
+def name_causes(known: Evidence) -> list[Finding]:
+    """Return the causes that evidence supports, the best first, each beside those before it."""
+    left = _Left.of(known)
+    found: list[Finding] = []
+    taken: list[Signature] = []
+    groups = _groups(known.found)
+    while groups and len(found) < SETTINGS.most:
+        gains = [left.gain(taken, group) for group in groups]
+        group = groups[int(np.argmax(gains))]
+        share = 1 - float(np.exp(-max(gains) / left.count))
+        if max(gains) <= SETTINGS.evidence or share <= SETTINGS.noticed:
+            break
+        found.append(_told(left, taken, group, share, max(gains)))
+        taken += group
+        groups = [g for g in groups if g[0].cause != group[0].cause]
+    varying = _varying_delay(known)
+    if varying is not None:
+        found.append(varying)
+    bursts = _bursts(known, left.residual(taken))
+    if bursts is not None:
+        found.append(bursts)
+    return sorted(found, key=lambda f: -f.deviance)
+
+
+def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
+    """Return what is added at a time: a cause at all joints, or the mass of one body."""
+    causes = dict.fromkeys(s.cause for s in found if s.cause != "mass")
+    return [
+        *([s for s in found if s.cause == cause] for cause in causes),
+        *([s] for s in found if s.cause == "mass"),
+    ]
 
 
 def _finding(
-    cause: Cause,
-    explained: float,
-    used: int,
-    chance: float,
-    excess: float,
-    each: FloatArray,
-    names: Sequence[str],
+    cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str, seen: str = ""
 ) -> Finding:
-    share = min((explained - used * chance) / excess, 1.0)
-    if chi2_law.sf(explained / chance, max(used, 1)) > SETTINGS.by_chance:
-        share = 0.0
-    order = np.argsort(-each)
-    chosen = tuple(names[j] for j in order[:4] if each[j] >= 0.25 * each[order[0]])
-    return _named(cause, float(share), chosen, ", ".join(chosen))
+    looks, means, do = LOOKS[cause]
+    if not seen:
+        seen = f"{100 * share:.2g} % of the squared residual on left-out motion looks like {looks}: {cause}."
+    alarm = Alarm(seen, means, do.replace("{}", where))
+    return Finding(cause, float(share), float(deviance), tuple(joints), alarm)
+
+
+def _told(
+    left: _Left, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
+) -> Finding:
+    cause = group[0].cause
+    if cause == "mass":
+        return _told_mass(left, taken, share, deviance)
+    gains = np.array([left.gain(taken, [signature]) for signature in group])
+    order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
+    joints = [group[k].where for k in order[:4]]
+    return _finding(cause, share, deviance, joints, listed(joints))
+
+
+def _told_mass(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Finding:
+    """Name each body that explains about as much: without a known torque motion shows ratios of masses."""
+    bodies = [s for s in left.known.found if s.cause == "mass"]
+    gains = {k: left.gain(taken, [body]) for k, body in enumerate(bodies)}
+    alike = sorted(
+        (k for k, gain in gains.items() if gain >= SETTINGS.alike * deviance), key=lambda k: -gains[k]
+    )
+    # The signature is a change per share of the mass, and the residual is prediction minus measurement.
+    change = {k: -float(left.coefficients([*taken, bodies[k]])[-1]) for k in alike}
+    ways = [
+        f"{bodies[k].where} {100 * abs(change[k]):.2g} % {'heavier' if change[k] > 0 else 'lighter'}"
+        for k in alike
+    ]
+    seen = (
+        f"With {' or '.join(ways)} the model predicts left-out motion with {100 * share:.2g} % less squared "
+        "residual: another mass."
+    )
+    names = [bodies[k].where for k in alike]
+    return _finding("mass", share, deviance, names, " and ".join(names), seen)
 
 
 @dataclass(frozen=True, slots=True)
 class _Left:
-    """What start states and parameters leave of the residual.
+    """Residuals and their derivatives without what start states can do of either.
 
     Attributes:
-        motions: The episodes.
-        effective: Derivatives by parameters while start states follow, (W, R, P) each.
-        normal: Start states' normal matrices, (W, S, S) each.
-        residual: The residual without what either explains, (W, R) each.
-        total: Its sum of squares.
+        known: The evidence.
+        effective: Derivatives by parameters while start states follow, (W, R, P) an episode.
+        normal: Start states' normal matrices, (W, S, S) an episode.
+        rest: The residual without what start states explain, (W, R) an episode.
+        columns: The same of each signature, by its identity.
     """
 
-    motions: Sequence[Motion]
+    known: Evidence
     effective: Sequence[FloatArray]
     normal: Sequence[FloatArray]
-    residual: Sequence[FloatArray]
-    total: float
+    rest: Sequence[FloatArray]
+    columns: dict[int, list[FloatArray]]
 
     @classmethod
-    def of(cls, found: Sequence[Motion], gain: FloatArray) -> _Left:
-        """Take it out of the motions' residuals; ``gain`` is the parameters' covariance, (P, P)."""
-        both = [eliminated(m.rows) for m in found]
-        residual = [
-            without_starts(m.rows.start, normal, m.rows.residual[..., None])[..., 0]
-            for m, (_, normal) in zip(found, both, strict=True)
+    def of(cls, known: Evidence) -> _Left:
+        """Take start states out of the evidence."""
+        both = [eliminated(rows) for rows in known.rows]
+        rest = [
+            without_starts(rows.start, normal, rows.residual[..., None])[..., 0]
+            for rows, (_, normal) in zip(known.rows, both, strict=True)
         ]
-        back = sum(np.einsum("wrp,wr->p", J, r) for (J, _), r in zip(both, residual, strict=True))
-        residual = [r - J @ (gain @ back) for (J, _), r in zip(both, residual, strict=True)]
-        total = float(sum(np.sum(r**2) for r in residual))
-        return cls(found, [J for J, _ in both], [n for _, n in both], residual, total)
+        left = cls(known, [J for J, _ in both], [n for _, n in both], rest, {})
+        for signature in known.found:
+            left.columns[id(signature)] = [
+                without_starts(
+                    rows.start,
+                    normal,
+                    np.concatenate([x, np.zeros((len(x), rows.start.shape[2], x.shape[2]))], axis=1),
+                )
+                for rows, normal, x in zip(known.rows, left.normal, signature.columns, strict=True)
+            ]
+        return left
+
+    def design(self, taken: Sequence[Signature]) -> list[FloatArray]:
+        """Return derivatives by the parameters and by signatures, (W, R, P + n) an episode."""
+        columns = [self.columns[id(s)] for s in taken]
+        return [np.concatenate(parts, axis=2) for parts in zip(self.effective, *columns, strict=True)]
+
+    def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return each window's normal matrix, (W, n, n), and vector, (W, n), squares, (W,), and the prior."""
+        design = self.design(taken)
+        matrix = np.concatenate([np.einsum("wri,wrj->wij", x, x) for x in design])
+        vector = np.concatenate(
+            [np.einsum("wri,wr->wi", x, r) for x, r in zip(design, self.rest, strict=True)]
+        )
+        squares = np.concatenate([np.sum(r**2, axis=1) for r in self.rest])
+        own = np.einsum("wii->i", matrix)
+        prior = np.append(self.known.prior, 1e-6 * own[len(self.known.prior) :] + 1e-12)
+        return matrix, vector, squares, prior
+
+    def coefficients(self, taken: Sequence[Signature]) -> FloatArray:
+        """Return the regression's coefficients on all windows, parameters first, (P + n,)."""
+        matrix, vector, _, prior = self._normal(taken)
+        return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
+
+    def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
+        """Return what parameters and signatures leave, (W, R) an episode."""
+        found = self.coefficients(taken)
+        return [r - x @ found for x, r in zip(self.design(taken), self.rest, strict=True)]
+
+    @property
+    def count(self) -> int:
+        """Degrees of freedom of the residuals."""
+        return sum(r.size - len(r) * n.shape[1] for r, n in zip(self.rest, self.normal, strict=True))
+
+    def held_out(self, taken: Sequence[Signature]) -> float:
+        """Return the cost of each fold's windows, parameters and signatures fitted to the others, in all."""
+        matrix, vector, squares, prior = self._normal(taken)
+        fold = FOLDS.of(len(squares))
+        cost = 0.0
+        for k in range(FOLDS.parts):
+            mine, others = fold == k, fold != k
+            found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
+            each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
+            cost += float(each[mine].sum())
+        return cost
+
+    def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
+        """Return the held-out deviance that more signatures gain beside those taken."""
+        return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
-def _explained(left: _Left, columns: Sequence[FloatArray], gain: FloatArray) -> tuple[float, FloatArray, int]:
-    """Return by how much columns, (W, H, M, J, n) each, lower the cost, alone by joint, and their number."""
-    J, n = columns[0].shape[3:]
-    matrix, vector = np.zeros((J * n, J * n)), np.zeros(J * n)
-    cross = np.zeros((gain.shape[0], J * n))
-    parts = zip(left.motions, columns, left.effective, left.normal, left.residual, strict=True)
-    for motion, own, effective, normal, r in parts:
-        W, _, S = motion.rows.start.shape
-        x = np.concatenate([own.reshape(W, -1, J * n), np.zeros((W, S, J * n))], axis=1)
-        x = without_starts(motion.rows.start, normal, x)
-        matrix += np.einsum("wri,wrj->ij", x, x)
-        vector += np.einsum("wri,wr->i", x, r)
-        cross += np.einsum("wrp,wri->pi", effective, x)
-    # What the parameters can do of it is theirs; the residual has nothing of that left.
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    matrix -= cross.T @ gain @ cross
-    solved = np.linalg.lstsq(matrix / np.outer(size, size), vector / size, rcond=1e-6)
-    explained = float(solved[0] @ (vector / size))
-    own_size = np.sqrt(np.maximum(np.diag(matrix), 1e-6 * size**2))
-    each = np.sum((vector / own_size).reshape(J, n) ** 2, axis=1)
-    return explained, each, int(solved[2])
-
-
-def _forced(motion: Motion, force: FloatArray) -> FloatArray:
-    """Return what disturbances (W, H, J, n), as accelerations, do to the channels, (W, H, M, J, n)."""
-    H = motion.velocity.shape[1]
-    before = np.concatenate([np.zeros_like(force[:, :1]), force[:, :-1]], axis=1)
-    # A force during a step acts like a kick at its end: the response is the window's, from there on.
-    full = fftconvolve(motion.response[..., None], before[:, :, None], axes=1)
-    return np.asarray(full[:, :H] * motion.period_s)
-
-
-def _friction(motion: Motion, scale: FloatArray) -> FloatArray:
-    v = motion.velocity
-    return _forced(
-        motion,
-        np.stack([-np.sign(v) * np.exp(-np.abs(v) / (s * scale)) for s in SETTINGS.low_speeds], axis=-1),
+def _varying_delay(known: Evidence) -> Finding | None:
+    """Return whether each command seems to act late by another time; see :mod:`.random_delay`."""
+    found = random_delay(known.rows, known.answers, known.period_s)
+    if found is None or not (found.gain > SETTINGS.evidence and found.share > SETTINGS.noticed):
+        return None
+    seen = (
+        f"{100 * found.share:.2g} % of the squared residual comes where commands change fast, as if each "
+        f"acted late by another time (standard deviation about {1e3 * found.std_s:.2g} ms): delay."
     )
+    return _finding("delay", found.share, found.deviance, (), "", seen)
 
 
-def _backlash(motion: Motion, scale: FloatArray) -> FloatArray:
-    direction = held_direction(motion.velocity, SETTINGS.still * scale)
-    samples = max(round(SETTINGS.play_s / motion.period_s), 1)
-    recent = direction.copy()
-    recent[:, samples:] -= direction[:, :-samples]
-    recent[:, :samples] -= direction[:, :1]
-    # Either the drive is free for a moment after a reversal, or the sensor sits on the side of the motor.
-    hysteresis = motion.direct * direction[:, :, None]
-    return np.stack([_forced(motion, 0.5 * recent[..., None])[..., 0], hysteresis], axis=-1)
-
-
-def held_direction(velocity: FloatArray, still: FloatArray) -> FloatArray:
-    """Return the direction of the last motion, (W, H, J): the velocity's, kept where a joint is still."""
-    moving = np.abs(velocity) > still
-    index = np.where(moving, np.arange(velocity.shape[1])[:, None], 0)
-    last = np.maximum.accumulate(index, axis=1)
-    return np.asarray(np.sign(np.take_along_axis(velocity, last, axis=1)))
-
-
-def _damping(motion: Motion, scale: FloatArray) -> FloatArray:
-    v = motion.velocity
-    return _forced(motion, np.stack([-v, -v * np.abs(v)], axis=-1))
-
-
-def _inertia(motion: Motion, scale: FloatArray) -> FloatArray:
-    acceleration = np.gradient(motion.velocity, motion.period_s, axis=1)
-    return _forced(motion, acceleration[..., None])
-
-
-def _load(motion: Motion, scale: FloatArray) -> FloatArray:
-    return _forced(motion, np.ones_like(motion.velocity)[..., None])
-
-
-_SIGNATURES: dict[Cause, Callable[[Motion, FloatArray], FloatArray]] = {
-    "friction": _friction,
-    "backlash": _backlash,
-    "damping": _damping,
-    "inertia": _inertia,
-    "load": _load,
-}
-
-
-def _varying_delay(left: _Left) -> tuple[float, int]:
-    """Return by how much a timing error of each short piece lowers the cost, and how many pieces are."""
-    explained, used = 0.0, 0
-    for motion, normal, r in zip(left.motions, left.normal, left.residual, strict=True):
-        W, H, M, _ = motion.direct.shape
-        size = max(round(SETTINGS.delay_piece_s / motion.period_s), 2)
-        pieces = max(H // size, 1)
-        label = np.minimum(np.arange(H) // size, pieces - 1)
-        moved = np.einsum("whmj,whj->whm", motion.direct, motion.velocity)
-        x = (moved[..., None] * (label[:, None, None] == np.arange(pieces))).reshape(W, H * M, pieces)
-        x = np.concatenate([x, np.zeros((W, motion.rows.start.shape[2], pieces))], axis=1)
-        x = without_starts(motion.rows.start, normal, x)
-        matrix, vector = np.einsum("wri,wrj->wij", x, x), np.einsum("wri,wr->wi", x, r)
-        solved = np.einsum("wij,wj->wi", np.linalg.pinv(matrix, rcond=1e-6, hermitian=True), vector)
-        explained += float(np.sum(solved * vector))
-        used += int(np.sum(np.linalg.matrix_rank(matrix, hermitian=True)))
-    return explained, used
-
-
-def _bursts(found: Sequence[Motion]) -> tuple[float, str] | None:
-    """Return the share of the residual that comes in bursts, and when; None where it does not."""
+def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Finding | None:
+    """Return whether the residual comes in bursts, and when; None where it does not."""
     power: list[FloatArray] = []
-    times: list[FloatArray] = []
     values: list[FloatArray] = []
-    for motion in found:
-        W, H = motion.time_s.shape
-        M = motion.direct.shape[2]
-        r = motion.rows.residual[:, : H * M].reshape(W, H, M)
+    for time_s, rows in zip(known.time_s, residual, strict=True):
+        W, H = time_s.shape
+        M = rows.shape[1] // H
+        r = rows[:, : H * M].reshape(W, H, M)
         power.append(np.sum(r**2, axis=2).ravel())
-        times.append(motion.time_s.ravel())
         values.append(r.ravel())
-    joined = np.concatenate(values)
-    kurtosis = float(np.mean(joined**4)) / max(float(np.mean(joined**2)) ** 2, 1e-300)
-    each, time = np.concatenate(power), np.concatenate(times)
+    every = np.concatenate(values)
+    kurtosis = float(np.mean(every**4)) / max(float(np.mean(every**2)) ** 2, 1e-300)
+    each, time = np.concatenate(power), np.concatenate([t.ravel() for t in known.time_s])
     most = np.argsort(-each)[: max(round(SETTINGS.burst_part * len(each)), 1)]
     most = most[each[most] > SETTINGS.burst_size * np.median(each)]
     share = float(each[most].sum() / max(each.sum(), 1e-300))
     if kurtosis < SETTINGS.burst_kurtosis or share < SETTINGS.burst_share:
         return None
-    period_s = found[0].period_s
-    seconds = sorted({round(t / (10 * period_s)) for t in time[most].tolist()})
-    stretches = _stretches(seconds, 10 * period_s)
-    return share, ", ".join(stretches[:5]) + (" and more" if len(stretches) > 5 else "")
+    unit_s = 10 * known.period_s
+    stretches = _stretches(sorted({round(t / unit_s) for t in time[most].tolist()}), unit_s)
+    where = ", ".join(stretches[:5]) + (" and more" if len(stretches) > 5 else "")
+    deviance = -len(each) * float(np.log(max(1 - share, 1e-300)))
+    return _finding("contact", share, deviance, (), where)
 
 
 def _stretches(numbers: Sequence[int], unit_s: float) -> list[str]:

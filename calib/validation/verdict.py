@@ -13,7 +13,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, ended_at_bound
 from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
-from deal_hw.calib.validation.diagnosis import diagnose, motions
+from deal_hw.calib.validation.diagnosis import diagnose
 from deal_hw.calib.validation.split_half import check_split_half, widened_by_halves
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.parameters import LONGEST_LATENCY_S
@@ -156,13 +156,7 @@ def with_causes(
     problem: Problem, refined: Refined, known: Uncertainty
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Return what is known, alarmed by what the residual looks like, and all causes as plain JSON values."""
-    free = np.append(known.shape.bound == 0, known.latency_interval_s[0] != known.latency_interval_s[1])
-    found = diagnose(
-        motions(problem, refined),
-        refined.normal.hessian * np.outer(free, free),
-        problem.robot.description.joint_names,
-        correlation_time(refined.normal.residual),
-    )
+    found = diagnose(problem, refined)
     alarms = (f.alarm for f in found[: SETTINGS.causes])
     return dataclasses.replace(known, alarms=(*known.alarms, *alarms)), [dataclasses.asdict(f) for f in found]
 

@@ -18,7 +18,7 @@ from deal_hw.calib.validation.verdict import SETTINGS, trust
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
 from deal_hw.cli.calibrate_model import Recordings
-from deal_hw.errors import DealHwError
+from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import (
     CAUSES,
     FAULTS,
@@ -33,20 +33,40 @@ from deal_hw.testing.plain_robots import (
 KEY = ("task", "fault", "seed")
 RIGHT = ""
 """The fault of a model that lacks nothing."""
+NONE = "none"
+"""What it is called where faults are chosen."""
 
 
-def cells(seeds: Sequence[int]) -> list[tuple[str, str, int]]:
-    """Return the robots by (kind, fault, seed): without a fault first."""
-    return [(kind, fault, seed) for fault in (RIGHT, *FAULTS) for seed in seeds for kind in KINDS]
+def cells(
+    seeds: Sequence[int], kinds: Sequence[str] = (), faults: Sequence[str] = ()
+) -> list[tuple[str, str, int]]:
+    """Return the robots by (kind, fault, seed): without a fault first.
+
+    Args:
+        seeds: Of the truths.
+        kinds: Names in `KINDS`; all by default.
+        faults: "none" and names in `FAULTS`; all by default.
+
+    Raises:
+        UnknownNameError: There is no such robot or fault.
+    """
+    known = {NONE: RIGHT} | {fault: fault for fault in FAULTS}
+    for what, given, names in (("robot", kinds, KINDS), ("fault", faults, known)):
+        for name in given:
+            if name not in names:
+                raise UnknownNameError(what, name, names)
+    return [
+        (kind, known[fault], seed) for fault in faults or known for seed in seeds for kind in kinds or KINDS
+    ]
 
 
-def table(seeds: Sequence[int], *, budget: Budget, threads: int | None) -> Cells:
+def table(cells: Sequence[tuple[str, str, int]], *, budget: Budget, threads: int | None) -> Cells:
     """Return what runs the robots; see :func:`run_cell`."""
 
     def make(kind: str, fault: str, seed: int) -> Callable[[], Row]:
         return lambda: run_cell(kind, fault, seed, budget=budget, threads=threads)
 
-    return Cells(names=KEY, runs=[(cell, make(*cell)) for cell in cells(seeds)])
+    return Cells(names=KEY, runs=[(cell, make(*cell)) for cell in cells])
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:

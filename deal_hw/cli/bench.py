@@ -53,8 +53,11 @@ class Bench:
     docs/example-so101.md and docs/example-go2-suspended.md make them; without it these two are skipped."""
 
     problems: str = ""
-    """first-answer: robots, comma separated; by default all: double-pendulum, cart-pole, torque-arm, so101,
-    go2-suspended."""
+    """first-answer, verdict: robots, comma separated; by default all. first-answer: double-pendulum,
+    cart-pole, torque-arm, so101, go2-suspended; verdict: pendulum, double-pendulum, arm, cart-pole, leg."""
+
+    faults: str = ""
+    """verdict: faults, comma separated (none, friction, backlash, jitter, mass, sign); by default all."""
 
     task: str = "cartpole"
     """Tasks, comma separated: cartpole, ant, go2 (loop: the cart-pole only)."""
@@ -108,7 +111,11 @@ class Bench:
             refuse(options, "only `bench real` takes that")
         if self.bench != "first-answer":
             # The class holds the defaults of these.
-            refuse(given(self, Bench, ("real", "problems")), "only `bench first-answer` takes that")
+            refuse(given(self, Bench, ("real",)), "only `bench first-answer` takes that")
+        if self.bench not in ("first-answer", "verdict"):
+            refuse(given(self, Bench, ("problems",)), "only `bench first-answer` and `verdict` take that")
+        if self.bench != "verdict":
+            refuse(given(self, Bench, ("faults",)), "only `bench verdict` takes that")
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -272,7 +279,11 @@ def _real(config: Bench, out: Path) -> _Table:
 def _verdict(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import verdict
 
-    cells = verdict.table(parse_seeds(config.seeds), budget=_budget(config), threads=config.threads)
+    cells = verdict.table(
+        verdict.cells(parse_seeds(config.seeds), _names(config.problems), _names(config.faults)),
+        budget=_budget(config),
+        threads=config.threads,
+    )
     return _Table(
         cells=cells, line=verdict.line, summary=lambda rows: print("\n".join(verdict.summary(rows)))
     )

@@ -32,7 +32,7 @@ CAUSES: Mapping[Fault, tuple[str, ...]] = {
     "friction": ("friction",),
     "backlash": ("backlash",),
     "jitter": ("delay",),
-    "mass": ("load", "inertia"),
+    "mass": ("mass",),
     "sign": (),
 }
 """Causes of the calibration's diagnosis that name the fault; a wrong sign is refused or warned of before."""

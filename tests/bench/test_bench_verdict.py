@@ -85,6 +85,13 @@ def test_cells_begin_with_right_models() -> None:
     assert {fault for _, fault, _ in found[: 2 * len(KINDS)]} == {""}
 
 
+def test_robots_and_faults_are_chosen_by_name() -> None:
+    """The right model is called none."""
+    assert cells([7], ["arm"], ["none", "sign"]) == [("arm", "", 7), ("arm", "sign", 7)]
+    with pytest.raises(UnknownNameError, match="unknown fault 'wobble'"):
+        cells([7], [], ["wobble"])
+
+
 def test_a_right_pendulum_ends_green(monkeypatch: pytest.MonkeyPatch) -> None:
     """Calibrated from CSV and MJCF as a user would: truths in the intervals, no search, said in one line."""
 

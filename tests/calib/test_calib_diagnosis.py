@@ -1,21 +1,29 @@
-"""The look of a residual names its cause: residuals of one joint, made by hand from each cause."""
+"""What a residual looks like: causes made by hand in one joint, and faults of simulated robots."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation.diagnosis import Finding, Motion, diagnose, held_direction
+from deal_hw.calib.uncertainty.intervals import with_rows
+from deal_hw.calib.validation import diagnosis
+from deal_hw.calib.validation.diagnosis import Evidence, Finding, evidence, find_play, name_causes
+from deal_hw.calib.validation.random_delay import FOLDS, random_delay
+from deal_hw.calib.validation.signatures import Answer, Cause, Signature, held_direction
+from deal_hw.cli.calibrate import Calibrate, prepare
+from deal_hw.cli.calibrate_model import Recordings
+from deal_hw.testing.plain_robots import Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 
-WINDOWS, SAMPLES, PERIOD_S, STD = 12, 80, 0.005, 1e-4
+WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
 DAMPING = 2.0
-"""Of the joint that all of this is about: its velocity decays with 1 / DAMPING seconds [1/s]."""
-
-Force = Callable[[FloatArray, FloatArray], FloatArray]
+"""Of the joint that this is about: its velocity decays with 1 / DAMPING seconds [1/s]."""
 
 
 def _motion() -> tuple[FloatArray, FloatArray]:
@@ -42,10 +50,22 @@ def _moved_by(force: FloatArray) -> FloatArray:
     return out
 
 
-def _diagnosed(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> tuple[Finding, ...]:
-    """Diagnose white noise plus what is wrong, (W, H) [rad]; ``columns`` are what free parameters do."""
+def _signatures() -> list[Signature]:
+    """Return what forces of size 1 do, and an offset of 1 mrad with the direction of motion."""
+    v, a = _motion()
+    made: dict[Cause, FloatArray] = {
+        "friction": _moved_by(-np.sign(v) * np.exp(-np.abs(v) / 0.1)),
+        "damping": _moved_by(-v),
+        "inertia": _moved_by(a),
+        "load": _moved_by(np.ones_like(v)),
+        "backlash": 1e-3 * np.sign(v),
+    }
+    return [Signature(cause, "knee", (x[..., None] / STD,)) for cause, x in made.items()]
+
+
+def _evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Evidence:
+    """Return white noise plus what is wrong, (W, H) [rad]; ``columns`` are what free parameters do."""
     rng = np.random.default_rng(0)
-    velocity, _ = _motion()
     time = np.arange(1, SAMPLES + 1) * PERIOD_S
     kick = np.broadcast_to((1 - np.exp(-DAMPING * time)) / DAMPING / STD, (WINDOWS, SAMPLES))
     start = np.stack([np.full((WINDOWS, SAMPLES), 1 / STD), kick], axis=-1)
@@ -58,71 +78,66 @@ def _diagnosed(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> tuple
         np.concatenate([parameter, np.zeros((WINDOWS, 2, parameter.shape[2]))], axis=1),
         np.concatenate([start, known], axis=1),
     )
-    # The hessian with start states eliminated, as the refinement has it.
-    js, jp = rows.start, rows.parameter
-    gain = np.linalg.solve(np.einsum("wrs,wrt->wst", js, js), np.einsum("wrs,wrp->wsp", js, jp))
-    left = jp - np.einsum("wrs,wsp->wrp", js, gain)
-    motion = Motion(
-        rows=rows,
-        velocity=velocity[..., None],
-        response=np.asarray(kick)[..., None, None],
-        direct=np.full((WINDOWS, SAMPLES, 1, 1), 1 / STD),
+    return Evidence(
+        rows=[rows],
+        prior=np.full(parameter.shape[2], 1e-6),
+        found=_signatures(),
+        answers=(),
         period_s=PERIOD_S,
-        time_s=(np.arange(WINDOWS * SAMPLES) * PERIOD_S).reshape(WINDOWS, SAMPLES),
+        time_s=[(np.arange(WINDOWS * SAMPLES) * PERIOD_S).reshape(WINDOWS, SAMPLES)],
     )
-    return diagnose([motion], np.einsum("wrp,wrq->pq", left, left), ("knee",))
+
+
+def _named(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> list[Finding]:
+    return name_causes(_evidence(wrong, columns))
 
 
 def test_noise_looks_like_nothing() -> None:
-    """White residuals of the right size have no excess to explain: no cause is named."""
-    assert _diagnosed(np.zeros((WINDOWS, SAMPLES))) == ()
+    """White residuals have nothing to explain: no cause is named."""
+    assert _named(np.zeros((WINDOWS, SAMPLES))) == []
 
 
 def test_friction_at_low_speed() -> None:
     """A force against the motion that dies out with speed."""
     v, _ = _motion()
-    found = _diagnosed(_moved_by(-1.0 * np.sign(v) * np.exp(-np.abs(v) / 0.1)))
+    found = _named(_moved_by(-1.0 * np.sign(v) * np.exp(-np.abs(v) / 0.1)))
     assert found[0].cause == "friction" and found[0].joints == ("knee",)
     assert found[0].share > 0.5 and "dof_friction_creep" in found[0].alarm.do
 
 
-def test_backlash() -> None:
-    """The sensor sits on the motor's side of 0.4 mrad of play: an offset with the direction of motion."""
+def test_sensor_on_the_motors_side_of_the_play() -> None:
+    """0.4 mrad of play: an offset with the direction of motion."""
     v, _ = _motion()
-    found = _diagnosed(2e-4 * np.sign(v))
-    assert found[0].cause == "backlash" and "play in the gear" in found[0].alarm.means
-    assert "the gear of knee" in found[0].alarm.do
+    found = _named(2e-4 * np.sign(v))
+    assert found[0].cause == "backlash" and "the gear of knee" in found[0].alarm.do
     assert found[0].share > 0.5
-
-
-def test_varying_delay() -> None:
-    """Samples are late by another 0-1.5 ms every tenth of a second."""
-    v, _ = _motion()
-    late = np.repeat(np.random.default_rng(1).uniform(0, 1.5e-3, (WINDOWS, 4)), 20, axis=1)
-    found = _diagnosed(-late * v)
-    assert found[0].cause == "delay" and found[0].share > 0.5
 
 
 def test_damping_that_no_parameter_has() -> None:
     """A force in proportion to velocity, and none left once a parameter does that."""
     v, _ = _motion()
     wrong = _moved_by(-0.3 * v)
-    found = _diagnosed(wrong)
+    found = _named(wrong)
     assert found[0].cause == "damping" and found[0].share > 0.8
-    assert _diagnosed(wrong, (wrong,)) == ()
+    assert _named(wrong, (wrong,)) == []
 
 
-def test_inertia_or_gain() -> None:
-    """A force in proportion to acceleration."""
-    _, a = _motion()
-    found = _diagnosed(_moved_by(0.05 * a))
-    assert found[0].cause == "inertia" and "dof_armature" in found[0].alarm.do
+@pytest.mark.parametrize(
+    ("cause", "force"), [("inertia", lambda a: 0.05 * a), ("load", lambda a: 0.3 + 0 * a)]
+)
+def test_forces_of_size_and_acceleration(cause: Cause, force: Callable[[FloatArray], FloatArray]) -> None:
+    """A constant force is a load, one in proportion to acceleration an inertia."""
+    found = _named(_moved_by(force(_motion()[1])))
+    assert found[0].cause == cause and found[0].share > 0.8
+    assert len(found) == 1
 
 
-def test_missing_load() -> None:
-    """A constant force."""
-    found = _diagnosed(_moved_by(np.full((WINDOWS, SAMPLES), 0.3)))
-    assert found[0].cause == "load" and found[0].share > 0.8
+def test_two_causes_are_named_and_the_larger_first() -> None:
+    """A load of 0.3 and a damping of a third of its effect."""
+    v, _ = _motion()
+    found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
+    assert [f.cause for f in found] == ["load", "damping"]
+    assert found[0].deviance > found[1].deviance > diagnosis.SETTINGS.evidence
 
 
 def test_contact_comes_in_bursts() -> None:
@@ -131,12 +146,103 @@ def test_contact_comes_in_bursts() -> None:
     rng = np.random.default_rng(2)
     for window, sample in ((2, 40), (8, 0)):
         wrong[window, sample : sample + 12] = 20 * STD * rng.normal(size=12)
-    found = {f.cause: f for f in _diagnosed(wrong)}
+    found = {f.cause: f for f in _named(wrong)}
     assert "contact" in found
     assert "0.98-1.07 s, 3.18-3.28 s" in found["contact"].alarm.do
 
 
 def test_direction_is_kept_where_a_joint_is_still() -> None:
-    """0.5, 0.01, -0.01, -0.5, 0.01 with 0.1 as still: up, up, up, down, down."""
-    v = np.array([0.5, 0.01, -0.01, -0.5, 0.01])[None, :, None]
-    assert held_direction(v, np.array([0.1])).ravel() == pytest.approx([1, 1, 1, -1, -1])
+    """0.5, 0.0001, -0.0001, -0.5, 0.0001 with 0.001 as still: up, up, up, down, down."""
+    v = np.array([[0.5, 1e-4, -1e-4, -0.5, 1e-4]])
+    assert held_direction(v, 1.0).ravel() == pytest.approx([1, 1, 1, -1, -1])
+
+
+def test_every_window_is_left_out_once_in_stretches() -> None:
+    """16 windows in four turns, each of two stretches of two."""
+    assert FOLDS.of(16).tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 2
+
+
+def _pushed(
+    varies: Callable[[FloatArray, np.random.Generator], FloatArray],
+) -> tuple[list[WindowRows], list[Answer]]:
+    """Return residuals of a joint that impulses move, as ``varies`` makes them of what commands change."""
+    rng = np.random.default_rng(3)
+    time = np.arange(SAMPLES) * PERIOD_S
+    answer = 50 * time * np.exp(-20 * time)
+    change = np.sin(2 * np.pi * 0.7 * np.arange(WINDOWS * SAMPLES) * PERIOD_S).reshape(WINDOWS, SAMPLES)
+    impulse = varies(change, rng)
+    moved = np.stack([np.convolve(one, answer)[:SAMPLES] for one in impulse])
+    residual = rng.normal(size=(WINDOWS, SAMPLES)) + moved
+    rows = WindowRows(
+        0,
+        np.concatenate([residual, np.zeros((WINDOWS, 1))], axis=1),
+        np.zeros((WINDOWS, SAMPLES + 1, 1)),
+        np.concatenate([np.ones((WINDOWS, SAMPLES, 1)), np.full((WINDOWS, 1, 1), 1e-3)], axis=1),
+    )
+    response = np.broadcast_to(answer, (1, WINDOWS, SAMPLES))[..., None]
+    return [rows], [Answer(response, change[..., None])]
+
+
+def test_random_delays_push_where_commands_change() -> None:
+    """Impulses of 0.5 (standard deviation) times what each command changes: 0.5 s in these units."""
+    rows, answers = _pushed(lambda change, rng: 0.5 * change * rng.standard_normal(change.shape))
+    found = random_delay(rows, answers, PERIOD_S)
+    assert found is not None and found.gain > diagnosis.SETTINGS.evidence
+    assert found.std_s == pytest.approx(0.5, rel=0.15)
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_random_forces_are_no_delays(slow: bool) -> None:
+    """The same impulses at any time, or a force that keeps its value through each window."""
+
+    def force(change: FloatArray, rng: np.random.Generator) -> FloatArray:
+        drawn = rng.standard_normal((WINDOWS, 1 if slow else SAMPLES))
+        return np.asarray(0.35 * drawn * np.ones_like(change))
+
+    found = random_delay(*_pushed(force), PERIOD_S)
+    assert found is not None and found.gain < 0
+
+
+def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Problem, Refined]:
+    """Return a simulated robot's recordings, and what a fit from its own values makes of them."""
+    robot = make_robot(kind, 3, fault)
+    model, paths, held_out = write(robot, folder, seconds=5.0)
+    config = Calibrate(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,), quiet=True)
+    work = prepare(config)
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    theta = np.array([robot.truth[name] for name in work.space.names])
+    return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
+
+
+def test_a_right_model_has_no_cause(tmp_path: Path) -> None:
+    """Neither a signature, nor a delay, nor play predicts left-out windows better."""
+    _, problem, fit = _truth("pendulum", None, tmp_path)
+    assert name_causes(evidence(problem, fit)) == []
+    assert find_play(problem, fit) is None
+
+
+def test_faults_of_a_simulated_robot_are_named(tmp_path: Path) -> None:
+    """Stribeck friction, and commands that are late by up to twice the mean delay."""
+    _, problem, fit = _truth("pendulum", "friction", tmp_path / "friction")
+    friction = name_causes(evidence(problem, fit))
+    assert friction[0].cause == "friction" and friction[0].joints == ("pivot",)
+    _, problem, fit = _truth("pendulum", "jitter", tmp_path / "jitter")
+    jitter = name_causes(evidence(problem, fit))
+    assert jitter[0].cause == "delay" and "late by another time" in jitter[0].alarm.seen
+
+
+def test_a_mass_is_named_with_its_size(tmp_path: Path) -> None:
+    """The last link weighs 50 % more."""
+    _, problem, fit = _truth("double-pendulum", "mass", tmp_path)
+    found = name_causes(evidence(problem, fit))
+    assert found[0].cause == "mass" and "fore" in found[0].joints
+    assert "Weigh" in found[0].alarm.do and "heavier" in found[0].alarm.seen
+
+
+def test_play_is_found_and_measured(tmp_path: Path) -> None:
+    """A gear with 0.06 rad of play: refitted with play in it the model predicts the rest to the noise."""
+    _, problem, fit = _truth("pendulum", "backlash", tmp_path)
+    found = find_play(problem, fit)
+    assert found is not None and found.cause == "backlash" and found.joints == ("pivot",)
+    assert "0.06 rad at pivot" in found.alarm.seen and "servo_play" in found.alarm.do
+    assert found.share > diagnosis.SETTINGS.decisive

@@ -59,3 +59,18 @@ def test_a_simulator_made_anew_gives_the_same(pool: BatchPool) -> None:
     again = pool.get(3)
     np.testing.assert_array_equal(moved(again), first)
     np.testing.assert_array_equal(moved(again), first)
+
+
+def test_forces_act_in_proportion_and_are_forgotten(robot: RobotModel) -> None:
+    """0, 1 and 2 N on the cart for 5 ms: twice the force, twice the change; the next windows have none."""
+    batch = ServoBatch(robot, k9_space(), 3, threads=1)
+    C = len(robot.coordinates)
+    path = np.zeros((3, 5, 1))
+    force = np.zeros((3, 5, C))
+    force[:, :, 0] = np.arange(3)[:, None]
+    batch.set_state(np.zeros(C), np.full(C, 0.5))
+    moved = batch.advance(path, force=force)[1][:, 0, 0]
+    assert moved[1] - moved[0] > 1e-4
+    assert moved[2] - moved[0] == pytest.approx(2 * (moved[1] - moved[0]), rel=0.02)
+    batch.set_state(np.zeros(C), np.full(C, 0.5))
+    np.testing.assert_allclose(batch.advance(path)[1][:, 0, 0], moved[0], rtol=1e-12)

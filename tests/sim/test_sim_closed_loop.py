@@ -24,6 +24,7 @@ class Sent:
     def __init__(self, count: int) -> None:
         self._batch = ServoBatch(ROBOT, SPACE, count, threads=1)
         self.robot, self.count, self.lag_s = ROBOT, count, self._batch.lag_s
+        self.play: FloatArray | None = None
         self.path: list[FloatArray] = []
 
     def advance(self, setpoint: FloatArray, every: int = 0) -> tuple[FloatArray, FloatArray]:
@@ -60,6 +61,18 @@ def test_setpoints_are_those_of_the_whole_path_slewed_and_then_delayed(
     lag = latency / ROBOT.step_s
     late = delay(path, np.rint(lag) if whole else lag, start)
     np.testing.assert_allclose(np.concatenate(sent.path, axis=1), late, atol=1e-12)
+
+
+def test_play_goes_on_from_period_to_period() -> None:
+    """A play of 0.4 around targets of 1 and then 0.9: 0.8 comes out of the first, and stays."""
+    sent = Sent(1)
+    sent.play = np.full((1, 1), 0.4)
+    loop = ClosedLoop(sent, STEPS, whole=True)  # type: ignore[arg-type]
+    loop.restart(np.zeros((1, 1)), np.zeros(1))
+    for target in (1.0, 0.9, 0.5):
+        loop.advance(np.full((1, 1), target))
+    path = np.concatenate(sent.path, axis=1)[0, ::STEPS, 0]
+    np.testing.assert_allclose(path, [0.8, 0.8, 0.7])
 
 
 def test_a_member_starts_anew_with_its_own_latency_and_leaves_the_others_alone() -> None:

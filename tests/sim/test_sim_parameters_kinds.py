@@ -319,7 +319,9 @@ def test_unknown_kind_lists_all_kinds_and_the_nearest() -> None:
     with pytest.raises(UnknownNameError, match=r"did you mean 'dof_damping'\?") as caught:
         find_kind("dof_dampin")
     assert all(name in str(caught.value) for name in (*KINDS, *DEVICE_KINDS))
-    assert set(DEVICE_KINDS) == {"servo_speed_limit", "command_delay", "encoder_bias", "sensor_noise"}
+    assert set(DEVICE_KINDS) == {
+        "servo_speed_limit", "command_delay", "servo_play", "encoder_bias", "sensor_noise"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(("torque", "moves"), [(0.19, False), (0.21, True)])

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.engine.servo import delay, play, slew
 
 
 def test_slew_by_hand() -> None:
@@ -55,3 +55,24 @@ def test_slew_is_the_step_by_step_law(seed: int, steps: int) -> None:
         now = now + np.clip(target[:, k] - now, -rate[:, k], rate[:, k])
         want.append(now)
     np.testing.assert_allclose(slew(start, target, rate), np.stack(want, axis=1), atol=1e-12)
+
+
+def test_play_by_hand() -> None:
+    """0.2 of play around 0: up to 0.1 nothing moves, then the end 0.1 behind; back only after 0.2."""
+    path = np.array([0.05, 0.1, 0.3, 0.2, 0.1, 0.0, -0.2])[None, :, None]
+    out = play(np.zeros((1, 1)), path, np.full((1, 1), 0.2))
+    np.testing.assert_allclose(out[0, :, 0], [0, 0, 0.2, 0.2, 0.2, 0.1, -0.1], atol=1e-15)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 0.5))
+def test_play_holds_until_it_is_used_up(seed: int, width: float) -> None:
+    """What comes out is at most half the width behind, and moves only where it is just that."""
+    rng = np.random.default_rng(seed)
+    path, widths = rng.uniform(-1, 1, (2, 40, 3)), np.full((2, 3), width)
+    start = path[:, 0]
+    out = play(start, path, widths)
+    behind = np.abs(path - out)
+    assert np.all(behind <= width / 2 + 1e-12)
+    moved = np.abs(np.diff(np.concatenate([start[:, None], out], axis=1), axis=1)) > 1e-12
+    np.testing.assert_allclose(behind[moved], width / 2, atol=1e-12)

@@ -30,6 +30,9 @@ ENCODER_BIAS = "encoder_bias"
 COMMAND_DELAY = "command_delay"
 """Kind that no MuJoCo field holds: what an actuator is sent acts later by it, on top of the latency."""
 
+SERVO_PLAY = "servo_play"
+"""Kind that no MuJoCo field holds: width of the play in the gear between an actuator and its joint."""
+
 SIZES_KEPT = 6
 """Simulators of so many sizes are kept: one iteration of a search or refinement needs up to four."""
 
@@ -47,6 +50,9 @@ class ServoBatch:
         space: The parameters that members differ in.
         count: Members N.
         threads: Threads; None for all CPUs.
+
+    Attributes:
+        play: Width of the play before each joint, (N, A) [rad or m]; None where no parameter is a play.
     """
 
     def __init__(
@@ -58,7 +64,7 @@ class ServoBatch:
         self.batch = Batch(robot.model, nsim=count, nthread=threads or default_threads())
         self._fields = BatchFields(self.batch, robot.model)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
-        self._warmstart = self.batch.bind("qacc_warmstart")
+        self._warmstart, self._applied = self.batch.bind("qacc_warmstart"), self.batch.bind("qfrc_applied")
         self._nominal = np.array([p.nominal for p in space.parameters])
         self._dof = list(robot.qvel)
         if robot.base is not None:
@@ -90,6 +96,7 @@ class ServoBatch:
         }
         self._bias = np.zeros((self.count, len(description.joint_names)))
         self._delay_s: FloatArray | None = None
+        self.play: FloatArray | None = None
         for p in self.space.parameters:
             values = columns.get(p.name, np.full(self.count, p.nominal))
             for name in p.elements:
@@ -101,6 +108,10 @@ class ServoBatch:
                     if self._delay_s is None:
                         self._delay_s = np.zeros((self.count, len(self.robot.actuator_names)))
                     self._delay_s[:, self.robot.actuator_names.index(name)] = values
+                elif p.kind == SERVO_PLAY:
+                    if self.play is None:
+                        self.play = np.zeros((self.count, len(self.robot.actuator_names)))
+                    self.play[:, self.robot.actuator_names.index(name)] = values
         self._biased = bool(np.any(self._bias))
         self.set_sent(
             self._default["servo_stiffness"],
@@ -199,7 +210,11 @@ class ServoBatch:
         return np.concatenate([qpos[..., at : at + 3], turned, joints], axis=-1)
 
     def advance(
-        self, setpoint: FloatArray, every: int = 0, reference: FloatArray | None = None
+        self,
+        setpoint: FloatArray,
+        every: int = 0,
+        reference: FloatArray | None = None,
+        force: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Advance all members in open loop.
 
@@ -208,6 +223,7 @@ class ServoBatch:
             every: Record each ``every``-th step; 0 records only the last.
             reference: Reference orientations of the charts at the recorded steps, (S // every, 4); the
                 identity by default.
+            force: Forces and torques on the coordinates at each step, (N, S, C) [N or N·m]; none by default.
 
         Returns:
             Positions and velocities after steps every, 2 every, ..., (N, S // every, C) each. A member that
@@ -223,15 +239,27 @@ class ServoBatch:
             control[:, :, list(self.robot.actuator)] = setpoint
         else:
             control = setpoint
+        spec = mujoco.mjtState.mjSTATE_CTRL
+        if force is not None:
+            applied = np.zeros((count, steps, self.robot.model.nv))
+            applied[:, :, self._dof] = force
+            control = np.concatenate([control, applied], axis=2)
+            spec |= mujoco.mjtState.mjSTATE_QFRC_APPLIED
         before = self._warnings()
         self.steps += count * steps
         if not every:
             # Stepping by rollout with a record of one field costs nothing over bare stepping.
             every = steps
         try:
-            record = self.batch.rollout(steps, control=control, record=("qpos", "qvel"))
+            record = self.batch.rollout(
+                steps, control=control, control_spec=int(spec), record=("qpos", "qvel")
+            )
         except mujoco.FatalError as err:
             raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
+        finally:
+            if force is not None:
+                # The engine would keep the last ones.
+                self._applied[:] = 0.0
         position = self._chart(record["qpos"][:, every - 1 :: every], reference)
         velocity = record["qvel"][:, every - 1 :: every][..., self._dof]
         bad = self._warnings() > before

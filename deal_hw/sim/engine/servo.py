@@ -39,6 +39,25 @@ def slew(start: FloatArray, target: FloatArray, rate: FloatArray) -> FloatArray:
     return out
 
 
+def play(start: FloatArray, setpoint: FloatArray, width: FloatArray) -> FloatArray:
+    """Drive through a gear with play: what comes out moves only where the play is used up.
+
+    Args:
+        start: What comes out before the first step, (N, A).
+        setpoint: What goes in, (N, S, A).
+        width: Width of the play, (N, A), at least 0.
+
+    Returns:
+        What comes out, (N, S, A).
+    """
+    out = np.empty_like(setpoint)
+    half, now = width / 2, start
+    for begin, end in itertools.pairwise(_changes(setpoint.shape[1], setpoint)):
+        now = np.clip(now, setpoint[:, begin] - half, setpoint[:, begin] + half)
+        out[:, begin:end] = now[:, None]
+    return out
+
+
 def _changes(steps: int, *series: FloatArray) -> list[int]:
     """Return 0, every step at which any of the series changes, and the number of steps."""
     changed = np.zeros(max(steps - 1, 0), dtype=bool)

@@ -126,4 +126,9 @@ ACTUATOR_KINDS = (
         along="set-points act later by it, on top of the latency that is scanned", apply=None, baseline=None,
         scale="linear", spread=0.02,
     ),
+    Kind(
+        name="servo_play", element="actuator", quantity="play", unit="rad", unit_slide="m", writes=(),
+        along="the joint's set-point follows where the play is used up", apply=None, baseline=None,
+        usable=_servo, scale="linear", spread=0.1,
+    ),
 )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.engine.servo import delay, play, slew
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, IntArray
 
@@ -89,7 +89,7 @@ def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> Flo
     """Return each member's set-point over the whole episode, (N, S, A).
 
     Args:
-        batch: The members; their speed limits and command delays count.
+        batch: The members; their speed limits, command delays and plays count.
         episode: The episode.
         latency_s: Total latency of each member, (N,) [s].
     """
@@ -100,8 +100,8 @@ def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> Flo
     factor = batch.servo_factor("servo_speed_limit")
     rate = factor[:, None] * episode.speed_limit[None] * episode.step_s
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
-    path = slew(start, episode.target, rate)
-    return delay(path, batch.lag_s(latency_s) / episode.step_s, start)
+    path = delay(slew(start, episode.target, rate), batch.lag_s(latency_s) / episode.step_s, start)
+    return path if batch.play is None else play(start, path, batch.play)
 
 
 def predict_windows(
@@ -111,6 +111,7 @@ def predict_windows(
     position: FloatArray,
     velocity: FloatArray,
     setpoint: FloatArray,
+    force: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Predict all windows with all members.
 
@@ -121,6 +122,7 @@ def predict_windows(
         position: Positions at the windows' starts, (W, C) or (N, W, C).
         velocity: Velocities at the windows' starts, (W, C) or (N, W, C).
         setpoint: Set-points of the whole episode, (N, S, A), from :func:`setpoints`.
+        force: Forces on the coordinates at the device periods of each window, (N, W, H * stride, C).
 
     Returns:
         Positions and velocities at the samples after each start, (N, W, H, C) each, in the chart of each
@@ -148,8 +150,10 @@ def predict_windows(
             sent = now
         batch.set_state(x[:, w], v[:, w], reference=None if reference is None else reference[start])
         control = setpoint[:, at : at + steps]
+        pushed = None if force is None else force[:, w]
         if repeat > 1:
             control = np.repeat(control, repeat, axis=1)
+            pushed = None if pushed is None else np.repeat(pushed, repeat, axis=1)
         charts = None if reference is None else reference[start + 1 : start + 1 + H]
-        out_x[:, w], out_v[:, w] = batch.advance(control, windows.stride * repeat, charts)
+        out_x[:, w], out_v[:, w] = batch.advance(control, windows.stride * repeat, charts, pushed)
     return out_x, out_v

@@ -1,0 +1,229 @@
+"""What each cause of a wrong model would do to the predictions, by simulation.
+
+A disturbance such as a force against the velocity is put into the windows that were fitted, along the motion
+that was fitted; the change of the prediction is the cause's signature. So what friction holds stays held, and
+what one joint does to the next counts. A body's mass is changed itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.fit.refinement import Refined
+from deal_hw.parameters import Parameter
+from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.recordings.windows import setpoints
+from deal_hw.types import FloatArray
+
+Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "load", "mass", "contact"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SignatureSettings:
+    """Settings of :func:`signatures`.
+
+    Attributes:
+        push: Size of a disturbance, as a share of the torque that the joint's own inertia took [-].
+        heavier: Share by which a mass is changed [-].
+        low_speeds: Speeds, as parts of a joint's rms speed, within which friction's excess at low speed falls
+            to 1/e [-].
+        still: Part of the rms speed below which a velocity has no direction [-].
+        nudge: Change of a set-point for one sample that shows how a joint answers [rad or m].
+    """
+
+    push: float = 0.2
+    heavier: float = 0.02
+    low_speeds: tuple[float, ...] = (0.1, 0.4)
+    still: float = 1e-3
+    nudge: float = 1e-3
+
+
+SETTINGS = SignatureSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """What one cause at one place does to the predictions.
+
+    Attributes:
+        cause: Which.
+        where: Joint or body.
+        columns: Change of the whitened predictions by each of n disturbances, per episode (W, H M, n).
+    """
+
+    cause: Cause
+    where: str
+    columns: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """How an episode's windows answer to commands.
+
+    Attributes:
+        response: Whitened predictions by a set-point that is changed at the first sample and back at the
+            next, over the area of that, (A, W, H, M) [1/(rad s) or 1/(m s)]. It is the mean over all
+            windows: where friction holds a joint there is none.
+        change: What the set-points changed by from sample to sample, (W, H, A) [rad or m].
+    """
+
+    response: FloatArray
+    change: FloatArray
+
+
+def signatures(problem: Problem, fit: Refined) -> list[Signature]:
+    """Return what causes do in the windows of a fit.
+
+    Args:
+        problem: The problem.
+        fit: Where a fit of windows ended.
+    """
+    states = fit.shooting.states(fit.point)
+    C, joints = problem.coordinates, problem.robot.joints
+    moved = np.concatenate(
+        [states[d.episode][1][d.windows.samples()].reshape(-1, C) for d in fit.shooting.data]
+    )
+    speed = np.sqrt(np.mean(moved**2, axis=0))
+    found: dict[tuple[Cause, str], list[FloatArray]] = {}
+    heavier = _bodies(problem)
+    wide = problem.with_more(heavier)
+    for e, data in enumerate(fit.shooting.data):
+        x, v = fit.point.position[e], fit.point.velocity[e]
+        if heavier:
+            theta = np.repeat(
+                np.append(fit.theta, [p.nominal for p in heavier])[None], 1 + len(heavier), axis=0
+            )
+            theta[1:, len(fit.theta) :] *= 1 + SETTINGS.heavier * np.eye(len(heavier))
+            late = np.full(len(theta), fit.latency_s)
+            masses = wide.predict(theta, late, data, x, v).observed
+            for p, column in zip(heavier, _changes(masses, data) / SETTINGS.heavier, strict=True):
+                found.setdefault(("mass", p.elements[0]), []).append(column[..., None])
+        path = _path(problem, fit, data)
+        velocity, acceleration = _along(problem, data, states[data.episode][1])
+        for name, c in zip(problem.robot.description.joint_names, range(C)[joints], strict=True):
+            forces = _forces(velocity[..., c], speed[c])
+            forces["inertia"] = [acceleration[..., c] / max(float(np.std(acceleration[..., c])), 1e-300)]
+            size = SETTINGS.push * _inertia(problem, c) * float(np.std(acceleration[..., c]))
+            each = [(cause, shape) for cause, shapes in forces.items() for shape in shapes]
+            force = np.zeros((1 + len(each), *velocity.shape[:2], C))
+            force[1:, ..., c] = size * np.stack([shape for _, shape in each])
+            pushed = _predict(problem, fit, data, e, np.repeat(path, len(force), axis=0), force)
+            columns = np.moveaxis(_changes(pushed, data), 0, -1)
+            for cause in forces:
+                mine = [k for k, (own, _) in enumerate(each) if own == cause]
+                found.setdefault((cause, name), []).append(columns[..., mine])
+            seen = np.flatnonzero(problem.channels == c)
+            offset = np.zeros((*data.measured.shape, 1))
+            moving = held_direction(states[data.episode][1][data.windows.samples()][..., c], speed[c])
+            # The sensor sits on the motor's side of the play.
+            offset[:, :, seen, 0] = (moving[..., None] / data.std[:, :, seen]) * problem.noise_std[c]
+            found.setdefault(("backlash", name), []).append(offset.reshape(len(offset), -1, 1))
+    return [Signature(cause, where, tuple(columns)) for (cause, where), columns in found.items()]
+
+
+def answers(problem: Problem, fit: Refined) -> list[Answer]:
+    """Return how the windows of a fit answer to commands; see :func:`signatures`."""
+    responses, changes = [], []
+    for e, data in enumerate(fit.shooting.data):
+        path = _path(problem, fit, data)
+        A, stride, step_s = path.shape[2], data.windows.stride, problem.episodes[data.episode].step_s
+        at = problem.episodes[data.episode].sample[data.windows.start]
+        # Windows follow each other: a change at the start of one comes back before the next is simulated.
+        paths = np.repeat(path, 1 + A, axis=0)
+        for step in range(stride):
+            rows = np.minimum(at + step, paths.shape[1] - 1)
+            paths[1:, rows] += SETTINGS.nudge * np.eye(A)[:, None]
+        observed = _predict(problem, fit, data, e, paths)
+        responses.append((observed[1:] - observed[:1]) / (SETTINGS.nudge * stride * step_s))
+        edges = np.minimum(at[:, None] + stride * np.arange(data.windows.length + 1), path.shape[1] - 1)
+        changes.append(np.diff(path[0][edges], axis=1))
+    mean = np.nan_to_num(np.mean(np.concatenate(responses, axis=1), axis=1))
+    every = zip(fit.shooting.data, changes, strict=True)
+    return [Answer(mean[:, None] / data.std, change) for data, change in every]
+
+
+def held_direction(velocity: FloatArray, speed: float) -> FloatArray:
+    """Return the direction of the last motion, (W, H): the velocity's, kept where a joint is still.
+
+    Args:
+        velocity: Of a joint, (W, H).
+        speed: Its rms.
+    """
+    moving = np.abs(velocity) > SETTINGS.still * speed
+    index = np.where(moving, np.arange(velocity.shape[1]), 0)
+    return np.asarray(np.sign(np.take_along_axis(velocity, np.maximum.accumulate(index, axis=1), axis=1)))
+
+
+def _forces(velocity: FloatArray, speed: float) -> dict[Cause, list[FloatArray]]:
+    """Return forces on a joint by their cause, of order 1, in the windows, (W, S)."""
+    v = velocity / max(speed, 1e-300)
+    against = -np.sign(v)
+    return {
+        "friction": [against * np.exp(-np.abs(v) / s) for s in SETTINGS.low_speeds],
+        "damping": [-v, -v * np.abs(v)],
+        "load": [np.ones_like(v)],
+    }
+
+
+def _bodies(problem: Problem) -> list[Parameter]:
+    """Return the masses of moving bodies that are neither searched nor known."""
+    model, kind = problem.robot.model, KIND_TABLE["body_mass"]
+    taken = {e for p in problem.space.parameters if p.kind == kind.name for e in p.elements}
+    return [
+        Parameter.around(
+            f"{body.name}.{kind.quantity}", kind.name, (body.name,), kind.unit, float(body.mass[0])
+        )
+        for body in map(model.body, range(1, model.nbody))
+        if model.body_weldid[body.id] and body.mass[0] > 0 and body.name and body.name not in taken
+    ]
+
+
+def _inertia(problem: Problem, coordinate: int) -> float:
+    """Return a joint's inertia where the model stands at zero [kg m^2 or kg]."""
+    joint = coordinate - problem.robot.joints.start
+    return float(problem.robot.model.dof_M0[problem.robot.qvel[joint]])
+
+
+def _path(problem: Problem, fit: Refined, data: WindowData) -> FloatArray:
+    """Return the set-points of an episode at a fit's values, (1, S, A)."""
+    batch = problem.batch(1)
+    batch.set_parameters(fit.theta[None])
+    return setpoints(batch, problem.episodes[data.episode], np.array([max(fit.latency_s, 0.0)]))
+
+
+def _predict(
+    problem: Problem,
+    fit: Refined,
+    data: WindowData,
+    e: int,
+    path: FloatArray,
+    force: FloatArray | None = None,
+) -> FloatArray:
+    batch = problem.batch(len(path))
+    batch.set_parameters(np.repeat(fit.theta[None], len(path), axis=0))
+    start = fit.point.position[e], fit.point.velocity[e]
+    return problem.predict_along(batch, path, data, *start, force).observed
+
+
+def _changes(observed: FloatArray, data: WindowData) -> FloatArray:
+    """Return how members after the first, (1 + n, W, H, M), whitened, differ from it, (n, W, H M)."""
+    found = np.nan_to_num((observed[1:] - observed[:1]) / data.std, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.asarray(found.reshape(*found.shape[:2], -1))
+
+
+def _along(problem: Problem, data: WindowData, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return velocities and accelerations at the device periods of each window, (W, H * stride, C) each."""
+    windows, period_s = data.windows, problem.episodes[data.episode].period_s
+    samples = np.concatenate([windows.start[:, None], windows.samples()], axis=1)
+    at = np.arange(windows.length * windows.stride) / windows.stride
+    before = at.astype(int)
+    part = (at - before)[:, None]
+
+    def between(values: FloatArray) -> FloatArray:
+        return np.asarray((1 - part) * values[samples[:, before]] + part * values[samples[:, before + 1]])
+
+    return between(velocity), between(np.gradient(velocity, period_s, axis=0))
