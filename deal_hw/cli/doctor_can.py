@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.transports.can_transport import CanAddress, CanTransport, can_links, open_can
+from deal_hw.drivers.transports.can_bus import CanAddress, CanTransport
+from deal_hw.drivers.transports.can_transport import can_links, open_can
 from deal_hw.drivers.transports.slcan_transport import serial_adapters
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.findings import Finding, Level

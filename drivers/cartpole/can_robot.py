@@ -7,7 +7,8 @@ import contextlib
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink, accept, check_node
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.transports.can_transport import CanAddress, CanTransport, open_can
+from deal_hw.drivers.transports.can_bus import CanAddress, CanTransport
+from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import TransportError
 from deal_hw.transport import Message, Transport

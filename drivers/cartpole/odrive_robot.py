@@ -9,7 +9,8 @@ from deal_hw.drivers.cartpole.can_link import accept
 from deal_hw.drivers.cartpole.can_robot import CanFrames
 from deal_hw.drivers.cartpole.odrive_link import OdriveLink, OdriveSettings
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.transports.can_transport import CanAddress, open_can
+from deal_hw.drivers.transports.can_bus import CanAddress
+from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.transport import Transport
 

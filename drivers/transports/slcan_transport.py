@@ -16,7 +16,7 @@ from typing import Final, Protocol
 from serial.tools import list_ports
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.transports.can_transport import NO_ACKNOWLEDGE, CanTransport
+from deal_hw.drivers.transports.can_bus import NO_ACKNOWLEDGE, CanTransport
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import ConfigurationError, TransportTimeoutError
 from deal_hw.transport import Message

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.transports import can_transport
+from deal_hw.drivers.transports.can_bus import CanAddress
 from deal_hw.drivers.transports.can_transport import (
-    CanAddress,
     PythonCanTransport,
     can_links,
     check_link,
