@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
-from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import CalibrationMethod
 from deal_hw.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from deal_hw.calib.data.problem import Problem
 
 METHODS: dict[str, str] = {
     "default": "deal_hw.calib.search.eki:Eki",

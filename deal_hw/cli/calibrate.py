@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from deal_hw.calib.methods import check_method
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
 from deal_hw.cli.calibrate_live import CHECKPOINT, SO_FAR, check_resume, saying_how_to_resume, watching
 from deal_hw.cli.calibrate_model import Recordings, prepare_model, write_parameters
@@ -187,6 +188,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         )
     if config.latency is not None:
         refuse(given(config, Calibrate(), ("latency_range",)), "--latency says the latency")
+    check_method(config.method)
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)

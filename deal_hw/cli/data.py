@@ -106,6 +106,10 @@ def _each(files: list[Path], mend: bool) -> tuple[list[RepairReport], list[str]]
 
 
 def _episode_files(path: Path) -> list[Path]:
+    if not path.exists():
+        raise DatasetError(
+            f"{path} does not exist; name a dataset (DIR) or an episode (DIR/episodes/000000.mcap)"
+        )
     if not path.is_dir():
         return [path]
     folder = path if path.name == "episodes" else path / "episodes"

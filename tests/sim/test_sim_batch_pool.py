@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -74,3 +77,23 @@ def test_forces_act_in_proportion_and_are_forgotten(robot: RobotModel) -> None:
     assert moved[2] - moved[0] == pytest.approx(2 * (moved[1] - moved[0]), rel=0.02)
     batch.set_state(np.zeros(C), np.full(C, 0.5))
     np.testing.assert_allclose(batch.advance(path)[1][:, 0, 0], moved[0], rtol=1e-12)
+
+
+def test_members_that_diverge_are_nan_and_leave_no_trace(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """MuJoCo's own line for each, on the terminal and in a file where the user stands, goes to the log."""
+    monkeypatch.chdir(tmp_path)
+    batch = ServoBatch(load_model(DESCRIPTION), k9_space().with_ratio(5.0), 64, threads=2)
+    batch.set_parameters(np.tile(batch.space.nominal, (64, 1)))
+    speed = np.zeros((64, 2))
+    speed[::2] = 1e12
+    batch.set_state(np.zeros((64, 2)), speed)
+    with caplog.at_level(logging.DEBUG, logger="deal_hw.sim.engine.batch"):
+        position, _ = batch.advance(np.zeros((64, 20, 1)))
+    assert np.isnan(position[::2]).all() and np.isfinite(position[1::2]).all()
+    assert "unstable" in caplog.text
+    assert capfd.readouterr() == ("", "") and list(tmp_path.iterdir()) == []

@@ -8,6 +8,7 @@ what goes in.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 
@@ -35,6 +36,16 @@ SERVO_PLAY = "servo_play"
 
 SIZES_KEPT = 6
 """Simulators of so many sizes are kept: one iteration of a search or refinement needs up to four."""
+
+
+def _note(warning: str) -> None:
+    logging.getLogger(__name__).debug(warning)
+
+
+if mujoco.get_mju_user_warning() is None:
+    # A search tries parameters that diverge, thousands of times. They come back as NaN and are counted; by
+    # itself MuJoCo would print a line for each, and write MUJOCO_LOG.TXT where the user stands.
+    mujoco.set_mju_user_warning(_note)
 
 
 def default_threads() -> int:
