@@ -75,7 +75,7 @@ def test_honest_rows_for_every_task(tmp_path: Path) -> None:
     """Cells are tasks by methods; no-data baselines score the centre's error everywhere."""
     out = tmp_path / "honest.json"
     settings = Bench(
-        bench="honest", task="cartpole,ant,go2", profile="ideal", seeds="3", methods="centre,nominal",
+        bench="honest", task="cartpole,ant,go2", profile="ideal", seeds="3", methods="midpoint,nominal",
         xi="3", out=out, threads=1, quiet=True,
     )  # fmt: skip
     assert bench(settings) == 0
@@ -84,7 +84,7 @@ def test_honest_rows_for_every_task(tmp_path: Path) -> None:
     for row in rows:
         assert set(row) >= FIELDS and row["bench"] == "honest" and not row["refined"]
         assert row["log_error_x100"] == pytest.approx(row["null_log_error_x100"])
-        assert row["log_error_x100"] > 10, "an honest truth is not the centre"
+        assert row["log_error_x100"] > 10, "an honest truth is not the midpoint"
     assert bench(settings) == 0
     assert json.loads(out.read_text())["rows"] == rows
 
@@ -93,7 +93,7 @@ def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> No
     """With the target at its place the nominal row scores 0 and every row says what that means."""
     out = tmp_path / "paper.json"
     settings = Bench(
-        bench="paper", task="ant", profile="ideal", seeds="3", methods="centre,nominal", out=out, quiet=True
+        bench="paper", task="ant", profile="ideal", seeds="3", methods="midpoint,nominal", out=out, quiet=True
     )
     assert bench(settings) == 0
     rows = {row["method"]: row for row in json.loads(out.read_text())["rows"]}
