@@ -28,6 +28,7 @@ FINE_AT_ZERO = {
     "lost_after_s", "sport_after_s", "battery_after_s", "nan_after_s", "hot_after_s", "stop_after_s",
     "push_after_s", "cut_after_s", "cut_s", "return_after_s",
     "bus_off_after_s", "bus_off_s", "tx_full_after_s", "tx_full_s", "lost_node_after_s",
+    "servo_reboot_after_s", "servo_overload_after_s", "servo_absent_after_s",
 }  # fmt: skip
 FINE_BELOW_ZERO = {"vigor", "known", "range", "push"}
 REQUIRED: dict[str, Any] = {
