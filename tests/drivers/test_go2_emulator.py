@@ -208,7 +208,7 @@ def test_wrong_options_are_refused_before_anything_opens() -> None:
         Emulate(robot="go2", transport="serial")
     with pytest.raises(UnknownNameError, match="robot to emulate 'spot'; known: cartpole, go2"):
         Emulate(robot="spot")
-    with pytest.raises(ConfigurationError, match="emulate cartpole has no --suspended, --push, --port"):
+    with pytest.raises(ConfigurationError, match="cartpole on serial has no --suspended, --push, --port"):
         Emulate(go2=Go2Options(suspended=True, faults=Go2Faults(push=5.0)), port="lo")
     with pytest.raises(ConfigurationError, match="emulate go2 has no --link, --vanish-after-s"):
         Emulate(robot="go2", link=Path("x"), vanish_after_s=1.0)
