@@ -26,7 +26,7 @@ MESSAGES = st.one_of(
     st.builds(protocol.Stop, U8),
     st.builds(protocol.Home, U8),
     st.builds(protocol.Ack, U8, st.sampled_from(MessageType), st.sampled_from(Result)),
-    st.builds(protocol.Target, U32, I32, U32, U32, U16, U32),
+    st.builds(protocol.Target, st.integers(0, protocol.NO_COMMAND - 1), I32, U32, U32, U16, U32),
     st.builds(protocol.State, U32, st.integers(0, 2**48 - 1), I32, I32, I32, I32, I16, U8, U32, U32),
     st.builds(Angle, U8, U32, I32, I32, U8),
 )
@@ -80,6 +80,12 @@ def test_a_state_by_hand() -> None:
     node = 5
     expected = b"".join(struct.pack("<IB3x8s", node * 32 + 8 + k, 8, part) for k, part in enumerate(parts))
     assert CanLink(node).encode(STATE) == expected
+
+
+def test_no_command_has_the_number_that_stands_for_none() -> None:
+    """A device that reported it would seem to have heard nothing."""
+    with pytest.raises(FrameError, match="does not fit its frames"):
+        CanLink().encode(protocol.Target(protocol.NO_COMMAND, 0, 0, 0, 0, 0))
 
 
 @settings(deadline=None)
