@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.dynamixel.registers import Register
@@ -29,6 +30,20 @@ _PING_BYTES = _STATUS_BYTES + 3
 _BITS_PER_BYTE = 10
 _QUEUE = 4096
 _ALERT = 0x80
+
+
+class _Packets(Protocol2PacketHandler):  # type: ignore[misc]
+    """The SDK's codec, one mistake of which is mended."""
+
+    def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
+        """Return an answer without the bytes that keep headers out of bodies; the SDK goes on with its CRC.
+
+        SDK 4.1 does it in place, and after the first such byte compares with bytes that it has already
+        overwritten: FF FF FD FD FF FD FD lost its last byte, and all registers behind it were shifted.
+        """
+        whole = bytes(packet)
+        body = whole[7:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+        return [*whole[:5], *(len(body) + 2).to_bytes(2, "little"), *body, *whole[-2:]]
 
 
 class Answer(NamedTuple):
@@ -154,7 +169,7 @@ class Bus:
         self.errors = 0
         self._clock = clock
         self._port = _Port(transport, clock, baud_rate, answer_s)
-        self._sdk: Any = PacketHandler(2.0)
+        self._sdk: Any = _Packets()
         self._ids: tuple[int, ...] = ()
         self._size = 0
         self._fast = False
