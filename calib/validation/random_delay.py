@@ -27,7 +27,8 @@ class Folds:
 
     Attributes:
         parts: In so many turns.
-        rounds: Each turn leaves out so many stretches of windows that follow each other.
+        rounds: Each turn leaves out so many stretches of windows that follow each other; one where there are
+            too few windows for more.
     """
 
     parts: int = 4
@@ -35,7 +36,8 @@ class Folds:
 
     def of(self, windows: int) -> IntArray:
         """Return the turn in which each window is left out, (W,)."""
-        return np.asarray(np.arange(windows) * self.rounds * self.parts // max(windows, 1) % self.parts)
+        rounds = self.rounds if windows >= self.rounds * self.parts else 1
+        return np.asarray(np.arange(windows) * rounds * self.parts // max(windows, 1) % self.parts)
 
 
 FOLDS = Folds()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -157,6 +158,12 @@ def test_direction_is_kept_where_a_joint_is_still() -> None:
     assert held_direction(v, 1.0).ravel() == pytest.approx([1, 1, 1, -1, -1])
 
 
+@pytest.mark.parametrize("windows", range(4, 12))
+def test_no_turn_leaves_out_nothing(windows: int) -> None:
+    """A recording of 4 s has four or five windows: each turn leaves out at least one."""
+    assert set(FOLDS.of(windows)) == set(range(FOLDS.parts))
+
+
 def test_every_window_is_left_out_once_in_stretches() -> None:
     """16 windows in four turns, each of two stretches of two."""
     assert FOLDS.of(16).tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 2
@@ -189,6 +196,20 @@ def test_random_delays_push_where_commands_change() -> None:
     found = random_delay(rows, answers, PERIOD_S)
     assert found is not None and found.gain > diagnosis.SETTINGS.evidence
     assert found.std_s == pytest.approx(0.5, rel=0.15)
+
+
+@pytest.mark.parametrize("windows", [3, 4, 5])
+def test_few_windows_end_in_an_answer_or_none(windows: int) -> None:
+    """Four windows are compared, fewer are not; neither is an error."""
+    (rows,), (answer,) = _pushed(lambda change, rng: np.zeros_like(change))
+    few = dataclasses.replace(
+        rows, residual=rows.residual[:windows], parameter=rows.parameter[:windows], start=rows.start[:windows]
+    )
+    answers = dataclasses.replace(
+        answer, response=answer.response[:, :windows], change=answer.change[:windows]
+    )
+    found = random_delay([few], [answers], PERIOD_S)
+    assert (found is None) == (windows < FOLDS.parts)
 
 
 @pytest.mark.parametrize("slow", [False, True])
