@@ -49,12 +49,11 @@ class RestartSettings:
     """When a search is run again from other draws.
 
     Attributes:
-        explained: Searched no more once chi2 is below this: noise explains the recordings.
         restarts: Most searches after the first.
         same: Two searches whose unexplained chi2 differ by a smaller share say that the model is wrong, not
             the search.
         fewest_generations: With fewer left in the budget another search would not get anywhere.
-        explained: Below this chi2 no other search is run.
+        explained: Searched no more once chi2 is below this: noise explains the recordings.
     """
 
     restarts: int = 2
