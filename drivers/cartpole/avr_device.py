@@ -7,11 +7,11 @@ import functools
 import math
 import struct
 from dataclasses import dataclass
-from typing import ClassVar
 
 from fastcrc import crc16
 
 from deal_hw.drivers.cartpole import native, protocol
+from deal_hw.drivers.cartpole.device import EmulatedDevice
 from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
@@ -19,7 +19,6 @@ from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import ConfigurationError, ProtocolError
 from deal_hw.types import Status
 
-TICK_NS = 1_000_000
 _BYTES_PER_TICK = 99
 """One less than 1 Mbaud carries in 1 ms, so that none is left over."""
 _INSTALL = "apt-get install gcc libc6-dev gcc-avr avr-libc libsimavr-dev libelf-dev, or use --firmware python"
@@ -145,15 +144,14 @@ class Chip:
         self._board = None
 
 
-class AvrDevice:
-    """A chip on a cart-pole; tick by tick, bytes in and bytes out, like :class:`CartpoleDevice`.
+class AvrDevice(EmulatedDevice):
+    """A chip on a cart-pole.
 
     The chip sees no more than its pins: edges of two quadrature encoders, two limit switches, the UART. Its
     PWM, averaged over each millisecond, is the force on the cart. Noise and jitter of the profile do not act:
     counts are what the encoders count. The whole latency lies between a command and its action.
 
     Attributes:
-        received_bytes: How many have come from the host.
         chip: The chip.
 
     Args:
@@ -168,32 +166,16 @@ class AvrDevice:
     def __init__(
         self, truth: Truth, *, start_angle_rad: float | None = None, build: Rig = Rig()
     ) -> None:  # fmt: skip
-        self._mechanics = Mechanics(truth, start_angle_rad=start_angle_rad)
+        super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad))
         self._build = build
         profile = find_profile(truth.profile)
         jitter = (profile.actuation_jitter_ticks + profile.sensing_jitter_ticks) // 2
         delay = truth.actuation_ticks + truth.sensing_ticks + jitter
         self.chip = Chip(eeprom(settings_of(truth, delay), build.full_force_n))
         self._counted = self._counts()
-        self._inbox = b""
-        self._tick = 0
         self._setting_pole = False
         self._decoder = protocol.FrameDecoder()
         self._status = Status.NONE
-        self.received_bytes = 0
-
-    trouble: ClassVar[str] = ""
-    """What is wrong with its wire; an emulated bus tells more."""
-
-    @property
-    def device_ns(self) -> int:
-        """Device time at which the next tick runs [ns]."""
-        return self._tick * TICK_NS
-
-    @property
-    def true_position(self) -> tuple[float, float]:
-        """True cart position and pole angle now [m, rad]; never on the wire."""
-        return self._mechanics.position
 
     @property
     def armed(self) -> bool:
@@ -211,18 +193,6 @@ class AvrDevice:
     def watchdog(self) -> bool:
         """Whether the last state frame said that commands had stayed away."""
         return Status.WATCHDOG in self._status
-
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the host; they go over the UART as fast as 1 Mbaud carries them."""
-        self._inbox += data
-        self.received_bytes += len(data)
-
-    def advance_to(self, device_ns: int) -> bytes:
-        """Run every tick up to and including ``device_ns``; return the bytes sent meanwhile."""
-        out = bytearray()
-        while self._tick * TICK_NS <= device_ns:
-            out += self.tick()
-        return bytes(out)
 
     def tick(self) -> bytes:
         """Run one millisecond of chip and mechanics; return the bytes sent in it.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink
-from deal_hw.drivers.cartpole.device import CartpoleDevice, python_firmware
+from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice, python_firmware
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.truth import Truth, unique_id
 from deal_hw.drivers.transports.slcan_transport import (
@@ -28,40 +28,6 @@ _BUFFERED: Final = 3
 _SECOND_DEVICE: Final = 0x5EC0_0000
 
 
-class BusDevice(Protocol):
-    """A device on a CAN bus: bytes are whole frames as :data:`FRAME` lays them out."""
-
-    received_bytes: int
-
-    @property
-    def device_ns(self) -> int:
-        """Device time at which the next tick runs [ns]."""
-        ...
-
-    @property
-    def armed(self) -> bool:
-        """Whether the motor follows targets."""
-        ...
-
-    @property
-    def mode(self) -> str:
-        """What the motor does."""
-        ...
-
-    @property
-    def watchdog(self) -> bool:
-        """Whether the motor was stopped because commands stayed away."""
-        ...
-
-    def receive(self, data: bytes) -> None:
-        """Take frames."""
-        ...
-
-    def advance_to(self, device_ns: int) -> bytes:
-        """Run every tick up to a device time [ns]; return the frames sent meanwhile."""
-        ...
-
-
 class SlcanAdapter:
     """The adapter, the bus and the devices on it, as one device that speaks the adapter's characters.
 
@@ -69,11 +35,12 @@ class SlcanAdapter:
         received_bytes: How many characters have come from the host.
 
     Args:
-        devices: What is on the bus; the first is the cart-pole itself.
+        devices: What is on the bus, whose bytes are frames as :data:`FRAME` lays them out; the first is the
+            cart-pole itself.
         faults: What goes wrong on the bus.
     """
 
-    def __init__(self, devices: list[BusDevice], faults: CanFaults) -> None:
+    def __init__(self, devices: list[EmulatedDevice], faults: CanFaults) -> None:
         self.received_bytes = 0
         self._devices = devices
         self._faults = faults
@@ -224,14 +191,14 @@ def can_device(truth: Truth, node: int = NODE, version: int = 1, identity: int =
     )
 
 
-def can_devices(truth: Truth, faults: CanFaults) -> list[BusDevice]:
+def can_devices(truth: Truth, faults: CanFaults) -> list[EmulatedDevice]:
     """Return the cart-pole on a bus, and what else is there by its faults."""
     identities = (0, _SECOND_DEVICE) if faults.duplicate_node else (0,)
     return [can_device(truth, faults.node, faults.dbc_version, identity) for identity in identities]
 
 
 def adapter_emulator(
-    devices: list[BusDevice],
+    devices: list[EmulatedDevice],
     *,
     link: Path | None,
     hazards: Hazards,

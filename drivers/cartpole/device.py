@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import abc
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -44,7 +44,87 @@ def python_firmware(truth: Truth, mechanics: Mechanics, link: Link | None = None
     return Controller(servo, unique_id(truth), mechanics.command_delay, link)
 
 
-class CartpoleDevice:
+class EmulatedDevice(abc.ABC):
+    """A device on the mechanics of the emulated cart-pole, in device time: bytes in, bytes out.
+
+    Attributes:
+        received_bytes: How many have come from the host.
+
+    Args:
+        mechanics: What it moves and measures.
+        keep_truth: Whether to keep the true trajectory for :meth:`true_trajectory`.
+    """
+
+    def __init__(self, mechanics: Mechanics, *, keep_truth: bool = False) -> None:
+        self.received_bytes = 0
+        self._mechanics = mechanics
+        self._inbox = b""
+        self._tick = 0
+        self._kept: array[float] | None = array("d") if keep_truth else None
+
+    @property
+    def device_ns(self) -> int:
+        """Device time at which the next tick runs [ns]."""
+        return self._tick * TICK_NS
+
+    @property
+    def true_position(self) -> tuple[float, float]:
+        """True cart position and pole angle now [m, rad]; never on the wire."""
+        return self._mechanics.position
+
+    @property
+    @abc.abstractmethod
+    def armed(self) -> bool:
+        """Whether the motor follows targets."""
+
+    @property
+    @abc.abstractmethod
+    def mode(self) -> str:
+        """What the motor does: "idle" and "held" are without torque, "homing" and "armed" are not."""
+
+    @property
+    @abc.abstractmethod
+    def watchdog(self) -> bool:
+        """Whether the motor was stopped because commands stayed away."""
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with its wire or its motors now; "" for nothing."""
+        return ""
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host; the next tick handles them."""
+        self._inbox += data
+        self.received_bytes += len(data)
+
+    def advance_to(self, device_ns: int) -> bytes:
+        """Run every tick up to and including ``device_ns``; return the bytes sent meanwhile."""
+        out = bytearray()
+        while self.device_ns <= device_ns:
+            out += self.tick()
+        return bytes(out)
+
+    @abc.abstractmethod
+    def tick(self) -> bytes:
+        """Run the next tick; return the bytes sent in it."""
+
+    def true_trajectory(self) -> TrueTrajectory:
+        """Return the true states of all ticks so far.
+
+        Raises:
+            ValueError: They were not kept.
+        """
+        if self._kept is None:
+            raise ValueError("the device was made with keep_truth=False")
+        rows = np.array(self._kept).reshape(-1, 7)
+        return TrueTrajectory(rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3:5], rows[:, 5], rows[:, 6])
+
+    def _keep(self, force_n: float, setpoint_m: float) -> None:
+        if self._kept is not None:
+            self._kept.extend((self._tick, *self._mechanics.truth_row(), force_n, setpoint_m))
+
+
+class CartpoleDevice(EmulatedDevice):
     """Firmware and mechanics of an emulated cart-pole.
 
     Control tick k, at device time k ms: (1) handle what was received, let due commands act; (2) slew the
@@ -54,9 +134,6 @@ class CartpoleDevice:
 
     Until armed the motor is off: the pole hangs, or is held upright by a hand after homing. Between arming
     and the first target the force is zero, because gains come only with targets.
-
-    Attributes:
-        received_bytes: How many have come from the host.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
@@ -69,25 +146,8 @@ class CartpoleDevice:
         self, truth: Truth, *, keep_truth: bool = False, start_angle_rad: float | None = None,
         firmware: Callable[[Truth, Mechanics], Firmware] = python_firmware,
     ) -> None:  # fmt: skip
-        self._mechanics = Mechanics(truth, start_angle_rad=start_angle_rad)
+        super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad), keep_truth=keep_truth)
         self._firmware = firmware(truth, self._mechanics)
-        self._inbox = b""
-        self.received_bytes = 0
-        self._tick = 0
-        self._kept: array[float] | None = array("d") if keep_truth else None
-
-    trouble: ClassVar[str] = ""
-    """What is wrong with its wire; an emulated bus tells more."""
-
-    @property
-    def device_ns(self) -> int:
-        """Device time at which the next tick runs [ns]."""
-        return self._tick * TICK_NS
-
-    @property
-    def true_position(self) -> tuple[float, float]:
-        """True cart position and pole angle now [m, rad]; never on the wire."""
-        return self._mechanics.position
 
     @property
     def armed(self) -> bool:
@@ -109,18 +169,6 @@ class CartpoleDevice:
         """Corrupt frames received so far."""
         return self._firmware.frame_errors
 
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the host; the next tick handles them."""
-        self._inbox += data
-        self.received_bytes += len(data)
-
-    def advance_to(self, device_ns: int) -> bytes:
-        """Run every tick up to and including ``device_ns``; return the bytes sent meanwhile."""
-        out = bytearray()
-        while self._tick * TICK_NS <= device_ns:
-            out += self.tick()
-        return bytes(out)
-
     def tick(self) -> bytes:
         """Run one control tick; return the bytes sent in it."""
         mechanics, firmware, out = self._mechanics, self._firmware, b""
@@ -137,8 +185,7 @@ class CartpoleDevice:
                 mechanics.release()
         force, report_due = firmware.control(motor)
         mechanics.observe(firmware.setpoint)
-        if self._kept is not None:
-            self._kept.extend((self._tick, *mechanics.truth_row(), force, firmware.setpoint))
+        self._keep(force, firmware.setpoint)
         if report_due:
             frame = firmware.report(mechanics.read())
             out += b"" if mechanics.loses_frame() else frame
@@ -146,10 +193,3 @@ class CartpoleDevice:
             firmware.finish_homing()
         self._tick += 1
         return out
-
-    def true_trajectory(self) -> TrueTrajectory:
-        """Return the true states of all ticks so far."""
-        if self._kept is None:
-            raise ValueError("the device was made with keep_truth=False")
-        rows = np.array(self._kept).reshape(-1, 7)
-        return TrueTrajectory(rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3:5], rows[:, 5], rows[:, 6])

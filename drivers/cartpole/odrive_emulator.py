@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.drivers.cartpole import protocol
-from deal_hw.drivers.cartpole.can_emulator import BusDevice, adapter_emulator
+from deal_hw.drivers.cartpole.can_emulator import adapter_emulator
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
 from deal_hw.drivers.cartpole.controller import FIRMWARE_VERSION, TICKS_PER_STATE, Mode
 from deal_hw.drivers.cartpole.description import DAMPING_NS_M, DESCRIPTION, EFFORT_LIMIT_N, STIFFNESS_N_M
-from deal_hw.drivers.cartpole.device import CartpoleDevice
+from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.odrive_frames import (
     CLOSED_LOOP,
@@ -277,7 +277,7 @@ def odrive_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> Car
     """Return an emulated ODrive and pole encoder behind a serial CAN adapter; node is the drive's."""
     faults = hazards.can
     parts = OdriveSettings(drive=faults.node)
-    devices: list[BusDevice] = [odrive_device(truth, parts, faults.dbc_version)]
+    devices: list[EmulatedDevice] = [odrive_device(truth, parts, faults.dbc_version)]
     if faults.duplicate_node:
         devices.append(odrive_device(truth, parts, faults.dbc_version, 0x5EC0_0000))
     settings = [f"enable_watchdog={ENABLE_WATCHDOG}", f"watchdog_timeout={WATCHDOG_TIMEOUT}"]

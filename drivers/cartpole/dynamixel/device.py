@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from array import array
 from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.device import TICK_NS, TrueTrajectory
+from deal_hw.drivers.cartpole.device import TICK_NS, EmulatedDevice
 from deal_hw.drivers.cartpole.dynamixel.emulated_servo import EmulatedServo
 from deal_hw.drivers.cartpole.dynamixel.packets import (
     BROADCAST,
@@ -53,7 +52,7 @@ _FREE_M = 10.0
 """A servo knows no rail: its goals may lie beyond the stops."""
 
 
-class DynamixelDevice:
+class DynamixelDevice(EmulatedDevice):
     """Two servos and the cart-pole that they drive and measure.
 
     Control tick k, at device time k ms: set-point, force from the state at its start, one physics step.
@@ -64,7 +63,6 @@ class DynamixelDevice:
     belt servo gets torque.
 
     Attributes:
-        received_bytes: How many have come from the host.
         servos: Belt servo and pole servo.
         fast_read: Whether they know Fast Sync and Bulk Read; older firmware does not.
         host_baud_rate: What the host's port is set to; a servo of another rate hears noise. None: the same.
@@ -84,12 +82,11 @@ class DynamixelDevice:
         *,
         keep_truth: bool = False,
     ) -> None:
-        self.received_bytes = 0
+        super().__init__(Mechanics(truth, read_rate_hz=DESCRIPTION.device_rate_hz), keep_truth=keep_truth)
         self.fast_read = True
         self.host_baud_rate: int | None = None
         self._settings = s = settings or DynamixelSettings()
         self._faults = faults or ServoFaults()
-        self._mechanics = Mechanics(truth, read_rate_hz=DESCRIPTION.device_rate_hz)
         self._loop = Servo(truth.parameters, self._mechanics.timestep_s, reach_m=_FREE_M)
         rng = np.random.default_rng([truth.seed, 0xD12])
         self._cart = EmulatedServo(s.cart_id, s.baud_rate, mode=s.operating_mode)
@@ -101,14 +98,12 @@ class DynamixelDevice:
         self._parser = PacketParser()
         self._replies: deque[tuple[int, bytes]] = deque()
         self._targets: deque[tuple[int, Target]] = deque()
-        self._tick = 0
         self._now_ns = 0
         self._alive_ns = 0
         self._torque = self._lit = self._let_go = self._stopped = False
         self._told: Target | None = None
         self._told_ns = -1
         self._first_ns: int | None = None
-        self._kept: array[float] | None = array("d") if keep_truth else None
         motor = self._mechanics.motor()
         self._mechanics.observe(motor.position)
         self._sense(motor)
@@ -121,11 +116,6 @@ class DynamixelDevice:
         """Device time at which something happens next, a tick or an answer [ns]."""
         tick_ns = self._tick * TICK_NS
         return min(tick_ns, max(self._replies[0][0], self._now_ns)) if self._replies else tick_ns
-
-    @property
-    def true_position(self) -> tuple[float, float]:
-        """True cart position and pole angle now [m, rad]; never on the wire."""
-        return self._mechanics.position
 
     @property
     def armed(self) -> bool:
@@ -177,11 +167,9 @@ class DynamixelDevice:
 
     def advance_to(self, device_ns: int) -> bytes:
         """Let everything happen up to and including ``device_ns``; return the bytes sent meanwhile."""
-        out = bytearray()
-        while self.device_ns <= device_ns:
-            out += self.tick()
+        out = super().advance_to(device_ns)
         self._now_ns = max(self._now_ns, device_ns)
-        return bytes(out)
+        return out
 
     def tick(self) -> bytes:
         """Let the next thing happen; return the bytes sent."""
@@ -190,13 +178,6 @@ class DynamixelDevice:
             return self._replies.popleft()[1]
         self._run_tick()
         return b""
-
-    def true_trajectory(self) -> TrueTrajectory:
-        """Return the true states of all ticks so far."""
-        if self._kept is None:
-            raise ValueError("the device was made with keep_truth=False")
-        rows = np.array(self._kept).reshape(-1, 7)
-        return TrueTrajectory(rows[:, 0].astype(np.int64), rows[:, 1:3], rows[:, 3:5], rows[:, 5], rows[:, 6])
 
     def reboot(self, servo: EmulatedServo) -> None:
         """Restart a servo, as after a dip of its supply."""
@@ -225,8 +206,7 @@ class DynamixelDevice:
             loop.accept(self._targets.popleft()[1])
         force = loop.update(motor.position, motor.velocity) if self._torque else 0.0
         mechanics.observe(loop.setpoint)
-        if self._kept is not None:
-            self._kept.extend((self._tick, *mechanics.truth_row(), force, loop.setpoint))
+        self._keep(force, loop.setpoint)
         self._sense(motor)
         mechanics.step(force)
         self._tick += 1
