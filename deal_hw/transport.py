@@ -91,6 +91,42 @@ class Transport(abc.ABC):
         self.close()
 
 
+class TransportWrapper(Transport):
+    """A transport on top of another, which it opens and closes; what goes through is the subclass's matter.
+
+    Args:
+        inner: The transport below.
+    """
+
+    def __init__(self, inner: Transport) -> None:
+        self._inner = inner
+
+    @property
+    def port(self) -> str:
+        """Where the path leads."""
+        return str(getattr(self._inner, "port", type(self._inner).__name__))
+
+    def open(self) -> None:
+        """Open the path."""
+        self._inner.open()
+
+    def close(self) -> None:
+        """Close the path."""
+        self._inner.close()
+
+    def reopen(self) -> None:
+        """Open the path again."""
+        self._inner.reopen()
+
+    def receive(self, timeout_s: float) -> Message:
+        """Return what arrived."""
+        return self._inner.receive(timeout_s)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the path; -1: each process opens its own."""
+        return int(self._inner.fileno())  # type: ignore[attr-defined]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WireOptions:
     """How a topic transport reaches its peers, beyond the port.

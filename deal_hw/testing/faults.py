@@ -8,7 +8,7 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.errors import ConfigurationError, TransportLostError
-from deal_hw.transport import Message, Transport
+from deal_hw.transport import Message, Transport, TransportWrapper
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +81,7 @@ class FrameFaults:
         return frame
 
 
-class FaultyTransport(Transport):
+class FaultyTransport(TransportWrapper):
     """A transport whose messages suffer on the way.
 
     Args:
@@ -98,7 +98,7 @@ class FaultyTransport(Transport):
         sent: FrameFaults | None = None,
         clock: Clock | None = None,
     ) -> None:
-        self.inner = inner
+        super().__init__(inner)
         self._received = received
         self._sent = sent
         self._clock = clock
@@ -111,18 +111,19 @@ class FaultyTransport(Transport):
     def open(self) -> None:
         """Open the inner transport."""
         self._check()
-        self.inner.open()
+        self._inner.open()
 
-    def close(self) -> None:
-        """Close the inner transport."""
-        self.inner.close()
+    def reopen(self) -> None:
+        """Open the inner transport again."""
+        self._check()
+        self._inner.reopen()
 
     def send(self, message: Message) -> None:
         """Send what is left of the message."""
         self._check()
         payload = message.payload if self._sent is None else self._sent.apply(message.payload)
         if payload:
-            self.inner.send(Message(message.channel, payload, message.stamp_ns))
+            self._inner.send(Message(message.channel, payload, message.stamp_ns))
 
     def receive(self, timeout_s: float) -> Message:
         """Receive what is left of a message; a lost one is as if it had never come."""
@@ -130,16 +131,12 @@ class FaultyTransport(Transport):
         left_s = timeout_s
         while True:
             self._check()
-            message = self.inner.receive(left_s)
+            message = self._inner.receive(left_s)
             if self._clock:
                 left_s = max(0.0, timeout_s - (self._clock.now_ns() - start_ns) / 1e9)
             payload = message.payload if self._received is None else self._received.apply(message.payload)
             if payload:
                 return Message(message.channel, payload, message.stamp_ns)
-
-    def fileno(self) -> int:
-        """Return the inner transport's descriptor."""
-        return int(self.inner.fileno())  # type: ignore[attr-defined]
 
     def _check(self) -> None:
         if self._unplugged:

@@ -11,25 +11,19 @@ from deal_hw.drivers.transports.can_bus import CanAddress, CanTransport
 from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import TransportError
-from deal_hw.transport import Message, Transport
+from deal_hw.transport import Message, TransportWrapper
 
 _MOST_AT_ONCE = 256
 
 
-class CanFrames(Transport):
+class CanFrames(TransportWrapper):
     """CAN frames as a stream of bytes, each frame as Linux' ``struct can_frame``; the channel is "".
 
     Args:
         inner: The bus.
     """
 
-    def __init__(self, inner: CanTransport) -> None:
-        self._inner = inner
-
-    @property
-    def port(self) -> str:
-        """Where the bus is."""
-        return self._inner.port
+    _inner: CanTransport
 
     @property
     def trouble(self) -> str:
@@ -40,18 +34,6 @@ class CanFrames(Transport):
     def error_frames(self) -> int:
         """How often the adapter reported an error."""
         return self._inner.error_frames
-
-    def open(self) -> None:
-        """Open the bus."""
-        self._inner.open()
-
-    def close(self) -> None:
-        """Close the bus."""
-        self._inner.close()
-
-    def reopen(self) -> None:
-        """Open the bus again where it was lost."""
-        self._inner.reopen()
 
     def send(self, message: Message) -> None:
         """Send frames one after the other; after one that fails the rest stays."""
@@ -68,10 +50,6 @@ class CanFrames(Transport):
                 frame = self._inner.receive(0.0)
                 frames.append(_pack(frame))
         return Message("", b"".join(frames), frame.stamp_ns)
-
-    def fileno(self) -> int:
-        """Return the descriptor of the bus; -1: each process opens its own path."""
-        return self._inner.fileno()
 
 
 def can_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool = True) -> CartpoleRobot:

@@ -6,10 +6,10 @@ from collections.abc import Collection
 from typing import NoReturn
 
 from deal_hw.errors import SafetyError
-from deal_hw.transport import Message, TopicTransport, Transport
+from deal_hw.transport import Message, TopicTransport, Transport, TransportWrapper
 
 
-class ListenOnly(Transport):
+class ListenOnly(TransportWrapper):
     """Wraps a transport; whoever sends through it gets an error, and nothing goes out.
 
     Args:
@@ -18,26 +18,6 @@ class ListenOnly(Transport):
 
     can_send = False
 
-    def __init__(self, inner: Transport) -> None:
-        self._inner = inner
-
-    @property
-    def port(self) -> str:
-        """Where the path leads."""
-        return str(getattr(self._inner, "port", type(self._inner).__name__))
-
-    def open(self) -> None:
-        """Open the path."""
-        self._inner.open()
-
-    def close(self) -> None:
-        """Close the path."""
-        self._inner.close()
-
-    def reopen(self) -> None:
-        """Open the path again."""
-        self._inner.reopen()
-
     def send(self, message: Message) -> NoReturn:
         """Refuse.
 
@@ -45,14 +25,6 @@ class ListenOnly(Transport):
             SafetyError: Always.
         """
         raise SafetyError(f"{self.port}: this run only listens (--dry-run): nothing may be sent")
-
-    def receive(self, timeout_s: float) -> Message:
-        """Return what arrived."""
-        return self._inner.receive(timeout_s)
-
-    def fileno(self) -> int:
-        """Return the descriptor of the path."""
-        return int(self._inner.fileno())  # type: ignore[attr-defined]
 
 
 class ListenOnlyTopics(ListenOnly, TopicTransport):

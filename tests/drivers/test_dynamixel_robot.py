@@ -253,7 +253,7 @@ def test_a_lost_command_is_counted_and_all_of_the_next_is_sent() -> None:
 
         def send(self, message: Message) -> None:
             if not self.deaf:
-                self.inner.send(message)
+                self._inner.send(message)
             self.deaf = False
 
     wire = Wire(lambda t: Deaf(t, received=None))
@@ -446,8 +446,8 @@ def test_noise_is_another_device() -> None:
     class Chatter(FaultyTransport):
         def receive(self, timeout_s: float) -> Message:
             with contextlib.suppress(TransportTimeoutError):
-                self.inner.receive(timeout_s)
-            return Message("", b"GRBL 1.1\r\n", 0) if timeout_s > 0 else self.inner.receive(0.0)
+                self._inner.receive(timeout_s)
+            return Message("", b"GRBL 1.1\r\n", 0) if timeout_s > 0 else self._inner.receive(0.0)
 
     with pytest.raises(WrongDeviceError, match="another device on this port"):
         Wire(lambda t: Chatter(t)).robot.connect()
