@@ -59,8 +59,11 @@ MAKERS: Final[Mapping[tuple[str, str], str]] = {
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
 descriptor of the port that a parent process opened. It does no I/O.
 """
-CAN_NODES: Final[Mapping[str, tuple[int, ...]]] = {"can": (1,), "odrive": (0, 2)}
-"""Transports over a CAN bus, and the numbers that their devices usually have."""
+CAN_BUSES: Final[Mapping[str, str]] = {
+    "can": "deal_hw.drivers.cartpole.can_robot:can_bus",
+    "odrive": "deal_hw.drivers.cartpole.odrive_robot:odrive_bus",
+}
+"""Transports over a CAN bus, and what tells the bus and the nodes that a port means."""
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     "cartpole": ("serial", "can", "odrive", "dynamixel"),
     "go2": TOPIC_TRANSPORTS,
@@ -69,7 +72,7 @@ REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
 """Transports that reach each robot; the first is the default."""
 
 __all__ = [
-    "CAN_NODES",
+    "CAN_BUSES",
     "DESCRIPTIONS",
     "MAKERS",
     "REACHED_BY",
@@ -78,6 +81,7 @@ __all__ = [
     "TOPIC_TRANSPORTS",
     "TRANSPORTS",
     "adopt_robot",
+    "can_bus",
     "claim_name",
     "default_transport",
     "driver_description",
@@ -276,6 +280,17 @@ def parameter_spaces(name: str) -> Mapping[str, Callable[[], ParameterSpace]]:
     return found
 
 
+def can_bus(transport_name: str, port: str) -> tuple[str, tuple[int, ...]]:
+    """Return the bus of a port on CAN, and the numbers of the devices that are expected there.
+
+    Raises:
+        UnknownNameError: The transport does not use CAN.
+        ConfigurationError: The port means nothing.
+    """
+    found: tuple[str, tuple[int, ...]] = _find("CAN transport", CAN_BUSES, transport_name)(port)
+    return found
+
+
 def default_transport(name: str) -> str:
     """Return the transport that usually reaches a robot.
 
@@ -328,7 +343,7 @@ def _driver(name: str) -> Any:
     return _find("robot", ROBOTS, name)
 
 
-def _find(what: str, table: dict[str, str], name: str) -> Any:
+def _find(what: str, table: Mapping[str, str], name: str) -> Any:
     if name not in table:
         raise UnknownNameError(what, name, table)
     module, _, attribute = table[name].partition(":")

@@ -13,12 +13,20 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from deal_hw.cli.doctor_can import examine_can, list_adapters
+from deal_hw.cli.doctor_can import list_adapters, listen_to_bus
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.cli.options import Range, check_ranges
 from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import CAN_NODES, TOPIC_TRANSPORTS, default_transport, make_robot, make_topic_transport
+from deal_hw.drivers import (
+    CAN_BUSES,
+    TOPIC_TRANSPORTS,
+    can_bus,
+    default_transport,
+    make_robot,
+    make_topic_transport,
+)  # fmt: skip
+from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
@@ -123,8 +131,9 @@ def _examine(config: Doctor) -> Iterator[Finding]:
     clock = MonotonicClock()
     try:
         if name not in TOPIC_TRANSPORTS:
-            if name in CAN_NODES:
-                yield from examine_can(config.port, clock, min(1.0, config.seconds), *CAN_NODES[name])
+            if name in CAN_BUSES:
+                bus, nodes = can_bus(name, config.port)
+                yield from listen_to_bus(open_can(bus, clock), clock, min(1.0, config.seconds), *nodes)
             if name == "dynamixel":
                 from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.transports.can_bus import CanAddress, CanTransport
-from deal_hw.drivers.transports.can_transport import can_links, open_can
+from deal_hw.drivers.transports.can_bus import CanTransport
+from deal_hw.drivers.transports.can_transport import can_links
 from deal_hw.drivers.transports.slcan_transport import serial_adapters
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.findings import Finding, Level
@@ -84,14 +84,6 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
             "can", Level.WARN, f"{transport.error_frames} errors on the bus; the last: {transport.trouble}",
             "check wiring, termination and bit rate",
         )  # fmt: skip
-
-
-def examine_can(port: str, clock: Clock, seconds: float, *nodes: int) -> Iterator[Finding]:
-    """Yield what is heard on the bus of a port; arguments and errors as :func:`listen_to_bus`."""
-    address = CanAddress.parse(port)
-    given = (address.node, address.encoder)
-    expected = [usual if own is None else own for usual, own in zip(nodes, given, strict=False)]
-    yield from listen_to_bus(open_can(port, clock), clock, seconds, *expected)
 
 
 def _ip_details() -> dict[str, dict[str, Any]]:

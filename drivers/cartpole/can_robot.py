@@ -7,7 +7,7 @@ import contextlib
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink, accept, check_node
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.transports.can_bus import CanAddress, CanTransport
+from deal_hw.drivers.transports.can_bus import CanTransport, take_settings
 from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.errors import TransportError
@@ -52,6 +52,16 @@ class CanFrames(TransportWrapper):
         return Message("", b"".join(frames), frame.stamp_ns)
 
 
+def can_bus(port: str) -> tuple[str, tuple[int]]:
+    """Return the bus of a port, and the device's number on it.
+
+    Raises:
+        ConfigurationError: The port means nothing.
+    """
+    bus, given = take_settings(port, {"node": 0})
+    return bus, (check_node(given.get("node", NODE)),)
+
+
 def can_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool = True) -> CartpoleRobot:
     """Return a cart-pole on a CAN bus; nothing is opened yet.
 
@@ -64,9 +74,8 @@ def can_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool 
     Raises:
         ConfigurationError: The port means nothing.
     """
-    given = CanAddress.parse(port).node
-    node = check_node(NODE if given is None else given)
-    frames = CanFrames(open_can(port, clock, accept(node), fd))
+    bus, (node,) = can_bus(port)
+    frames = CanFrames(open_can(bus, clock, accept(node), fd))
     return CartpoleRobot(frames if can_send else listen_only(frames), clock, link=lambda: CanLink(node))
 
 

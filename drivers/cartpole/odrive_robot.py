@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Final
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.cartpole.can_link import accept
 from deal_hw.drivers.cartpole.can_robot import CanFrames
 from deal_hw.drivers.cartpole.odrive_link import OdriveLink, OdriveSettings
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.transports.can_bus import CanAddress
+from deal_hw.drivers.transports.can_bus import take_settings
 from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.transport import Transport
+
+_LOWEST: Final = {
+    "node": 0, "encoder": 1, "mm_per_turn": 1, "kv": 1, "enable_watchdog": 1, "watchdog_timeout": 1,
+}  # fmt: skip
+"""Settings that a port may give, and the lowest value of each."""
 
 
 class OdriveRobot(CartpoleRobot):
@@ -30,20 +35,36 @@ class OdriveRobot(CartpoleRobot):
         self.watchdog_s = settings.watchdog_s if settings.enable_watchdog else 0.0  # type: ignore[misc]
 
 
-def odrive_settings(port: str) -> OdriveSettings:
-    """Return what a port says of the parts.
+def odrive_settings(port: str) -> tuple[str, OdriveSettings]:
+    """Return the bus of a port, and what the port says of the parts.
+
+    Args:
+        port: Such as ``can0?node=5&mm_per_turn=60&kv=150``: numbers on the bus, travel of the cart a turn of
+            the motor [mm], the motor's constant [rev/min/V], numbers of the drive's watchdog settings.
 
     Raises:
         ConfigurationError: The port means nothing.
     """
-    address = CanAddress.parse(port)
-    given: dict[str, Any] = {
-        "drive": address.node, "encoder": address.encoder, "enable_watchdog": address.enable_watchdog,
-        "watchdog_timeout": address.watchdog_timeout,
-        "metres_per_turn": None if address.mm_per_turn is None else address.mm_per_turn / 1e3,
-        "torque_constant": None if address.kv is None else 8.27 / address.kv,
-    }  # fmt: skip
-    return OdriveSettings(**{name: value for name, value in given.items() if value is not None})
+    bus, given = take_settings(port, _LOWEST)
+    settings = OdriveSettings()
+    return bus, OdriveSettings(
+        drive=given.get("node", settings.drive),
+        encoder=given.get("encoder", settings.encoder),
+        metres_per_turn=given["mm_per_turn"] / 1e3 if "mm_per_turn" in given else settings.metres_per_turn,
+        torque_constant=8.27 / given["kv"] if "kv" in given else settings.torque_constant,
+        enable_watchdog=given.get("enable_watchdog", 0),
+        watchdog_timeout=given.get("watchdog_timeout", 0),
+    )
+
+
+def odrive_bus(port: str) -> tuple[str, tuple[int, int]]:
+    """Return the bus of a port, and the numbers of drive and encoder on it.
+
+    Raises:
+        ConfigurationError: The port means nothing.
+    """
+    bus, settings = odrive_settings(port)
+    return bus, (settings.drive, settings.encoder)
 
 
 def odrive_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bool = True) -> OdriveRobot:
@@ -58,6 +79,6 @@ def odrive_robot(port: str, clock: Clock, fd: int | None = None, *, can_send: bo
     Raises:
         ConfigurationError: The port means nothing.
     """
-    settings = odrive_settings(port)
-    frames = CanFrames(open_can(port, clock, accept(settings.drive, settings.encoder), fd))
+    bus, settings = odrive_settings(port)
+    frames = CanFrames(open_can(bus, clock, accept(settings.drive, settings.encoder), fd))
     return OdriveRobot(frames if can_send else listen_only(frames), clock, settings)

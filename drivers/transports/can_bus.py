@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, urlencode
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError, UnknownNameError
 from deal_hw.transport import Transport
 
 BITRATE: Final = 500_000
-_SETTINGS: Final = (
-    "bitrate", "node", "encoder", "mm_per_turn", "kv", "enable_watchdog", "watchdog_timeout",
-)  # fmt: skip
+_BITRATE: Final = "bitrate"
+_MOST: Final = 1_000_000
 NO_ACKNOWLEDGE: Final = (
     "no other node acknowledges: is the device powered, does it use this bit rate, are both ends of the bus "
     "terminated (60 ohm between CAN-H and CAN-L)?"
@@ -28,29 +27,17 @@ BUS_OFF: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CanAddress:
-    """Where a CAN device is, as in ``slcan:/dev/ttyACM0?bitrate=1000000&node=3``.
+    """Where a CAN bus is, as in ``slcan:/dev/ttyACM0?bitrate=1000000``.
 
     Attributes:
         interface: Name of a python-can interface: "socketcan", "slcan", "virtual", "pcan", ...
         channel: The interface's name for the bus: "can0", a serial port.
         bitrate: Bits per second of the bus; socketcan's is set by ``ip link``.
-        node: Number of the device on the bus; None: the driver's usual one.
-        encoder: Number of a second device, the pole's encoder; None: the driver's usual one.
-        mm_per_turn: Travel of the cart a turn of the motor [mm], for a motor drive.
-        kv: Of the motor [rev/min/V], for a motor drive.
-        enable_watchdog: Number of a motor drive's setting, as its firmware numbers them.
-        watchdog_timeout: The same.
     """
 
     interface: str
     channel: str
     bitrate: int = BITRATE
-    node: int | None = None
-    encoder: int | None = None
-    mm_per_turn: int | None = None
-    kv: int | None = None
-    enable_watchdog: int | None = None
-    watchdog_timeout: int | None = None
 
     @classmethod
     def parse(cls, port: str) -> CanAddress:
@@ -60,7 +47,7 @@ class CanAddress:
             ConfigurationError: It means nothing.
             UnknownNameError: A setting after ``?`` does not exist.
         """
-        place, _, query = port.partition("?")
+        place, values = take_settings(port, {_BITRATE: 1})
         interface, colon, channel = place.partition(":")
         if not colon:
             interface, channel = ("slcan" if "/" in place else "socketcan"), place
@@ -69,15 +56,37 @@ class CanAddress:
                 f"port {port!r}: a CAN port is INTERFACE:CHANNEL, such as socketcan:can0 or "
                 "slcan:/dev/ttyACM0?bitrate=500000"
             )
-        values: dict[str, int] = {}
-        for name, value in parse_qsl(query, keep_blank_values=True):
-            if name not in _SETTINGS:
-                raise UnknownNameError("setting of a CAN port", name, _SETTINGS)
-            least = 0 if name == "node" else 1
-            if not value.isascii() or not value.isdigit() or not least <= int(value[:9]) <= 1_000_000:
-                raise ConfigurationError(f"port {port!r}: {name} is a whole number, {least} to 1000000")
-            values[name] = int(value)
         return cls(interface=interface, channel=channel, **values)
+
+
+def take_settings(port: str, lowest: Mapping[str, int]) -> tuple[str, dict[str, int]]:
+    """Take a driver's settings out of a port, such as ``node`` out of ``can0?bitrate=250000&node=3``.
+
+    Args:
+        port: As the user gave it.
+        lowest: The settings by name, with the lowest value of each.
+
+    Returns:
+        The port without them, and those that were given.
+
+    Raises:
+        ConfigurationError: A value is no whole number of the allowed range.
+        UnknownNameError: A setting is neither one of these nor one of the bus.
+    """
+    place, _, query = port.partition("?")
+    allowed = tuple(dict.fromkeys((_BITRATE, *lowest)))
+    taken: dict[str, int] = {}
+    rest = []
+    for name, value in parse_qsl(query, keep_blank_values=True):
+        if name not in allowed:
+            raise UnknownNameError("setting of a CAN port", name, allowed)
+        if name not in lowest:
+            rest.append((name, value))
+            continue
+        if not value.isascii() or not value.isdigit() or not lowest[name] <= int(value[:9]) <= _MOST:
+            raise ConfigurationError(f"port {port!r}: {name} is a whole number, {lowest[name]} to {_MOST}")
+        taken[name] = int(value)
+    return place + ("?" + urlencode(rest) if rest else ""), taken
 
 
 class CanTransport(Transport):

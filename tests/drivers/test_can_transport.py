@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.transports import can_transport
-from deal_hw.drivers.transports.can_bus import CanAddress
+from deal_hw.drivers.transports.can_bus import CanAddress, take_settings
 from deal_hw.drivers.transports.can_transport import (
     PythonCanTransport,
     can_links,
@@ -179,11 +179,11 @@ class TestInheritedSlcan(TransportSuite):
     ("port", "meaning"),
     [
         ("can0", CanAddress(interface="socketcan", channel="can0")),
-        ("socketcan:can1?node=3", CanAddress(interface="socketcan", channel="can1", node=3)),
+        ("socketcan:can1", CanAddress(interface="socketcan", channel="can1")),
         ("/dev/ttyACM0", CanAddress(interface="slcan", channel="/dev/ttyACM0")),
         (
-            "slcan:/dev/ttyACM0?bitrate=1000000&node=2&encoder=5",
-            CanAddress(interface="slcan", channel="/dev/ttyACM0", bitrate=1_000_000, node=2, encoder=5),
+            "slcan:/dev/ttyACM0?bitrate=1000000",
+            CanAddress(interface="slcan", channel="/dev/ttyACM0", bitrate=1_000_000),
         ),
         ("pcan:PCAN_USBBUS1", CanAddress(interface="pcan", channel="PCAN_USBBUS1")),
     ],
@@ -193,8 +193,26 @@ def test_ports_mean_interface_channel_and_settings(port: str, meaning: CanAddres
     assert CanAddress.parse(port) == meaning
 
 
+def test_a_driver_takes_its_settings_out_of_a_port() -> None:
+    """The bus keeps its own; others are refused with what is allowed."""
+    port = "slcan:/dev/ttyACM0?node=2&bitrate=1000000&encoder=5"
+    bus, given = take_settings(port, {"node": 0, "encoder": 1})
+    assert bus == "slcan:/dev/ttyACM0?bitrate=1000000"
+    assert given == {"node": 2, "encoder": 5}
+    assert take_settings("can1", {"node": 0}) == ("can1", {})
+    with pytest.raises(UnknownNameError, match="bitrate, node"):
+        take_settings(port, {"node": 0})
+
+
+@pytest.mark.parametrize("query", ["node=x", "node=-1", "node=", "encoder=0", "node=1000001", "node=1e3"])
+def test_settings_are_whole_numbers_of_their_range(query: str) -> None:
+    """With the lowest and the highest."""
+    with pytest.raises(ConfigurationError, match="whole number"):
+        take_settings(f"can0?{query}", {"node": 0, "encoder": 1})
+
+
 @pytest.mark.parametrize(
-    "port", ["", "slcan:", ":can0", "can0?node=x", "can0?node=-1", "can0?bitrate=2000000"]
+    "port", ["", "slcan:", ":can0", "can0?node=x", "can0?bitrate=0", "can0?bitrate=2000000"]
 )
 def test_ports_that_mean_nothing_are_refused(port: str) -> None:
     """With the form that a port has."""

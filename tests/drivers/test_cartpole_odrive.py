@@ -427,13 +427,14 @@ class FrameLoss(FrameFaults):
 
 def test_a_port_says_how_the_parts_are_joined() -> None:
     """Node numbers, pulley, motor and the watchdog's settings."""
-    parts = odrive_settings(
+    bus, parts = odrive_settings(
         "can0?node=5&encoder=6&mm_per_turn=60&kv=150&enable_watchdog=437&watchdog_timeout=438"
     )
+    assert bus == "can0"
     assert (parts.drive, parts.encoder, parts.metres_per_turn) == (5, 6, 0.06)
     assert parts.torque_constant == pytest.approx(0.05513, rel=1e-3)
     assert (parts.enable_watchdog, parts.watchdog_timeout) == (437, 438)
-    assert odrive_settings("can0?node=0") == OdriveSettings()
+    assert odrive_settings("can0?node=0") == ("can0", OdriveSettings())
 
 
 @pytest.mark.parametrize(
