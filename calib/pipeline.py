@@ -25,7 +25,6 @@ from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
     Uncertainty,
-    correlation_time,
     uncertainty_at,
     with_rows,
 )
@@ -186,7 +185,8 @@ class Calibration(CalibrationMethod[Problem]):
             run.offer("local fit", local)
         elif self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
-        if local is not None and needs_no_search(problem, local):
+        # What another minimum leaves can be as small as noise, but it has a pattern.
+        if local is not None and conclusive(problem, local, MISMATCH.white_samples):
             found = to_the_noise(run, without_search(problem, budget, local), local)
         else:
             if local is not None and progress is not None:
@@ -363,24 +363,18 @@ def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> No
         progress(Progress(BEFORE_SEARCH, 1, 1, f"the data cannot tell: {'; '.join(words)}"))
 
 
-def conclusive(problem: Problem, fit: Refined) -> bool:
+def conclusive(problem: Problem, fit: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
     """Return whether a fit needs no other judge: what it leaves has the size of the sensors' noise.
 
     A residual that was chosen explains itself: only what no fit has seen can judge then.
+
+    Args:
+        problem: Recordings and simulator.
+        fit: The fit.
+        longest: Autocorrelation time up to which its residual passes for noise [samples].
     """
     chosen = problem.known_std is not None and problem.robot.base is None
-    return not chosen and not unexplained(fit)
-
-
-def needs_no_search(problem: Problem, local: Refined) -> bool:
-    """Return whether the local fit is the answer: its residual is noise, and white as noise is.
-
-    What another minimum leaves can be as small as noise, but it has a pattern.
-    """
-    if not conclusive(problem, local):
-        return False
-    negligible = local.chi2 <= MISMATCH.negligible_chi2
-    return negligible or correlation_time(local.normal.residual) <= MISMATCH.white_samples
+    return not chosen and not unexplained(fit, longest)
 
 
 def without_search(problem: Problem, budget: Budget, local: Refined) -> CalibrationResult:

@@ -93,13 +93,18 @@ def latency_alarms(problem: Problem, latency_s: float) -> tuple[Alarm, ...]:
     )
 
 
-def unexplained(refined: Refined) -> bool:
-    """Return whether the residual is larger, or autocorrelated longer, than noise is."""
+def unexplained(refined: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
+    """Return whether the residual is larger, or autocorrelated longer, than noise is.
+
+    Args:
+        refined: A fit.
+        longest: Autocorrelation time up to which it passes for noise [samples].
+    """
     if refined.chi2 <= MISMATCH.negligible_chi2:
         return False
     if refined.chi2 > MISMATCH.chi2:
         return True
-    return correlation_time(refined.normal.residual) > MISMATCH.correlation_samples
+    return correlation_time(refined.normal.residual) > longest
 
 
 def judge(

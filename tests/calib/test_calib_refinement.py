@@ -16,9 +16,9 @@ from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
-from deal_hw.calib.pipeline import Calibration, CalibrationRun, Refinement, conclusive, needs_no_search
+from deal_hw.calib.pipeline import Calibration, CalibrationRun, Refinement, conclusive
 from deal_hw.calib.search.resume import Restarts
-from deal_hw.calib.uncertainty.intervals import SETTINGS, correlation_time, intervals, uncertainty
+from deal_hw.calib.uncertainty.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
 from deal_hw.calib.uncertainty.time_steps import LatencyScan
 from deal_hw.calib.validation.metrics import HeldOut, error_percent, interval_score, log_error_x100
@@ -86,10 +86,11 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
         return dataclasses.replace(found, normal=normal, chi2=float(np.mean(residual**2)))
 
     assert correlation_time((pattern,)) == pytest.approx(1.5, rel=0.1)
-    assert needs_no_search(problem, leaving(white))
-    assert conclusive(problem, leaving(pattern)) and not needs_no_search(problem, leaving(pattern))
+    assert conclusive(problem, leaving(white), MISMATCH.white_samples)
+    assert conclusive(problem, leaving(pattern))
+    assert not conclusive(problem, leaving(pattern), MISMATCH.white_samples)
     # What is far below the noise needs no explanation.
-    assert needs_no_search(problem, leaving(0.5 * pattern))
+    assert conclusive(problem, leaving(0.5 * pattern), MISMATCH.white_samples)
 
 
 def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: Demonstration) -> None:
