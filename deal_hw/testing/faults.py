@@ -81,6 +81,57 @@ class FrameFaults:
         return frame
 
 
+class OneBadFrame(FrameFaults):
+    """Changes one byte of the next message when told to, and no other.
+
+    Args:
+        byte: Which one of the message's bytes; negative counts from the end.
+    """
+
+    def __init__(self, byte: int) -> None:
+        super().__init__(FaultRates(), np.random.default_rng(0), None)
+        self._byte = byte
+        self._armed = False
+
+    def corrupt_next(self) -> None:
+        """Have the next message arrive corrupt."""
+        self._armed = True
+
+    def apply(self, data: bytes) -> bytes:
+        """Flip bits of the byte; none becomes 0, which would end a COBS frame."""
+        if not self._armed:
+            return data
+        self._armed = False
+        self.corrupted += 1
+        changed = bytearray(data)
+        changed[self._byte] = changed[self._byte] ^ 0x55 or 1
+        return bytes(changed)
+
+
+class RecordFaults(FrameFaults):
+    """Faults of frames of a fixed size. Their first bytes are spared: CAN controllers filter by identifiers.
+
+    Args:
+        rates: How often.
+        rng: Source of randomness.
+        size: Bytes of a frame.
+        header: Bytes at its beginning that stay.
+    """
+
+    def __init__(self, rates: FaultRates, rng: np.random.Generator, *, size: int, header: int) -> None:
+        super().__init__(rates, rng, None)
+        self._size, self._header = size, header
+
+    def apply(self, data: bytes) -> bytes:
+        """Treat each frame's data alone; a repeated frame has its header again."""
+        out, width = b"", self._size - self._header
+        for k in range(0, len(data), self._size):
+            head, body = data[k : k + self._header], data[k + self._header : k + self._size]
+            left = self._frame(body)
+            out += b"".join(head + left[j : j + width] for j in range(0, len(left), width))
+        return out
+
+
 class FaultyTransport(TransportWrapper):
     """A transport whose messages suffer on the way.
 

@@ -109,3 +109,18 @@ def dds_peer() -> Path:
 def dds_domain() -> int:
     """A domain that other runs on this machine hardly use at the same time."""
     return SystemRandom().randrange(10, 100)
+
+
+@pytest.fixture(scope="session")
+def crc_bit_by_bit() -> Callable[[bytes], int]:
+    """Return CRC-16/IBM-3740 from its definition: polynomial 0x1021, start 0xFFFF, highest bit first."""
+
+    def crc_of(data: bytes) -> int:
+        crc = 0xFFFF
+        for byte in data:
+            crc ^= byte << 8
+            for _ in range(8):
+                crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+        return crc
+
+    return crc_of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -49,16 +50,6 @@ def frames_of(data: bytes) -> list[bytes]:
     return [data[k : k + FRAME.size] for k in range(0, len(data), FRAME.size)]
 
 
-def crc_bit_by_bit(data: bytes) -> int:
-    """CRC-16/IBM-3740 from its definition: polynomial 0x1021, start 0xFFFF, most significant bit first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
-    return crc
-
-
 @pytest.mark.parametrize(("expression", "frames"), vectors())
 def test_the_page_tells_the_truth(expression: str, frames: bytes) -> None:
     """Each of its messages has exactly the frames that stand beside it, in both directions."""
@@ -67,7 +58,7 @@ def test_the_page_tells_the_truth(expression: str, frames: bytes) -> None:
     assert list(CanLink().decode(frames)) == [message]
 
 
-def test_a_state_by_hand() -> None:
+def test_a_state_by_hand(crc_bit_by_bit: Callable[[bytes], int]) -> None:
     """Offsets of the page's table, packed by struct, with a CRC from its definition."""
     parts = [
         struct.pack("<II", 2102, 499),

@@ -39,53 +39,20 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
-from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
+from deal_hw.testing.faults import FaultRates, FaultyTransport, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.testing.scripted_device import ScriptedDevice
 from deal_hw.transport import Message, WireOptions
 from deal_hw.types import RobotState, Status
 
 MS = 1_000_000
 
 
-class ScriptedNode:
-    """A node that answers whatever comes with fixed frames."""
-
-    def __init__(self, answer: bytes) -> None:
-        self.device_ns = 0
-        self._answer = answer
-        self._pending = b""
-
-    def receive(self, data: bytes) -> None:
-        """Any frame provokes the answer."""
-        self._pending += self._answer
-
-    def tick(self) -> bytes:
-        """Send the answer, once."""
-        self.device_ns += MS
-        out, self._pending = self._pending, b""
-        return out
-
-
-class OneBadFrame(FrameFaults):
-    """Changes one data byte of the next frame when told to."""
-
-    def __init__(self) -> None:
-        super().__init__(FaultRates(), np.random.default_rng(0), None)
-        self.pending = False
-
-    def apply(self, data: bytes) -> bytes:
-        """Flip bits in the data of the first frame."""
-        if self.pending:
-            self.pending = False
-            return data[:10] + bytes([data[10] ^ 0x55]) + data[11:]
-        return data
-
-
 def scripted(message: protocol.AnyMessage | None) -> CartpoleRobot:
     """Return a driver in front of a node that always says the same."""
     clock = VirtualClock()
     answer = b"" if message is None else CanLink().encode(message)
-    return CartpoleRobot(VirtualTransport(ScriptedNode(answer), clock), clock, link=CanLink)
+    return CartpoleRobot(VirtualTransport(ScriptedDevice(answer), clock), clock, link=CanLink)
 
 
 def info(kind: str = "cartpole", version: int = 1) -> protocol.Info:
@@ -96,12 +63,9 @@ def info(kind: str = "cartpole", version: int = 1) -> protocol.Info:
 class TestCartpoleOnCan(RobotSuite):
     @pytest.fixture
     def bench(self) -> RobotBench:
-        clock, fault = VirtualClock(), OneBadFrame()
+        clock, fault = VirtualClock(), OneBadFrame(10)
         wire = VirtualTransport(can_device(nominal_truth("ideal")), clock)
         robot = CartpoleRobot(FaultyTransport(wire, received=fault), clock, link=CanLink)
-
-        def corrupt() -> None:
-            fault.pending = True
 
         return RobotBench(
             robot=robot,
@@ -109,7 +73,7 @@ class TestCartpoleOnCan(RobotSuite):
             newer=scripted(info(version=2)),
             silent=scripted(None),
             unplug=wire.unplug,
-            corrupt=corrupt,
+            corrupt=fault.corrupt_next,
         )
 
 
@@ -303,7 +267,7 @@ def test_five_percent_of_corrupt_and_lost_lines_are_survived() -> None:
     rates = FaultRates(corrupt=0.05, drop=0.02, duplicate=0.02)
     clock = VirtualClock()
     wire = VirtualTransport(can_device(nominal_truth()), clock)
-    faults = [FrameLoss(rates, np.random.default_rng(seed)) for seed in (1, 2)]
+    faults = [RecordFaults(rates, np.random.default_rng(seed), size=FRAME.size, header=8) for seed in (1, 2)]
     robot = CartpoleRobot(FaultyTransport(wire, faults[0], faults[1]), clock, link=CanLink)
     robot.connect()
     robot.home(5.0)
@@ -318,22 +282,6 @@ def test_five_percent_of_corrupt_and_lost_lines_are_survived() -> None:
             assert abs(state.position[1]) < 10
     assert sequences == sorted(set(sequences))
     assert robot.link_errors > 50
-
-
-class FrameLoss(FrameFaults):
-    """Faults of single CAN frames: an identifier is spared, since hardware filters by it."""
-
-    def __init__(self, rates: FaultRates, rng: np.random.Generator) -> None:
-        super().__init__(rates, rng, None)
-
-    def apply(self, data: bytes) -> bytes:
-        """Treat each frame's data alone."""
-        out = b""
-        for k in range(0, len(data), FRAME.size):
-            head, body = data[k : k + 8], data[k + 8 : k + FRAME.size]
-            left = self._frame(body)
-            out += b"".join(head + left[j : j + 8] for j in range(0, len(left), 8))
-        return out
 
 
 # Plumbing.

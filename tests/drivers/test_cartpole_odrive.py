@@ -34,8 +34,9 @@ from deal_hw.errors import (
     TransportTimeoutError,
     WrongDeviceError,
 )
-from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
+from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.testing.scripted_device import ScriptedDevice
 from deal_hw.types import RobotState, Status
 
 MS = 1_000_000
@@ -49,44 +50,10 @@ def frames(data: bytes) -> list[tuple[int, bytes]]:
     return [(identifier, payload[:length]) for identifier, length, payload in FRAME.iter_unpack(data)]
 
 
-class ScriptedBus:
-    """Nodes that answer whatever comes with fixed frames."""
-
-    def __init__(self, answer: bytes) -> None:
-        self.device_ns = 0
-        self._answer = answer
-        self._pending = b""
-
-    def receive(self, data: bytes) -> None:
-        """Any frame provokes the answer."""
-        self._pending += self._answer
-
-    def tick(self) -> bytes:
-        """Send the answer, once."""
-        self.device_ns += MS
-        out, self._pending = self._pending, b""
-        return out
-
-
-class OneBadFrame(FrameFaults):
-    """Changes the encoder's part of the next sample when told to."""
-
-    def __init__(self) -> None:
-        super().__init__(FaultRates(), np.random.default_rng(0), None)
-        self.pending = False
-
-    def apply(self, data: bytes) -> bytes:
-        """Flip bits in the last frame's data."""
-        if self.pending:
-            self.pending = False
-            return data[:-3] + bytes([data[-3] ^ 0x55]) + data[-2:]
-        return data
-
-
 def scripted(answer: bytes, parts: OdriveSettings = PARTS) -> OdriveRobot:
     """Return a driver in front of nodes that always say the same."""
     clock = VirtualClock()
-    return OdriveRobot(VirtualTransport(ScriptedBus(answer), clock), clock, parts)
+    return OdriveRobot(VirtualTransport(ScriptedDevice(answer), clock), clock, parts)
 
 
 def heartbeat(state: int = IDLE, errors: int = 0) -> bytes:
@@ -129,11 +96,8 @@ class Wire:
 class TestOdriveRobot(RobotSuite):
     @pytest.fixture
     def bench(self) -> RobotBench:
-        fault = OneBadFrame()
+        fault = OneBadFrame(-3)
         wire = Wire(fault=fault)
-
-        def corrupt() -> None:
-            fault.pending = True
 
         return RobotBench(
             robot=wire.robot,
@@ -141,7 +105,7 @@ class TestOdriveRobot(RobotSuite):
             newer=scripted(heartbeat() + encoder_info(version=2)),
             silent=scripted(b""),
             unplug=wire.virtual.unplug,
-            corrupt=corrupt,
+            corrupt=fault.corrupt_next,
         )
 
 
@@ -396,7 +360,7 @@ def test_two_encoders_under_one_number_are_a_fault() -> None:
 
 def test_five_percent_of_lost_frames_are_survived() -> None:
     """Requests are repeated; samples that lost a part are refused whole."""
-    faults = FrameLoss(FaultRates(drop=0.05), np.random.default_rng(3))
+    faults = RecordFaults(FaultRates(drop=0.05), np.random.default_rng(3), size=FRAME.size, header=8)
     wire = Wire(fault=faults)
     robot = wire.armed()
     # What waited since connect still counts from the drive's power-on.
@@ -409,17 +373,6 @@ def test_five_percent_of_lost_frames_are_survived() -> None:
             assert abs(state.position[0]) < 0.41
     assert sequences == sorted(set(sequences))
     assert robot.link_errors > 20
-
-
-class FrameLoss(FrameFaults):
-    """Loses single CAN frames."""
-
-    def __init__(self, rates: FaultRates, rng: np.random.Generator) -> None:
-        super().__init__(rates, rng, None)
-
-    def apply(self, data: bytes) -> bytes:
-        """Treat each frame alone."""
-        return b"".join(self._frame(data[k : k + FRAME.size]) for k in range(0, len(data), FRAME.size))
 
 
 # Ports and runs.

@@ -13,50 +13,17 @@ from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
-from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
+from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.testing.scripted_device import ScriptedDevice
 from deal_hw.transport import Message, Transport
 from deal_hw.types import Status
-
-
-class ScriptedCore:
-    """A device that answers whatever comes with fixed bytes, in real frames."""
-
-    def __init__(self, answer: bytes) -> None:
-        self.device_ns = 0
-        self._answer = answer
-        self._pending = b""
-
-    def receive(self, data: bytes) -> None:
-        """Any bytes provoke the answer."""
-        self._pending += self._answer
-
-    def tick(self) -> bytes:
-        """Send the answer, once."""
-        self.device_ns += 1_000_000
-        out, self._pending = self._pending, b""
-        return out
-
-
-class OneBadFrame(FrameFaults):
-    """Corrupts exactly the next frame when told to."""
-
-    def __init__(self) -> None:
-        super().__init__(FaultRates(), np.random.default_rng(0))
-        self.pending = False
-
-    def apply(self, data: bytes) -> bytes:
-        """Flip bits in the middle of the frame."""
-        if self.pending:
-            self.pending = False
-            return data[:10] + bytes([data[10] ^ 0x55 or 1]) + data[11:]
-        return data
 
 
 def scripted(answer: bytes) -> CartpoleRobot:
     """Return a driver in front of a device that always says the same."""
     clock = VirtualClock()
-    return CartpoleRobot(VirtualTransport(ScriptedCore(answer), clock), clock)
+    return CartpoleRobot(VirtualTransport(ScriptedDevice(answer), clock), clock)
 
 
 def info(kind: str = "cartpole", version: int = 1) -> bytes:
@@ -84,11 +51,8 @@ class Wire:
 class TestCartpoleRobot(RobotSuite):
     @pytest.fixture
     def bench(self) -> RobotBench:
-        fault = OneBadFrame()
+        fault = OneBadFrame(10)
         wire = Wire(lambda transport: FaultyTransport(transport, received=fault))
-
-        def corrupt() -> None:
-            fault.pending = True
 
         return RobotBench(
             robot=wire.robot,
@@ -96,7 +60,7 @@ class TestCartpoleRobot(RobotSuite):
             newer=scripted(info(version=2)),
             silent=scripted(b""),
             unplug=wire.virtual.unplug,
-            corrupt=corrupt,
+            corrupt=fault.corrupt_next,
         )
 
 

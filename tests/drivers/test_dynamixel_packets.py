@@ -36,6 +36,7 @@ from deal_hw.drivers.cartpole.dynamixel.samples import SampleGrid, TickClock
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
+from deal_hw.testing.scripted_device import ScriptedDevice
 
 RANDOM_INPUTS = 100_000
 
@@ -152,28 +153,10 @@ def test_hostile_answers_to_single_questions(data: bytes) -> None:
                 continue
 
 
-class Echo:
-    """A device that answers whatever it is asked with the same bytes."""
-
-    def __init__(self, answer: bytes) -> None:
-        self.device_ns = 0
-        self._answer, self._pending = answer, b""
-
-    def receive(self, data: bytes) -> None:
-        """Any question provokes the answer."""
-        self._pending += self._answer
-
-    def tick(self) -> bytes:
-        """Send it."""
-        self.device_ns += 1_000_000
-        out, self._pending = self._pending, b""
-        return out
-
-
 def bus_that_hears(answer: bytes) -> Bus:
     """Return a bus on which every question is answered with these bytes."""
     clock = VirtualClock()
-    transport = VirtualTransport(Echo(answer), clock)
+    transport = VirtualTransport(ScriptedDevice(answer), clock)
     transport.open()
     return Bus(transport, clock, 1_000_000, 0.003)
 

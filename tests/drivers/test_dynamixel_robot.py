@@ -35,25 +35,10 @@ from deal_hw.errors import (
     TransportTimeoutError,
     WrongDeviceError,
 )
-from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
+from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, Transport
 from deal_hw.types import RobotState, Status
-
-
-class OneBadAnswer(FrameFaults):
-    """Corrupts exactly the next answer when told to."""
-
-    def __init__(self) -> None:
-        super().__init__(FaultRates(), np.random.default_rng(0), None)
-        self.pending = False
-
-    def apply(self, data: bytes) -> bytes:
-        """Flip bits in the middle."""
-        if self.pending:
-            self.pending = False
-            return data[:20] + bytes([data[20] ^ 0x55]) + data[21:]
-        return data
 
 
 class Wire:
@@ -118,7 +103,7 @@ def middle() -> int:
 class TestDynamixelCartpole(RobotSuite):
     @pytest.fixture
     def bench(self) -> RobotBench:
-        fault = OneBadAnswer()
+        fault = OneBadFrame(20)
         wire = Wire(lambda t: FaultyTransport(t, received=fault))
         foreign, newer, silent = Wire(), Wire(), Wire()
         foreign.cart.put(MODEL_NUMBER, 350)
@@ -126,16 +111,13 @@ class TestDynamixelCartpole(RobotSuite):
         for servo in silent.device.servos:
             servo.present = False
 
-        def corrupt() -> None:
-            fault.pending = True
-
         return RobotBench(
             robot=wire.robot,
             foreign=foreign.robot,
             newer=newer.robot,
             silent=silent.robot,
             unplug=wire.virtual.unplug,
-            corrupt=corrupt,
+            corrupt=fault.corrupt_next,
         )
 
 

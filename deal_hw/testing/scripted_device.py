@@ -1,0 +1,32 @@
+"""A device for a virtual wire that says what a test tells it to, whatever it is asked."""
+
+from __future__ import annotations
+
+
+class ScriptedDevice:
+    """Answers each message with the same bytes, in its next tick of 1 ms; goes behind a ``VirtualTransport``.
+
+    Attributes:
+        device_ns: Time of the next tick [ns].
+        inbox: All bytes received so far.
+        outbox: Bytes that the next tick sends.
+
+    Args:
+        answer: What a message provokes; nothing by default.
+    """
+
+    def __init__(self, answer: bytes = b"") -> None:
+        self.device_ns = 0
+        self.inbox = self.outbox = b""
+        self._answer = answer
+
+    def receive(self, data: bytes) -> None:
+        """Keep the bytes, and answer them."""
+        self.inbox += data
+        self.outbox += self._answer
+
+    def tick(self) -> bytes:
+        """Send what is waiting, once."""
+        self.device_ns += 1_000_000
+        out, self.outbox = self.outbox, b""
+        return out
