@@ -1,4 +1,4 @@
-"""The small problem on which the searches are tested: a cart-pole with two free parameters."""
+"""What tests of the calibration share: problems of a cart-pole with two free parameters, and recordings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
@@ -31,6 +34,31 @@ def _recorded(seconds: float = 1.2, latency_ticks: int = 0) -> Recorded:
     theta = np.array([p.nominal * TRUTH[p.name] for p in space])
     made = simulated_episode(DESCRIPTION, space, theta, seconds=seconds, latency_ticks=latency_ticks)
     return space, theta, align(made, DESCRIPTION)
+
+
+@pytest.fixture(scope="session")
+def ideal() -> Case:
+    """A noise-free demonstration of a cart-pole of a tuning seed."""
+    return make_case("cartpole", "ideal", 1, 5.0)
+
+
+@pytest.fixture(scope="session")
+def noisy() -> Case:
+    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
+    return make_case("cartpole", "sensor", 2, 5.0)
+
+
+@pytest.fixture(scope="session")
+def noisy_problem(noisy: Case) -> Problem:
+    """The noisy demonstration's problem, the latency given."""
+    return Problem(noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=noisy.latency_s)
+
+
+@pytest.fixture(scope="session")
+def noisy_refined(noisy: Case, noisy_problem: Problem) -> Refined:
+    """Where the refinement of the noisy problem ends, in windows of 0.2 s."""
+    found = refine(noisy_problem, noisy.theta * 1.02, noisy.latency_s, (0.2,), fixed_latency=True)
+    return with_rows(found)
 
 
 @pytest.fixture(scope="session")

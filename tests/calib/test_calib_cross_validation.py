@@ -7,112 +7,66 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.bench.tasks import Case, make_case
+from deal_hw.bench.tasks import Case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined, at_parameters, refine, refine_robust, refine_windows
+from deal_hw.calib.fit.refinement import Refined, at_parameters, refine_robust, refine_windows
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline import Calibration
-from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
 from deal_hw.calib.validation.verdict import Validation, unexplained
-from deal_hw.calibration import (
-    Budget,
-    CalibrationMethod,
-    CalibrationResult,
-    ProgressCallback,
-    StateStore,
-)
-from deal_hw.types import FloatArray
+from deal_hw.calibration import Budget
+from deal_hw.testing.fixed_search import FixedSearch
 
 
-class At(CalibrationMethod[Problem]):
-    """A search that ends where it is told."""
-
-    name = "at"
-
-    def __init__(self, theta: FloatArray, latency_s: float) -> None:
-        self._theta, self._latency_s = theta, latency_s
-        self.runs = 0
-
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-        checkpoint: StateStore | None = None,
-    ) -> CalibrationResult:
-        """Return that place."""
-        self.runs += 1
-        interval = np.stack([problem.space.low, problem.space.high], axis=1)
-        return CalibrationResult(
-            method="at",
-            space=problem.space,
-            estimate=self._theta,
-            interval=interval,
-            latency_s=self._latency_s,
-        )
-
-
-@pytest.fixture(scope="module")
-def case() -> Case:
-    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
-    return make_case("cartpole", "sensor", 2, 5.0)
-
-
-@pytest.fixture(scope="module")
-def problem(case: Case) -> Problem:
-    """Its problem, the latency given."""
-    return Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
-
-
-@pytest.fixture(scope="module")
-def refined(case: Case, problem: Problem) -> Refined:
-    """Where the refinement ends, in windows of 0.2 s."""
-    found = refine(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
-    return with_rows(found)
-
-
-def test_folds_are_disjoint_and_cover_everything(problem: Problem) -> None:
+def test_folds_are_disjoint_and_cover_everything(noisy_problem: Problem) -> None:
     """Each sample is left out exactly once, and each fold leaves out two stretches."""
-    masks = fold_masks(problem, 2)
+    masks = fold_masks(noisy_problem, 2)
     total = np.sum([m[0] for m in masks], axis=0)
     assert np.all(total == 1)
     assert np.count_nonzero(np.diff(masks[0][0].astype(int)) == 1) == 1
-    part = problem.part(masks[0])
-    assert part.episodes[0].usable.sum() == (problem.episodes[0].usable & masks[0][0]).sum()
-    assert part.starts is problem.starts and problem.episodes[0].usable.sum() > part.episodes[0].usable.sum()
+    part = noisy_problem.part(masks[0])
+    assert part.episodes[0].usable.sum() == (noisy_problem.episodes[0].usable & masks[0][0]).sum()
+    assert (
+        part.starts is noisy_problem.starts
+        and noisy_problem.episodes[0].usable.sum() > part.episodes[0].usable.sum()
+    )
 
 
-def test_folds_keep_the_refinement_where_it_helps_and_drop_it_where_not(case: Case, problem: Problem) -> None:
+def test_folds_keep_the_refinement_where_it_helps_and_drop_it_where_not(
+    noisy: Case, noisy_problem: Problem
+) -> None:
     """From 10 % off the refinement predicts better over all; what costs too much is left out with a note."""
-    off = choose(problem, At(case.theta * 1.1, case.latency_s), Budget(), 0, 40, 0)
+    off = choose(noisy_problem, FixedSearch(noisy.theta * 1.1, noisy.latency_s), Budget(), 0, 40, 0)
     assert off.chosen == "refinement"
     assert np.prod(off.errors["refinement"]) < 0.75 * np.prod(off.errors["search"])
     assert set(off.to_json()) == {"chosen", "errors", "window_s", "steps"}
-    truth = prediction_error(problem, [(case.theta, case.latency_s), (case.theta * 1.1, case.latency_s)], 40)
+    truth = prediction_error(
+        noisy_problem, [(noisy.theta, noisy.latency_s), (noisy.theta * 1.1, noisy.latency_s)], 40
+    )
     assert truth[0] < truth[1]
-    dear = choose(problem, At(case.theta, case.latency_s), Budget(), 0, 40, 10**10)
+    dear = choose(noisy_problem, FixedSearch(noisy.theta, noisy.latency_s), Budget(), 0, 40, 10**10)
     assert dear.chosen == "refinement" and "left out" in dear.note
 
 
-def test_a_search_that_is_kept_gets_start_states_and_intervals(case: Case, problem: Problem) -> None:
+def test_a_search_that_is_kept_gets_start_states_and_intervals(noisy: Case, noisy_problem: Problem) -> None:
     """At a search's estimate the start states settle to a lower cost, and the estimate stays."""
-    searched = At(case.theta, case.latency_s).run(problem, Budget(), np.random.default_rng(0))
-    shooting = Shooting(problem, 40)
+    searched = FixedSearch(noisy.theta, noisy.latency_s).run(
+        noisy_problem, Budget(), np.random.default_rng(0)
+    )
+    shooting = Shooting(noisy_problem, 40)
     smoothed = shooting.smoothed()
-    there = at_parameters(problem, searched.estimate, searched.latency_s, 40, smoothed)
-    assert there.theta == pytest.approx(case.theta)
-    assert there.normal.cost < shooting.cost(shooting.start(case.theta, case.latency_s, smoothed))
+    there = at_parameters(noisy_problem, searched.estimate, searched.latency_s, 40, smoothed)
+    assert there.theta == pytest.approx(noisy.theta)
+    assert there.normal.cost < shooting.cost(shooting.start(noisy.theta, noisy.latency_s, smoothed))
     assert there.chi2 < 1.3 and not unexplained(there)
 
 
-def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> None:
+def test_unexplained_data_go_through_the_folds_and_are_diagnosed(noisy: Case) -> None:
     """With a latency 10 ms off the model fails: folds are run, provenance says what was chosen and why."""
-    wrong = case.latency_s + 0.01
-    problem = Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=wrong)
-    search = At(case.theta, wrong)
+    wrong = noisy.latency_s + 0.01
+    problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=wrong)
+    search = FixedSearch(noisy.theta, wrong)
     result = Calibration(search, settings=Validation(split_half=False)).run(
         problem, Budget(generations=16), np.random.default_rng(0)
     )
@@ -123,13 +77,13 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(case: Case) -> 
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
-def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(case: Case) -> None:
+def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(noisy: Case) -> None:
     """With residuals taken to be 50 times the noise chi2 says nothing: the folds are run all the same."""
-    chosen = 50 * Problem(case.robot, case.space, [case.fit], threads=1).noise_std
+    chosen = 50 * Problem(noisy.robot, noisy.space, [noisy.fit], threads=1).noise_std
     problem = Problem(
-        case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s, known_std=chosen
+        noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=noisy.latency_s, known_std=chosen
     )
-    search = At(case.theta * 1.05, case.latency_s)
+    search = FixedSearch(noisy.theta * 1.05, noisy.latency_s)
     result = Calibration(search, settings=Validation(split_half=False, diagnosis=False)).run(
         problem, Budget(generations=15), np.random.default_rng(0)
     )
@@ -148,22 +102,26 @@ def test_huber_weights_by_hand() -> None:
     assert kurtosis([np.array([1.0, -1.0])]) == 1.0
 
 
-def test_robust_refinement_shrugs_off_wild_samples(case: Case, problem: Problem, refined: Refined) -> None:
+def test_robust_refinement_shrugs_off_wild_samples(
+    noisy: Case, noisy_problem: Problem, noisy_refined: Refined
+) -> None:
     """A cart sample in the middle of each window off by 10 mm: Huber's loss stays nearer to the clean fit."""
-    wild = case.fit.position.copy()
+    wild = noisy.fit.position.copy()
     wild[20::40, 0] += 1e-2
     spoilt = Problem(
-        case.robot, case.space, [dataclasses.replace(case.fit, position=wild)], threads=1,
-        fixed_latency_s=case.latency_s,
+        noisy.robot, noisy.space, [dataclasses.replace(noisy.fit, position=wild)], threads=1,
+        fixed_latency_s=noisy.latency_s,
     )  # fmt: skip
     # The noise is that of the clean recording: an outlier is what noise does not make.
-    spoilt.noise, spoilt.starts = problem.noise, problem.starts
-    shooting = Shooting(spoilt, refined.shooting.length)
-    point = shooting.start(refined.theta, case.latency_s, refined.shooting.states(refined.point))
+    spoilt.noise, spoilt.starts = noisy_problem.noise, noisy_problem.starts
+    shooting = Shooting(spoilt, noisy_refined.shooting.length)
+    point = shooting.start(
+        noisy_refined.theta, noisy.latency_s, noisy_refined.shooting.states(noisy_refined.point)
+    )
     plain = refine_windows(shooting, point, 6, fixed_latency=True)
     assert kurtosis(plain.normal.residual) > 6.0
     robust = refine_robust(plain, fixed_latency=True)
-    scaled = [spoilt.space.to_scale(p.theta) for p in (refined, plain, robust)]
+    scaled = [spoilt.space.to_scale(p.theta) for p in (noisy_refined, plain, robust)]
     assert np.linalg.norm(scaled[2] - scaled[0]) < 0.5 * np.linalg.norm(scaled[1] - scaled[0])
     # What it leaves out of the loss it does not leave out of the verdict.
     assert robust.chi2 > 1.3

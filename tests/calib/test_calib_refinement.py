@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from deal_hw.bench.loop import demonstrate
-from deal_hw.bench.tasks import Case as Demonstration
+from deal_hw.bench.tasks import Case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
@@ -23,54 +22,14 @@ from deal_hw.calib.uncertainty.null_space import null_directions, null_space
 from deal_hw.calib.uncertainty.time_steps import LatencyScan
 from deal_hw.calib.validation.metrics import HeldOut, error_percent, interval_score, log_error_x100
 from deal_hw.calib.validation.verdict import Validation
-from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space, parameter_space
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
+from deal_hw.testing.fixed_search import FixedSearch
 from deal_hw.types import FloatArray
-
-
-class Near(CalibrationMethod[Problem]):
-    """A search that starts some percent off the truth: what is tested is what comes after it."""
-
-    name = "local"
-
-    def __init__(self, theta: FloatArray, latency_s: float) -> None:
-        self._theta, self._latency_s = theta, latency_s
-        self.runs = 0
-
-    def run(
-        self,
-        problem: Problem,
-        budget: Budget,
-        rng: np.random.Generator,
-        progress: ProgressCallback | None = None,
-    ) -> CalibrationResult:
-        """Return a point near the truth."""
-        self.runs += 1
-        theta = self._theta * np.exp(rng.normal(0.0, 0.05, len(self._theta)))
-        interval = np.stack([problem.space.low, problem.space.high], axis=1)
-        return CalibrationResult(
-            method="local",
-            space=problem.space,
-            estimate=theta,
-            interval=interval,
-            latency_s=self._latency_s + 1e-3,
-        )
-
-
-@pytest.fixture(scope="module")
-def ideal() -> Demonstration:
-    """A noise-free demonstration of a tuning seed."""
-    return demonstrate("ideal", 1, 5.0)
-
-
-@pytest.fixture(scope="module")
-def noisy() -> Demonstration:
-    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
-    return demonstrate("sensor", 2, 5.0)
 
 
 def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[..., Problem]) -> None:
@@ -93,14 +52,14 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
     assert conclusive(problem, leaving(0.5 * pattern), MISMATCH.white_samples)
 
 
-def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: Demonstration) -> None:
+def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: Case) -> None:
     """The local fit stays where a search ends above it, here one that returns the middle of the range.
 
     Refined from there the answer is up to 190 % off, at a chi2 of 1.68 instead of 0.92.
     """
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     best = refine(problem, noisy.theta, noisy.truth.latency_s)
-    search = Near(problem.space.center, 0.0)
+    search = FixedSearch(problem.space.center, 1e-3, 0.05)
     run = CalibrationRun(
         problem=problem,
         budget=Budget(population=8, generations=1),
@@ -113,7 +72,7 @@ def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: De
     assert Refinement().best(run).theta == pytest.approx(best.theta, rel=0.01)
 
 
-def test_refinement_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> None:
+def test_refinement_recovers_an_ideal_robot_exactly(ideal: Case) -> None:
     """Truth recovery: from 10 % off, all parameters within 0.01 % and the latency within a microsecond."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
     start = ideal.theta * np.exp(0.1 * np.cos(np.arange(9)))
@@ -123,7 +82,7 @@ def test_refinement_recovers_an_ideal_robot_exactly(ideal: Demonstration) -> Non
     assert found.chi2 < 2.0
 
 
-def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Demonstration) -> None:
+def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None:
     """Truth recovery with noise: mean error within 3 %, latency to the tick, 7 of 9 intervals hold."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     stages: list[str] = []
@@ -131,7 +90,9 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Demonstration
     def watch(p: Progress) -> None:
         stages.append(p.stage)
 
-    method = Calibration(Near(noisy.theta, noisy.truth.latency_s), settings=Validation(local_first=False))
+    method = Calibration(
+        FixedSearch(noisy.theta, noisy.truth.latency_s + 1e-3, 0.05), settings=Validation(local_first=False)
+    )
     result = method.run(problem, Budget(), np.random.default_rng(0), watch)
     assert error_percent(result.estimate, noisy.theta) < 3.0
     assert abs(result.latency_s - noisy.truth.latency_s) < 1.1e-3
@@ -142,7 +103,7 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Demonstration
     assert result.provenance["latency_scan"]["ticks"]
 
 
-def test_heldout_error_falls_far_below_nominal(noisy: Demonstration) -> None:
+def test_heldout_error_falls_far_below_nominal(noisy: Case) -> None:
     """On another motion family the true parameters predict four times better than the nominal ones."""
     held_out = HeldOut(noisy.robot, noisy.space, [noisy.heldout], threads=1, truth=[noisy.heldout_truth])
     truth = (noisy.theta, noisy.truth.latency_s)
@@ -151,10 +112,10 @@ def test_heldout_error_falls_far_below_nominal(noisy: Demonstration) -> None:
     assert errors["truth"] < errors["null"]
 
 
-def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal: Demonstration) -> None:
+def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal: Case) -> None:
     """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
-    search = Near(ideal.theta, 0.02)
+    search = FixedSearch(ideal.theta, 0.021, 0.05)
     result = Calibration(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.runs >= 2
     assert any("does not explain" in alarm.means for alarm in result.alarms)
@@ -215,7 +176,7 @@ def test_null_direction_names_the_common_factor() -> None:
     assert _unseen(_two(), np.diag([1e6, 1e6])) == ()
 
 
-def test_k11_names_its_null_directions_on_real_information(noisy: Demonstration) -> None:
+def test_k11_names_its_null_directions_on_real_information(noisy: Case) -> None:
     """With nothing weighed, two combinations are invisible; each names a mass, together nearly all."""
     space = parameter_space().with_ratio(5.0)
     problem = Problem(noisy.robot, space, [noisy.fit], threads=1)
@@ -265,13 +226,13 @@ def test_scores_by_hand() -> None:
     assert score.width90 == pytest.approx(np.median(widths) / (2 * 1.6448536 * 0.1))
 
 
-def test_recording_without_excitation_is_refused_before_any_search(ideal: Demonstration) -> None:
+def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) -> None:
     """A robot that stands still is refused, and the message says what to record."""
     import dataclasses
 
     still = dataclasses.replace(ideal.fit, position=np.zeros_like(ideal.fit.position))
     problem = Problem(ideal.robot, ideal.space, [still], threads=1)
-    search = Near(ideal.theta, 0.0)
+    search = FixedSearch(ideal.theta, 1e-3, 0.05)
     with pytest.raises(InsufficientDataError, match=r"hardly moves.*--profile rich"):
         Calibration(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.runs == 0
@@ -290,7 +251,7 @@ def test_diverged_members_are_nan_and_the_others_untouched() -> None:
     assert np.isnan(position[1]).all()
 
 
-def test_latency_scan_weighs_ticks_by_their_cost(ideal: Demonstration) -> None:
+def test_latency_scan_weighs_ticks_by_their_cost(ideal: Case) -> None:
     """Costs 10 and 12 at chi2 1 weigh 1 : exp(-1)."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
     at = refine(problem, ideal.theta, 0.0, (0.2,), iterations=1)

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.bench.loop import demonstrate
-from deal_hw.bench.tasks import Case as Demonstration
+from deal_hw.bench.tasks import Case
 from deal_hw.calib.data.innovations import Members, explained, linearise, predict
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.rollouts import (
@@ -25,23 +24,17 @@ from deal_hw.types import FloatArray
 
 
 @pytest.fixture(scope="module")
-def ideal() -> Demonstration:
-    """A noise-free demonstration of a tuning seed."""
-    return demonstrate("ideal", 1, 5.0)
-
-
-@pytest.fixture(scope="module")
-def problem(ideal: Demonstration) -> Problem:
+def problem(ideal: Case) -> Problem:
     """The problem of that demonstration."""
     return Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
 
 
-def members(ideal: Demonstration, latency_s: FloatArray) -> Members:
+def members(ideal: Case, latency_s: FloatArray) -> Members:
     """Return the truth and one wrong simulator."""
     return Members(np.stack([ideal.theta, ideal.space.center]), latency_s)
 
 
-def test_replay_of_the_truth_follows_the_recording(ideal: Demonstration, problem: Problem) -> None:
+def test_replay_of_the_truth_follows_the_recording(ideal: Case, problem: Problem) -> None:
     """With the true parameters the first second of the unstable pole is reproduced to 0.1 mm and 0.1 mrad."""
     ticks = control_ticks(problem, 0)
     position, velocity, action = rollout_population(problem, members(ideal, np.zeros(2)), 0, ticks)
@@ -53,7 +46,7 @@ def test_replay_of_the_truth_follows_the_recording(ideal: Demonstration, problem
     assert np.abs(position[1, :50] - recorded[:50]).max() > 1e-2
 
 
-def test_policy_in_the_loop_equals_the_replay(ideal: Demonstration, problem: Problem) -> None:
+def test_policy_in_the_loop_equals_the_replay(ideal: Case, problem: Problem) -> None:
     """A policy that answers with the recorded targets makes the rollouts of the replay, at any latency."""
     target = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 1))
     # Commands of the recording arrive within a tick; those of a policy in the loop at its start.
@@ -74,7 +67,7 @@ def test_policy_in_the_loop_equals_the_replay(ideal: Demonstration, problem: Pro
     np.testing.assert_allclose(closed[2], replayed[2])
 
 
-def test_gains_change_where_the_recording_changed_them(ideal: Demonstration, problem: Problem) -> None:
+def test_gains_change_where_the_recording_changed_them(ideal: Case, problem: Problem) -> None:
     """A change of the effort limit in the middle is sent at its tick and not before."""
     effort = ideal.fit.effort_limit.copy()
     effort[1000:] *= 1e-3
@@ -88,7 +81,7 @@ def test_gains_change_where_the_recording_changed_them(ideal: Demonstration, pro
     assert np.abs(one[:, 80] - two[:, 80]).max() > 1e-3
 
 
-def test_ticks_stop_at_a_gap(ideal: Demonstration) -> None:
+def test_ticks_stop_at_a_gap(ideal: Case) -> None:
     """A lost frame ends the rollout, and a recording without two whole ticks is refused."""
     usable = ideal.fit.usable.copy()
     usable[41] = False
@@ -115,7 +108,7 @@ def test_transitions_hold_state_action_and_change(problem: Problem) -> None:
     np.testing.assert_allclose(scaled[:, kept].std(axis=0), 1, atol=1e-3)
 
 
-def test_negative_latency_is_a_shift_the_other_way(ideal: Demonstration, problem: Problem) -> None:
+def test_negative_latency_is_a_shift_the_other_way(ideal: Case, problem: Problem) -> None:
     """Predictions go smoothly through latency zero: -1, 0 and 1 ms are nearly on a line."""
     data = problem.windows(40)[0]
     theta = np.repeat(ideal.theta[None], 3, axis=0)
@@ -129,7 +122,7 @@ def test_negative_latency_is_a_shift_the_other_way(ideal: Demonstration, problem
     assert np.median(bend[moved] / slope[moved]) < 0.2
 
 
-def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Demonstration, problem: Problem) -> None:
+def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Case, problem: Problem) -> None:
     """Whitened innovations have at most their expected size at the truth, a huge one at the centre."""
     truth = Members(ideal.theta[None], np.zeros(1))
     wrong = Members(ideal.space.center[None], np.zeros(1))
@@ -137,7 +130,7 @@ def test_truth_is_explained_and_a_wrong_simulator_is_not(ideal: Demonstration, p
     assert explained(problem, wrong, 10) > 1e3
 
 
-def test_whitening_takes_out_a_wrong_start_state(ideal: Demonstration, problem: Problem) -> None:
+def test_whitening_takes_out_a_wrong_start_state(ideal: Case, problem: Problem) -> None:
     """What one standard deviation of start velocity does to a window is whitened to about one."""
     data = problem.windows(20)[0]
     truth = Members(ideal.theta[None], np.zeros(1))
@@ -165,7 +158,7 @@ def test_coordinates_map_the_cube_to_ranges_and_back(problem: Problem) -> None:
     np.testing.assert_allclose(logistic(logit(unit)), unit)
 
 
-def test_given_latency_is_not_searched(ideal: Demonstration) -> None:
+def test_given_latency_is_not_searched(ideal: Case) -> None:
     """A latency that is known stays what it is."""
     given = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.013)
     coordinates = Coordinates(given)

@@ -18,70 +18,53 @@ from deal_hw.calibration import BEFORE_SEARCH, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 
 
-@pytest.fixture(scope="module")
-def case() -> Case:
-    """A demonstration of a tuning seed with noise, quantisation and an unknown latency."""
-    return make_case("cartpole", "sensor", 2, 5.0)
-
-
-@pytest.fixture(scope="module")
-def problem(case: Case) -> Problem:
-    """Its problem, the latency given."""
-    return Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
-
-
-@pytest.fixture(scope="module")
-def refined(case: Case, problem: Problem) -> Refined:
-    """Where the refinement ends, in windows of 0.2 s."""
-    found = refine(problem, case.theta * 1.02, case.latency_s, (0.2,), fixed_latency=True)
-    return with_rows(found)
-
-
-def test_halves_share_no_window_and_hold_all(problem: Problem, refined: Refined) -> None:
+def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """Blocks of two windows go to either half in turn, with their start states."""
-    halves = [half_of(refined.shooting, refined.point, half, 2) for half in range(2)]
+    halves = [half_of(noisy_refined.shooting, noisy_refined.point, half, 2) for half in range(2)]
     starts = [set(s.data[0].windows.start.tolist()) for s, _ in halves]
     assert not starts[0] & starts[1]
-    assert starts[0] | starts[1] == set(refined.shooting.data[0].windows.start.tolist())
-    whole = refined.shooting.cost(refined.point)
+    assert starts[0] | starts[1] == set(noisy_refined.shooting.data[0].windows.start.tolist())
+    whole = noisy_refined.shooting.cost(noisy_refined.point)
     assert sum(s.cost(p) for s, p in halves) == pytest.approx(whole)
     first = halves[0][0].data[0]
     assert len(first.measured) == len(first.windows) == len(halves[0][1].position[0])
 
 
-def test_halves_of_a_right_model_agree(problem: Problem, refined: Refined) -> None:
+def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
-    known = uncertainty_at(problem, refined, fixed_latency=True)
-    halves = check_split_half(problem, refined, known)
-    assert halves.flagged == () and halves.alarms(problem.space) == () and halves.steps > 0
-    assert [r.name for r in halves.rows] == list(problem.space.names)
+    known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
+    halves = check_split_half(noisy_problem, noisy_refined, known)
+    assert halves.flagged == () and halves.alarms(noisy_problem.space) == () and halves.steps > 0
+    assert [r.name for r in halves.rows] == list(noisy_problem.space.names)
     assert all(r.first[1] <= r.first[0] <= r.first[2] for r in halves.rows)
-    assert set(halves.to_json()["parameters"]) == set(problem.space.names)
-    assert widened_by_halves(problem, known, refined.theta, halves) is known
+    assert set(halves.to_json()["parameters"]) == set(noisy_problem.space.names)
+    assert widened_by_halves(noisy_problem, known, noisy_refined.theta, halves) is known
 
 
 def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
-    case: Case, problem: Problem, refined: Refined
+    noisy: Case, noisy_problem: Problem, noisy_refined: Refined
 ) -> None:
     """A half whose stiffness lies ten standard deviations off: its interval is widened to it, and said."""
-    known = uncertainty_at(problem, refined, fixed_latency=True)
-    k = problem.space.names.index("servo.stiffness")
+    known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
+    k = noisy_problem.space.names.index("servo.stiffness")
     std = np.sqrt(known.covariance[k, k])
-    far = problem.space.to_scale(refined.theta)
-    far = problem.space.from_scale(far + 10 * std * np.eye(len(problem.space))[k])[k]
-    reach = np.zeros(len(problem.space))
+    far = noisy_problem.space.to_scale(noisy_refined.theta)
+    far = noisy_problem.space.from_scale(far + 10 * std * np.eye(len(noisy_problem.space))[k])[k]
+    reach = np.zeros(len(noisy_problem.space))
     reach[k] = 10 * std
-    wide = widened_by_halves(problem, known, refined.theta, SplitHalf((), ("servo.stiffness",), reach))
+    wide = widened_by_halves(
+        noisy_problem, known, noisy_refined.theta, SplitHalf((), ("servo.stiffness",), reach)
+    )
     assert wide.interval[k, 1] == pytest.approx(far)
     assert wide.interval[0] == pytest.approx(known.interval[0])
     assert any("disagree about servo.stiffness" in alarm.seen for alarm in wide.alarms)
 
 
-def test_too_few_windows_are_not_halved(case: Case, problem: Problem, refined: Refined) -> None:
+def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noisy_refined: Refined) -> None:
     """Three windows: a note instead of rows."""
-    few = dataclasses.replace(case.fit, usable=np.arange(len(case.fit.sample)) < 130)
-    short = Problem(case.robot, case.space, [few], threads=1, fixed_latency_s=case.latency_s)
-    found = refine(short, case.theta, case.latency_s, (0.2,), iterations=1, fixed_latency=True)
+    few = dataclasses.replace(noisy.fit, usable=np.arange(len(noisy.fit.sample)) < 130)
+    short = Problem(noisy.robot, noisy.space, [few], threads=1, fixed_latency_s=noisy.latency_s)
+    found = refine(short, noisy.theta, noisy.latency_s, (0.2,), iterations=1, fixed_latency=True)
     halves = check_split_half(short, found, uncertainty_at(short, found, fixed_latency=True))
     assert halves.rows == () and "too few" in halves.note
 

@@ -1,0 +1,53 @@
+"""A search whose answer a test chooses, to look at what comes after a search."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calibration import (
+    Budget,
+    CalibrationMethod,
+    CalibrationResult,
+    ProgressCallback,
+    StateStore,
+)
+from deal_hw.types import FloatArray
+
+
+class FixedSearch(CalibrationMethod[Any]):
+    """Ends where it is told, or near it, with the whole range as its interval.
+
+    Attributes:
+        runs: How often it was run.
+
+    Args:
+        theta: Where it ends, (K,).
+        latency_s: The latency that it finds [s].
+        spread: Standard deviation of the logarithm of what each parameter is off.
+    """
+
+    name = "fixed"
+
+    def __init__(self, theta: FloatArray, latency_s: float, spread: float = 0.0) -> None:
+        self._theta, self._latency_s, self._spread = theta, latency_s, spread
+        self.runs = 0
+
+    def run(
+        self,
+        problem: Any,
+        budget: Budget,
+        rng: np.random.Generator,
+        progress: ProgressCallback | None = None,
+        checkpoint: StateStore | None = None,
+    ) -> CalibrationResult:
+        """Return that place."""
+        self.runs += 1
+        return CalibrationResult(
+            method=self.name,
+            space=problem.space,
+            estimate=self._theta * np.exp(rng.normal(0.0, self._spread, len(self._theta))),
+            interval=np.stack([problem.space.low, problem.space.high], axis=1),
+            latency_s=self._latency_s,
+        )
