@@ -26,7 +26,7 @@ import numpy as np
 from fault_rig import ARMING, COMMANDING, CONNECTING, ENDING, TAKING_OVER, Case, Rig, SpoiledError, headline
 from stall_monitor import watch_stalls
 
-from deal_hw.bench.rows import describe_machine
+from deal_hw.bench.rows import describe_call
 from deal_hw.control.realtime import priority
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.errors import DealHwError
@@ -364,9 +364,7 @@ def main(
     # A shell that starts a program in the background has it ignore Ctrl-C, and so would all that it starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     calls, rows = earlier(given.out)
-    # Names of files only: where they lay on this machine is nobody's business.
-    argv = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
-    calls.append({"argv": argv, "machine": describe_machine()})
+    calls.append(describe_call(f"tools/{Path(sys.argv[0]).name}"))
     bad = 0
     for row in run_cases(rig_type, chosen, wire, given, rows):
         rows[row["fault"]] = row

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import describe_machine
+from deal_hw.bench.rows import write_rows
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
@@ -125,10 +125,7 @@ def main() -> int:
             print(table(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
     print(table(rows))
     if given.out is not None:
-        # Names of files only: where they lay on this machine is nobody's business.
-        argv = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
-        result = {"argv": argv, "machine": describe_machine(), "rows": rows}
-        given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_rows(given.out, rows, program="tools/measure_cartpole_wires.py")
     return 0
 
 

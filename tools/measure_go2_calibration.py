@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import describe_machine
+from deal_hw.bench.rows import describe_call
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
 from deal_hw.drivers.go2.emulator.truth import Truth
@@ -43,8 +43,7 @@ def main() -> int:
     """Measure each seed and write the rows."""
     options = _options()
     result: dict[str, Any] = {
-        "argv": sys.argv[1:],
-        "machine": describe_machine(),
+        **describe_call("tools/measure_go2_calibration.py"),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "rows": [],
     }

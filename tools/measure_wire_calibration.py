@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import describe_machine
+from deal_hw.bench.rows import write_rows
 from deal_hw.cli.bench import parse_seeds
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
@@ -126,9 +126,7 @@ def main() -> int:
             short = rows[-1]["error"] or f"{rows[-1]['error_percent']:.2f} %"
             print(f"{transport} seed {seed}: {short}", file=sys.stderr, flush=True)
             if given.out is not None:
-                argv = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
-                result = {"argv": argv, "machine": describe_machine(), "rows": rows}
-                given.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+                write_rows(given.out, rows, program="tools/measure_wire_calibration.py")
     print(table(rows))
     return 0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import platform
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -96,8 +97,16 @@ def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], program: str = "deal-hw") -> None:
     """Write rows with the machine and the command they came from, as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    values = {"format": FORMAT, "machine": describe_machine(), "argv": [program, *sys.argv[1:]]}
-    write_json(path, {**values, "rows": list(rows)})
+    write_json(path, {"format": FORMAT, **describe_call(program), "rows": list(rows)})
+
+
+def describe_call(program: str) -> dict[str, Any]:
+    """Return what made measurements: the machine, and the command with names of files only.
+
+    Where the files lay on that machine is nobody's business.
+    """
+    words = (re.sub(r"[^\s=,]*/", "", word) for word in sys.argv[1:])
+    return {"machine": describe_machine(), "argv": [program, *words]}
 
 
 def describe_machine() -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from deal_hw.bench.rows import write_rows
 from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
 from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
 
@@ -46,6 +47,18 @@ def test_rows_have_the_fields_of_the_benchmark_and_are_not_run_twice(tmp_path: P
     before = row["seconds"]
     assert bench(settings) == 0
     assert json.loads(out.read_text())["rows"][0]["seconds"] == before
+
+
+def test_rows_name_files_but_no_folder_of_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command stands in the file as it was given, without the folders of its files."""
+    words = ["--out", str(tmp_path / "a.json"), f"--data={tmp_path / 'b.csv'},c/d.csv", "--method eki", "3"]
+    monkeypatch.setattr("sys.argv", ["/bin/tool.py", *words])
+    write_rows(tmp_path / "a.json", [{"error": ""}], program="tools/tool.py")
+    values = json.loads((tmp_path / "a.json").read_text())
+    assert values["argv"] == ["tools/tool.py", "--out", "a.json", "--data=b.csv,d.csv", "--method eki", "3"]
+    assert values["rows"] == [{"error": ""}]
 
 
 def test_unknown_method_is_refused_before_anything_runs(tmp_path: Path) -> None:
