@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from deal_hw.cli.doctor_can import list_adapters, listen_to_bus
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.cli.options import Range, check_ranges
@@ -26,7 +25,6 @@ from deal_hw.drivers import (
     make_robot,
     make_topic_transport,
 )  # fmt: skip
-from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
@@ -122,6 +120,9 @@ def _wrapped(lead: str, text: str) -> str:
 
 
 def _examine(config: Doctor) -> Iterator[Finding]:
+    from deal_hw.cli.doctor_can import list_adapters, listen_to_bus
+    from deal_hw.drivers.transports.can_transport import open_can
+
     yield from examine_machine()
     yield from list_adapters()
     yield from _interfaces(config.port)

@@ -20,7 +20,11 @@ from deal_hw.cli import main as cli
 from deal_hw.errors import ConfigurationError, MissingExtraError, PortNotFoundError, UnknownNameError
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAVY = ("numpy", "torch", "mujoco", "rerun", "scipy", "serial", "tyro", "rich")
+WIRES_AND_SIMULATORS = (
+    "can", "cantools", "cyclonedds", "dynamixel_easy_sdk", "dynamixel_sdk", "mujoco", "onnxruntime",
+    "rerun", "scipy", "serial", "torch", "zenoh",
+)  # fmt: skip
+HEAVY = ("numpy", "rich", "tyro", *WIRES_AND_SIMULATORS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -326,6 +330,21 @@ def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
     )
     loaded = json.loads(done.stderr.splitlines()[-1])
     assert sorted(loaded) == ["deal_hw.cli", "deal_hw.cli.main", "deal_hw.errors"]
+
+
+@pytest.mark.parametrize("name", ["collect", "deploy", "doctor", "emulate", "replay"])
+def test_help_of_a_verb_loads_no_wire_and_no_simulator(name: str) -> None:
+    """What a robot's options are is known without the packages that reach or simulate it."""
+    code = (
+        "import contextlib, sys, json\nfrom deal_hw.cli.main import main\n"
+        f"with contextlib.suppress(SystemExit): main([{name!r}, '--help'])\n"
+        f"print(json.dumps([name for name in {WIRES_AND_SIMULATORS!r} if name in sys.modules]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "usage: " in done.stdout
+    assert json.loads(done.stdout.splitlines()[-1]) == []
 
 
 @pytest.mark.parametrize("name", cli.VERBS)
