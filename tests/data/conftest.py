@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,22 +73,33 @@ def make_cycle() -> MakeCycle:
     return _cycle
 
 
-@pytest.fixture
-def write_episode(tmp_path: Path) -> WriteEpisode:
-    """Return a function that records cycles in virtual time; ``torn`` leaves it as a kill would."""
+@pytest.fixture(scope="session")
+def recorded_bytes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], tuple[bytes, bytes]]:
+    """Return a function that records cycles in virtual time, once: the file before and after its close."""
 
-    def write(name: str = "episode.mcap", cycles: int = 150, torn: bool = False) -> Path:
-        (tmp_path / name).unlink(missing_ok=True)  # Hypothesis replays what failed.
+    @functools.cache
+    def record(cycles: int) -> tuple[bytes, bytes]:
+        path = tmp_path_factory.mktemp("recorded") / "episode.mcap"
         clock = VirtualClock(HOST_START_NS)
-        recorder = EpisodeRecorder(tmp_path / name, DESCRIPTION.to_json(), {"purpose": "test"}, clock)
+        recorder = EpisodeRecorder(path, DESCRIPTION.to_json(), {"purpose": "test"}, clock)
         recorder.open()
         for number in range(cycles):
             clock.sleep_until_ns(HOST_START_NS + (number + 1) * CYCLE_NS)
             recorder.write(_cycle(number))
-        whole = (tmp_path / name).read_bytes()
+        unfinished = path.read_bytes()
         recorder.close()
-        if torn:
-            (tmp_path / name).write_bytes(whole)
+        return unfinished, path.read_bytes()
+
+    return record
+
+
+@pytest.fixture
+def write_episode(tmp_path: Path, recorded_bytes: Callable[[int], tuple[bytes, bytes]]) -> WriteEpisode:
+    """Return a function that writes recorded cycles to a file; ``torn`` leaves it as a kill would."""
+
+    def write(name: str = "episode.mcap", cycles: int = 150, torn: bool = False) -> Path:
+        unfinished, whole = recorded_bytes(cycles)
+        (tmp_path / name).write_bytes(unfinished if torn else whole)
         return tmp_path / name
 
     return write

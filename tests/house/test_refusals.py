@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from pathlib import Path
 
+import pytest
 import refusals
 
 from deal_hw import errors
@@ -27,12 +28,18 @@ class Reader:
 """
 
 
-def test_the_table_is_that_of_the_sources() -> None:
+@pytest.fixture(scope="module")
+def found() -> list[refusals.Refusal]:
+    """All refusals of the repository; reading its sources takes seconds."""
+    return refusals.refusals()
+
+
+def test_the_table_is_that_of_the_sources(found: list[refusals.Refusal]) -> None:
     """A refusal that is new, gone or worded otherwise shows as a line of a diff."""
     kept = (ROOT / refusals.TABLE).read_text(encoding="utf-8")
     diff = difflib.unified_diff(
         kept.splitlines(),
-        refusals.table(refusals.refusals()).splitlines(),
+        refusals.table(found).splitlines(),
         "kept",
         "sources",
         lineterm="",
@@ -69,9 +76,9 @@ def test_every_class_of_the_error_tree_is_known() -> None:
     assert defined <= refusals.error_classes()
 
 
-def test_a_line_that_no_test_ran_is_listed(tmp_path: Path) -> None:
+def test_a_line_that_no_test_ran_is_listed(tmp_path: Path, found: list[refusals.Refusal]) -> None:
     """The report of coverage says which lines ran; of a call any of its lines counts."""
-    first, second = refusals.refusals()[:2]
+    first, second = found[:2]
     report = tmp_path / "coverage.json"
     report.write_text(f'{{"files": {{"{first.path}": {{"executed_lines": [{first.last_line}]}}}}}}')
     assert refusals.unreached([first, second], report) == [second]

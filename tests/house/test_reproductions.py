@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import io
 import json
@@ -396,11 +397,15 @@ def test_the_supervisor_has_real_time_priority() -> None:
 
 @pytest.mark.slow
 def test_a_network_that_loops_for_ever_is_refused_before_the_port(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It hung `deploy`, and with --dry-run made the supervisor send damping."""
+    from deal_hw.policies import trial
     from deal_hw.policies.onnx_export import write_policy
 
+    # A tenth of its usual processor time: it is used up in any case.
+    brief = functools.partial(trial.TrialPolicy, settings=trial.TrialSettings(processor_s=1))
+    monkeypatch.setattr(trial, "TrialPolicy", brief)
     path = tmp_path / "endless.onnx"
     write_policy(*faulty_policy(CARTPOLE, "late", 10**9), path)
     assert main(["deploy", "cartpole", "--port", str(tmp_path / "no-port"), "--policy", str(path)]) == 2
