@@ -9,31 +9,36 @@ import pytest
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.episode_report import EpisodeReport
 from deal_hw.cli.link import LinkOptions
 from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.types import Status
+from deal_hw.types import Status, Trajectory
 
 LINK = LinkOptions(transport="dynamixel")
 PATIENT = "?answer_s=0.02"
 """A busy machine may take its time; a whole run is not a measurement."""
 
 
+def record(folder: Path, seconds: float, *faults: str) -> tuple[EpisodeReport, Trajectory]:
+    """Record a chirp on an emulator in a process of its own; return how it ended and what was recorded."""
+    profile = ("--nominal", "--profile", "sensor")
+    with EmulatorProcess("cartpole", "--transport", "dynamixel", *profile, *faults) as emulator:
+        report = collect(
+            Collect(
+                robot="cartpole", port=emulator.port + PATIENT, link=LINK, dataset=folder / "set",
+                profile="chirp", seconds=seconds, quiet=True,
+            )
+        )  # fmt: skip
+    return report.episodes[-1], Dataset.open(folder / "set").read(0).trajectory
+
+
 @pytest.mark.slow
 def test_collect_records_a_whole_run(tmp_path: Path) -> None:
     """Homing by the stops, a chirp, states on the grid with commands in force, torque off at the end."""
-    with EmulatorProcess(
-        "cartpole", "--transport", "dynamixel", "--nominal", "--profile", "sensor"
-    ) as emulator:
-        report = collect(
-            Collect(
-                robot="cartpole", port=emulator.port + PATIENT, link=LINK, dataset=tmp_path / "set",
-                profile="chirp", seconds=2.0, quiet=True,
-            )
-        )  # fmt: skip
-    assert report.episodes[-1].outcome is Outcome.FINISHED
-    assert report.episodes[-1].passive_confirmed
-    recorded = Dataset.open(tmp_path / "set").read(0).trajectory
+    report, recorded = record(tmp_path, 2.0)
+    assert report.outcome is Outcome.FINISHED
+    assert report.passive_confirmed
     armed = (recorded.status & int(Status.ARMED)) != 0
     assert armed.sum() > 200
     # Samples are 5 ms apart on the servo's clock, or a multiple where one was lost.
@@ -46,18 +51,8 @@ def test_collect_records_a_whole_run(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_an_overload_trips_the_run(tmp_path: Path) -> None:
     """The run is tripped with the servo's name, the motor is off, and the recording is whole."""
-    with EmulatorProcess(
-        "cartpole", "--transport", "dynamixel", "--nominal", "--profile", "sensor",
-        "--servo-overload-after-s", "0.5",
-    ) as emulator:  # fmt: skip
-        report = collect(
-            Collect(
-                robot="cartpole", port=emulator.port + PATIENT, link=LINK, dataset=tmp_path / "set",
-                profile="chirp", seconds=4.0, quiet=True,
-            )
-        )  # fmt: skip
-    assert report.episodes[-1].outcome is Outcome.TRIPPED
-    assert "servo 1 reports: overload" in report.episodes[-1].reason
-    assert report.episodes[-1].passive_confirmed
-    episode = Dataset.open(tmp_path / "set").read(0)
-    assert any("overload" in event.message for event in episode.trajectory.events)
+    report, recorded = record(tmp_path, 4.0, "--servo-overload-after-s", "0.5")
+    assert report.outcome is Outcome.TRIPPED
+    assert "servo 1 reports: overload" in report.reason
+    assert report.passive_confirmed
+    assert any("overload" in event.message for event in recorded.events)

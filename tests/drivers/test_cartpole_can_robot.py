@@ -349,13 +349,14 @@ def test_options_of_a_bus_need_one() -> None:
     Emulate(robot="cartpole", transport="can", can=CanOptions(node=3))
 
 
-def test_collect_records_a_whole_run_over_can(tmp_path: Path) -> None:
+@pytest.mark.parametrize("transport", ["can", "odrive"])
+def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     """Two processes, an inherited adapter, the emulator as a third: every state is there, none torn."""
-    with EmulatorProcess("cartpole", "--transport", "can", "--profile", "ideal", "--nominal") as emulator:
+    with EmulatorProcess("cartpole", "--transport", transport, "--profile", "ideal", "--nominal") as emulator:
         report = collect(
             Collect(
-                robot="cartpole", port=emulator.port, link=LinkOptions(transport="can"), out=tmp_path / "run",
-                profile="hold", seconds=1.0, quiet=True,
+                robot="cartpole", port=emulator.port, link=LinkOptions(transport=transport),
+                out=tmp_path / "run", profile="hold", seconds=1.0, quiet=True,
             )
         )  # fmt: skip
     assert [episode.outcome.value for episode in report.episodes] == ["finished"]

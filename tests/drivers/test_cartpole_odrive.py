@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.link import LinkOptions
 from deal_hw.clock import MonotonicClock, VirtualClock
-from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink
@@ -399,32 +394,12 @@ def test_parts_that_do_not_fit_are_refused(query: str) -> None:
         odrive_settings(f"can0?{query}")
 
 
-@pytest.fixture(scope="module")
-def port() -> Iterator[str]:
-    """Emulate the nominal cart-pole with an ODrive in a process of its own."""
-    with EmulatorProcess("cartpole", "--transport", "odrive", "--profile", "ideal", "--nominal") as emulator:
-        yield emulator.port
-
-
-def test_collect_records_a_whole_run(tmp_path: Path, port: str) -> None:
-    """Two processes, an inherited adapter, the emulator as a third."""
-    report = collect(
-        Collect(
-            robot="cartpole", port=port, link=LinkOptions(transport="odrive"), out=tmp_path / "run",
-            profile="hold", seconds=1.0, quiet=True,
-        )
-    )  # fmt: skip
-    assert [episode.outcome.value for episode in report.episodes] == ["finished"]
-    trajectory = Dataset.open(tmp_path / "run" / "dataset").read(0).trajectory
-    assert trajectory.position.shape[0] >= 180
-    assert np.isfinite(trajectory.position).all()
-
-
-def test_another_encoder_number_is_refused_over_the_adapter(port: str) -> None:
+def test_another_encoder_number_is_refused_over_the_adapter() -> None:
     """As a user sees it who forgot the number."""
-    robot = make_robot("cartpole", "odrive", port + "&encoder=9", MonotonicClock())
-    with pytest.raises((WrongDeviceError, TransportError), match="node 9"):
-        robot.connect()
+    with EmulatorProcess("cartpole", "--transport", "odrive", "--profile", "ideal", "--nominal") as emulator:
+        robot = make_robot("cartpole", "odrive", emulator.port + "&encoder=9", MonotonicClock())
+        with pytest.raises((WrongDeviceError, TransportError), match="node 9"):
+            robot.connect()
 
 
 def test_axis_states_have_the_drives_numbers() -> None:
