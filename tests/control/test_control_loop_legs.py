@@ -15,6 +15,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.handover import RUNNING
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
+from deal_hw.control.passive import PassiveConfig
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.safety import CycleInput, Safety, Verdict
 from deal_hw.data.recording.record import CycleRecord, encode
@@ -297,7 +298,8 @@ def test_an_unconfirmed_robot_is_not_handed_back() -> None:
         rig.device.begin_fault("freeze")
         loop.request_stop()
 
-    loop = rig.loop(At(3, end), hand_back=True)
+    # Long enough that the wire is opened again in vain.
+    loop = rig.loop(At(3, end), hand_back=True, passive=PassiveConfig(timeout_s=4.0))
     report = loop.run()
     assert (report.outcome, report.passive_confirmed) == (Outcome.STOPPED, False)
     assert "handing back" not in dict(rig.beats)
