@@ -26,11 +26,12 @@ from deal_hw.types import FloatArray
 
 Quantity = Literal[
     "position", "velocity", "sin_position", "cos_position", "action",
-    "gravity", "heading", "angular_velocity", "linear_velocity", "height", "command",
+    "gravity", "heading", "angular_velocity", "linear_velocity", "height", "command", "clock",
 ]  # fmt: skip
 Observation = npt.NDArray[np.float32]
 
 AXES = ("x", "y", "z")
+CLOCK_AXES = ("sin", "cos")
 BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", "height")
 """What a floating base adds, in the base's frame: the directions of gravity and of the world's x axis (unit
 vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
@@ -49,8 +50,10 @@ class ObservationTerm:
 
     Attributes:
         quantity: What is observed. Positions are relative to the default pose; "action" is a former action;
-            "command" is the wanted velocity of the base: x and y [m/s], z [rad/s], the same at all delays.
-        joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z.
+            "command" is the wanted velocity of the base: x and y [m/s], z [rad/s], and "clock" a phase that
+            turns ``clock_hz`` times a second from the first observation on; both the same at all delays.
+        joint: The joint it belongs to; for the base's quantities and the command an axis, x, y or z; for the
+            clock "sin" or "cos".
         scale: The factor applied to it [1/unit].
         delay: How many control periods ago, at most :data:`MAX_DELAY`; 0 is now (for actions 1 is the last
             one).
@@ -83,6 +86,8 @@ class ObservationTerm:
         """The axes of the quantity; () for a quantity of joints."""
         if self.quantity == "height":
             return ("z",)
+        if self.quantity == "clock":
+            return CLOCK_AXES
         return AXES if self.quantity in (*BASE_QUANTITIES, "command") else ()
 
 
@@ -106,6 +111,9 @@ class PolicySpec:
         trained_under: Digest of the parameter distribution it was trained under.
         training: Plain JSON values about the training (algorithm, steps, seed, versions).
         position_units: Unit of each joint's position in training, "m" or "rad", (J,); empty: not noted.
+        clock_hz: Turns a second of the clock that is observed; 0: none is.
+        command_range: Lowest and highest velocity command of training, x, y [m/s] and yaw rate [rad/s],
+            (3, 2); empty: not noted.
 
     Raises:
         ConfigurationError: A field cannot be; the message names the first.
@@ -127,6 +135,8 @@ class PolicySpec:
     trained_under: str = ""
     training: Mapping[str, Any] = field(default_factory=dict)
     position_units: tuple[str, ...] = ()
+    clock_hz: float = 0.0
+    command_range: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         for name, names in (
@@ -156,10 +166,25 @@ class PolicySpec:
             known = self.actuated if term.quantity == "action" else term.axes or self.joint_names
             if term.joint not in known:
                 raise refusal(f"observation[{i}].joint", term.joint, either(known))
+        self._check_clock()
+        if len(self.command_range) not in (0, len(AXES)) or not all(
+            len(ends) == 2 and -math.inf < ends[0] <= ends[1] < math.inf for ends in self.command_range
+        ):
+            raise refusal("command_range", self.command_range, "3 pairs (lowest, highest) of finite numbers")
         try:
             json.dumps(dict(self.training), allow_nan=False)
         except (TypeError, ValueError, RecursionError) as err:
             raise refusal("training", self.training, f"plain JSON values ({err})") from err
+
+    def _check_clock(self) -> None:
+        observed = any(term.quantity == "clock" for term in self.observation)
+        if not 0 <= self.clock_hz < self.control_rate_hz / 2 or observed != (self.clock_hz > 0):
+            allowed = (
+                f"above 0 and below half the control rate, {self.control_rate_hz / 2:g} Hz"
+                if observed
+                else "0, as no clock is observed"
+            )
+            raise refusal("clock_hz", self.clock_hz, allowed)
 
     @property
     def observes_base(self) -> bool:
@@ -175,8 +200,9 @@ class PolicySpec:
         """Return the spec as JSON text."""
         values = {**dataclasses.asdict(self), "training": dict(self.training)}
         # A default stays out: a spec written before the field existed keeps its digest.
-        if not self.position_units:
-            del values["position_units"]
+        for name in ("position_units", "clock_hz", "command_range"):
+            if not values[name]:
+                del values[name]
         return json.dumps(values, sort_keys=True)
 
     @classmethod
@@ -262,6 +288,7 @@ class ObservationBuilder:
 
     Attributes:
         command: The wanted velocity of the base: x, y [m/s] and yaw rate [rad/s], (..., 3); zero at first.
+        clock: Phase of the clock at the next observation, (...,) [turns]; zero at first and after a reset.
     """
 
     def __init__(self, spec: PolicySpec, batch_shape: tuple[int, ...] = ()) -> None:
@@ -276,6 +303,7 @@ class ObservationBuilder:
         self._action = np.zeros((depth + 1, *batch_shape, A))
         self._base = np.zeros((depth, *batch_shape, 4 * len(AXES) + 1))
         self.command: FloatArray = np.zeros((*batch_shape, len(AXES)))
+        self.clock: FloatArray = np.zeros(batch_shape)
         self._fresh = np.ones(batch_shape, dtype=bool)
 
     @property
@@ -288,6 +316,7 @@ class ObservationBuilder:
         mask = np.ones(self._fresh.shape, dtype=bool) if where is None else where
         self._fresh = self._fresh | mask
         self._action[:, mask] = 0.0
+        self.clock = np.where(mask, 0.0, self.clock)
 
     def record_action(self, action: FloatArray) -> None:
         """Note the action that was taken after the last observation, (..., A)."""
@@ -326,6 +355,7 @@ class ObservationBuilder:
         self._velocity = np.where(fresh, self._velocity[:1], self._velocity)
         self._fresh = np.zeros_like(self._fresh)
         columns = [self._term(term) for term in self.spec.observation]
+        self.clock = (self.clock + self.spec.clock_hz / self.spec.control_rate_hz) % 1.0
         return np.stack(columns, axis=-1).astype(np.float32)
 
     def _term(self, term: ObservationTerm) -> FloatArray:
@@ -349,6 +379,10 @@ class ObservationBuilder:
     def _read_command(self, term: ObservationTerm) -> FloatArray:
         return np.asarray(self.command[..., AXES.index(term.joint)])
 
+    def _read_clock(self, term: ObservationTerm) -> FloatArray:
+        angle = 2.0 * np.pi * self.clock
+        return np.asarray(np.sin(angle) if term.joint == "sin" else np.cos(angle))
+
     def _read_base(self, term: ObservationTerm) -> FloatArray:
         first = len(AXES) * BASE_QUANTITIES.index(term.quantity)
         return np.asarray(self._base[term.delay][..., first + term.axes.index(term.joint)])
@@ -362,6 +396,7 @@ _READERS: Final[Mapping[str, Callable[[ObservationBuilder, ObservationTerm], Flo
         "cos_position": ObservationBuilder._read_cosine,
         "action": ObservationBuilder._read_action,
         "command": ObservationBuilder._read_command,
+        "clock": ObservationBuilder._read_clock,
         **dict.fromkeys(BASE_QUANTITIES, ObservationBuilder._read_base),
     }
 )

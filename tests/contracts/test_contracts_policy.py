@@ -200,10 +200,12 @@ def test_specs_made_in_python_are_checked_too() -> None:
 @pytest.mark.parametrize("quantity", get_args(Quantity))
 def test_every_known_quantity_is_built(quantity: Quantity) -> None:
     """And all differ: two that read the same would be a quantity that is taken for another."""
+    element = {**dict.fromkeys(BASE, "z"), "clock": "cos"}
     spec = dataclasses.replace(
         feedback_spec(DRIVER),
+        clock_hz=2.5,
         observation=tuple(
-            ObservationTerm(q, "z" if q in BASE else DRIVER.joint_names[0], 1.0, int(q == "action"))
+            ObservationTerm(q, element.get(q, DRIVER.joint_names[0]), 1.0, int(q == "action"))
             for q in (quantity, *(other for other in get_args(Quantity) if other != quantity))
         ),
     )
@@ -213,6 +215,40 @@ def test_every_known_quantity_is_built(quantity: Quantity) -> None:
     rng = np.random.default_rng(1)
     built = builder.build(rng.uniform(0.2, 1.0, 18), rng.uniform(0.2, 1.0, 18))
     assert len(set(built.tolist())) == len(get_args(Quantity))
+
+
+def test_the_clock_turns_from_the_first_observation_on() -> None:
+    """At 2.5 turns a second and 50 Hz each observation is a twentieth of a turn on; a reset starts anew."""
+    clock = tuple(ObservationTerm("clock", axis, 2.0) for axis in ("sin", "cos"))
+    spec = dataclasses.replace(feedback_spec(DRIVER), observation=clock, clock_hz=2.5)
+    assert PolicySpec.from_json(spec.to_json()) == spec
+    builder = ObservationBuilder(spec, (2,))
+    seen = [builder.build(np.zeros((2, 12)), np.zeros((2, 12))) for _ in range(6)]
+    np.testing.assert_allclose(seen[0], [[0.0, 2.0]] * 2, atol=1e-6)
+    np.testing.assert_allclose(seen[5], [[2.0, 0.0]] * 2, atol=1e-6)
+    builder.reset(np.array([True, False]))
+    angle = 2.0 * np.pi * 0.3
+    built = builder.build(np.zeros((2, 12)), np.zeros((2, 12)))
+    np.testing.assert_allclose(built, [[0.0, 2.0], [2 * np.sin(angle), 2 * np.cos(angle)]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"clock_hz": 2.5}, "clock_hz is 2.5; allowed: 0, as no clock is observed"),
+        ({"command_range": ((0.0, 1.0),)}, "command_range is .*; allowed: 3 pairs"),
+        ({"command_range": ((1.0, 0.0),) * 3}, "command_range is .*; allowed: 3 pairs"),
+        (
+            {"observation": (ObservationTerm("clock", "sin", 1.0),), "clock_hz": 25.0},
+            "clock_hz is 25.0; allowed: above 0 and below half the control rate, 25 Hz",
+        ),
+    ],
+)
+def test_clocks_and_ranges_that_cannot_be_are_refused(fields: dict[str, Any], words: str) -> None:
+    """And a spec without them is written as before they existed, so that its digest stays."""
+    with pytest.raises(ConfigurationError, match=words):
+        dataclasses.replace(feedback_spec(DRIVER), **fields)
+    assert not {"clock_hz", "command_range"} & json.loads(feedback_spec(DRIVER).to_json()).keys()
 
 
 BASE = ("gravity", "heading", "angular_velocity", "linear_velocity", "height", "command")
