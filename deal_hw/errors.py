@@ -21,6 +21,9 @@ The tree (built-in parents in parentheses)::
     ├── DatasetError                           a recording that cannot be used
     │   ├── EmptyRecordingError
     │   └── TornRecordingError                 no footer: `deal-hw data repair` mends it
+    ├── TrainingError                          a training that cannot go on
+    │   ├── CheckpointError                    a checkpoint that cannot be read, or is of another training
+    │   └── TrainingDivergedError              weights that are no numbers any more
     └── CalibrationError
         └── InsufficientDataError              too short or without excitation; says what to record
 """
@@ -162,6 +165,18 @@ class EmptyRecordingError(DatasetError):
 
 class TornRecordingError(DatasetError):
     """The recording has no footer, as after a kill; ``deal-hw data repair`` mends it."""
+
+
+class TrainingError(DealHwError):
+    """A training cannot go on."""
+
+
+class CheckpointError(TrainingError):
+    """A checkpoint cannot be read, or is of another training."""
+
+
+class TrainingDivergedError(TrainingError):
+    """The weights are no numbers any more."""
 
 
 class CalibrationError(DealHwError):

@@ -2,27 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from deal_hw.policy import Policy
+from deal_hw.policy import Policy, PolicySpec
 
 EnvT = TypeVar("EnvT", contravariant=True)
 ConfigT = TypeVar("ConfigT", contravariant=True)
+FoundT = TypeVar("FoundT")
 
-TrainingProgress = Callable[[int, int, float], None]
-"""Called with steps done, steps in total and the recent mean return."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingStatus:
+    """How far a training is.
+
+    Attributes:
+        steps: Environment steps done.
+        total: Environment steps to do.
+        mean_return: Mean return of the last hundred episodes; 0 before the first ends.
+        measures: What the task measured lately, by name with its unit, such as ``velocity_error_m_s``.
+    """
+
+    steps: int
+    total: int
+    mean_return: float
+    measures: Mapping[str, float] = field(default_factory=dict)
+
+
+TrainingProgress = Callable[[TrainingStatus], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingFiles:
+    """What a training keeps on disk, what it starts from, and how it is told to stop.
+
+    Attributes:
+        checkpoint: The file (.safetensors) that training goes on from after a stop; None: none is written.
+        start: A checkpoint whose networks are the start of a new training (a fine-tune); None: from scratch.
+        resume: Go on from ``checkpoint``, where it was left.
+        log: Folder for TensorBoard's files; None: none are written.
+        stop: Asked between updates; once it says True the training ends with the policy as it is.
+    """
+
+    checkpoint: Path | None = None
+    start: Path | None = None
+    resume: bool = False
+    log: Path | None = None
+    stop: Callable[[], bool] = lambda: False
+
+    def source(self, layout: PolicySpec, read: Callable[[Path, PolicySpec], FoundT]) -> FoundT | None:
+        """Return what a training starts from, read by ``read(path, layout)``; None: from scratch."""
+        path = self.checkpoint if self.resume else self.start
+        return None if path is None else read(path, layout)
 
 
 class PolicyTrainer(Protocol, Generic[EnvT, ConfigT]):
     """Trains a policy in an environment."""
 
     name: str
+    config: Callable[..., Any]
+    """The class of its settings."""
 
     def train(
-        self, env: EnvT, config: ConfigT, rng: np.random.Generator, progress: TrainingProgress | None = None
+        self,
+        env: EnvT,
+        config: ConfigT,
+        rng: np.random.Generator,
+        progress: TrainingProgress | None = None,
+        files: TrainingFiles | None = None,
     ) -> Policy:
-        """Return the trained policy; the same generator state gives the same policy on the same machine."""
+        """Return the trained policy; the same generator state gives the same policy on the same machine.
+
+        Raises:
+            TrainingDivergedError: The networks hold numbers that are not finite; the checkpoint is the last
+                good one.
+            CheckpointError: A checkpoint cannot be read, or is of another training.
+        """
         ...

@@ -19,8 +19,6 @@ from deal_hw.types import FloatArray
 CART, POLE = 0, 1
 VELOCITIES, ACTIONS = 8, 14
 """How many velocities and former actions the policy observes."""
-MEMBERS = 32
-"""Robots simulated at once, by default."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

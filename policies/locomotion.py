@@ -38,7 +38,9 @@ class LocomotionEnv(ServoVectorEnv):
         count: Members N.
         ticks: Control periods in an episode.
         start_noise: Largest deviation of a joint from its settled position [rad].
+        host_delay_s: Lowest and highest delay that the host adds to the distribution's latency [s].
         threads: Threads of the physics; None for all CPUs.
+        step_s: Physics step [s]; the device period by default.
 
     Raises:
         ConfigurationError: The robot's base is fixed, or none of the settled robots may start.
@@ -53,15 +55,18 @@ class LocomotionEnv(ServoVectorEnv):
         *,
         ticks: int,
         start_noise: float,
+        host_delay_s: tuple[float, float] = (0.0, 0.0),
         threads: int | None = 1,
+        step_s: float | None = None,
     ) -> None:
         if description.floating_base is None:
             raise ConfigurationError(
                 f"robot {description.name!r} has a fixed base; locomotion needs a free one"
             )
         super().__init__(
-            description, distribution, layout, count, ticks=ticks, host_delay_s=(0.0, 0.0), threads=threads
-        )
+            description, distribution, layout, count,
+            ticks=ticks, host_delay_s=host_delay_s, threads=threads, step_s=step_s,
+        )  # fmt: skip
         self._start_noise = start_noise
         self._pool = self._settled(threads)
 
@@ -132,8 +137,12 @@ def locomotion_spec(
     action_scale: Sequence[float],
     trained_under: str,
     training: Mapping[str, Any] | None,
+    **more: Any,
 ) -> PolicySpec:
-    """Return a spec with the description's gains and limits, the latter within what may be sent."""
+    """Return a spec with the description's gains and limits, the latter within what may be sent.
+
+    ``more`` are further fields of the spec.
+    """
     limits = description.limits
     return PolicySpec(
         robot=description.name,
@@ -150,6 +159,7 @@ def locomotion_spec(
         position_units=description.position_units,
         trained_under=trained_under,
         training=dict(training or {}),
+        **more,
     )
 
 

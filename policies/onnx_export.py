@@ -20,6 +20,7 @@ OPSET = 18
 IR_VERSION = 9
 """Old enough for every onnxruntime that the base install accepts."""
 _ACTIVATIONS: Mapping[type[torch.nn.Module], str] = {
+    torch.nn.ELU: "Elu",
     torch.nn.ReLU: "Relu",
     torch.nn.Tanh: "Tanh",
 }
@@ -88,8 +89,15 @@ def _graph(network: torch.nn.Module, observation: int) -> onnx.ModelProto:
             width = layer.out_features
         elif type(layer) in _ACTIVATIONS:
             nodes.append(onnx.helper.make_node(_ACTIVATIONS[type(layer)], [value], [result]))
+        elif isinstance(layer, torch.nn.Hardtanh):
+            names = [f"lowest_{i}", f"highest_{i}"]
+            weights += [
+                onnx.numpy_helper.from_array(np.array(bound, dtype=np.float32), name)
+                for bound, name in zip((layer.min_val, layer.max_val), names, strict=True)
+            ]
+            nodes.append(onnx.helper.make_node("Clip", [value, *names], [result]))
         else:
-            known = ", ".join(["Linear", *(kind.__name__ for kind in _ACTIVATIONS)])
+            known = ", ".join(["Linear", "Hardtanh", *(kind.__name__ for kind in _ACTIVATIONS)])
             raise PolicyError(
                 f"cannot export a layer of type {type(layer).__name__}; known inside Sequential: {known}"
             )

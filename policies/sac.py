@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -17,9 +16,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from deal_hw.policies.network_policy import NetworkPolicy, diverged, is_finite, one_thread, trained_spec
+from deal_hw.policies.training_log import TrainingLog
 from deal_hw.policies.vector_env import ServoVectorEnv
-from deal_hw.policy import Observation, PolicySpec
-from deal_hw.training import TrainingProgress
+from deal_hw.policy import Observation
+from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.types import FloatArray
 
 
@@ -83,37 +85,11 @@ class SacConfig:
             )
 
 
-class NetworkPolicy:
-    """A policy that is a torch network: observations (B, O) in, actions (B, A) in [-1, 1] out."""
-
-    def __init__(self, network: torch.nn.Module, spec: PolicySpec) -> None:
-        self.network = network.eval()
-        self._spec = spec
-
-    @property
-    def spec(self) -> PolicySpec:
-        """What the policy observes and what its action means."""
-        return self._spec
-
-    def reset(self) -> None:
-        """Nothing to forget: the observation carries the past."""
-
-    def act(self, observation: Observation) -> FloatArray:
-        """Return the action, (A,), for an observation, (O,)."""
-        action: FloatArray = self.act_batch(observation[None])[0]
-        return action
-
-    def act_batch(self, observations: Observation) -> FloatArray:
-        """Return the actions, (B, A), for observations, (B, O)."""
-        with torch.no_grad():
-            action = self.network(torch.as_tensor(observations, dtype=torch.float32))
-        return np.asarray(action.numpy(), dtype=np.float64)
-
-
 class SacTrainer:
     """Trains on one CPU core; the same generator state gives the same policy on the same machine."""
 
     name = "sac"
+    config = SacConfig
 
     def train(
         self,
@@ -121,8 +97,9 @@ class SacTrainer:
         config: SacConfig,
         rng: np.random.Generator,
         progress: TrainingProgress | None = None,
+        files: TrainingFiles | None = None,
     ) -> NetworkPolicy:
-        """Return the policy after ``config.steps`` environment steps.
+        """Return the policy after ``config.steps`` environment steps, or as it is when it is told to stop.
 
         Args:
             env: The environment; it is seeded from ``rng``.
@@ -130,25 +107,48 @@ class SacTrainer:
             rng: Where all randomness comes from. The global generators of random, numpy and torch are seeded
                 from it, as stable-baselines3 draws from them.
             progress: Called about a hundred times.
+            files: Checkpoint, TensorBoard files, and the word to stop. A checkpoint holds the networks and
+                not the transitions: a training that goes on gathers new ones.
 
         Returns:
             The mean action, without exploration.
+
+        Raises:
+            TrainingDivergedError: The networks hold numbers that are not finite.
+            CheckpointError: A checkpoint cannot be read, or does not fit.
         """
-        threads = torch.get_num_threads()
-        # For networks of this size a second thread costs more than it computes; and one thread sums in one
-        # order.
-        torch.set_num_threads(1)
-        try:
+        files = files or TrainingFiles()
+        with one_thread(), TrainingLog(files.log) as log:
             seed = int(rng.integers(2**31))
+            found = files.source(env.layout, read_checkpoint)
+            done = int(found.notes["steps"]) if found is not None and files.resume else 0
+            if done:
+                seed = int(np.random.default_rng([seed, done]).integers(2**31))
             adapter = _Adapter(env, seed)
             model = _model(adapter, config, seed)
+            if found is not None:
+                _load(model, config, found)
+                model.num_timesteps = done
             mean = _MeanActor(config.steps * (1.0 - config.averaged))
-            model.learn(config.steps, callback=[_Report(adapter, config.steps, progress), mean])
-        finally:
-            torch.set_num_threads(threads)
-        actor = mean.apply()
+            report = _Report(adapter, config, progress, files, log)
+            if done < config.steps:
+                model.learn(config.steps - done, callback=[mean, report], reset_num_timesteps=False)
+            report.keep()
+        actor = mean.apply(model)
         network = torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh())
-        return NetworkPolicy(network, _spec_of(env, config, seed))
+        spec = trained_spec(
+            env, self.name, config, seed,
+            stable_baselines3=stable_baselines3.__version__, torch=str(torch.__version__),
+        )  # fmt: skip
+        return NetworkPolicy(network, spec)
+
+
+def _load(model: SAC, config: SacConfig, found: Checkpoint) -> None:
+    found.check(trainer=SacTrainer.name, hidden=list(config.hidden))
+    model.policy.load_state_dict(found.part("policy", model.policy.state_dict()))
+    temperature: Any = model.log_ent_coef
+    with torch.no_grad():
+        temperature.copy_(found.part("entropy", {"log": temperature})["log"])
 
 
 def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
@@ -174,37 +174,30 @@ def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
     )
 
 
-def _spec_of(env: ServoVectorEnv, config: SacConfig, seed: int) -> PolicySpec:
-    training = {
-        **env.layout.training,
-        "algorithm": "sac",
-        "members": env.num_envs,
-        "seed": seed,
-        "config": {**asdict(config), "hidden": list(config.hidden)},
-        "versions": {"stable_baselines3": stable_baselines3.__version__, "torch": str(torch.__version__)},
-    }
-    return dataclasses.replace(env.layout, training=training)
-
-
 class _Adapter(VecEnv):
     """Shows a Gymnasium vector environment (SAME_STEP autoreset) to stable-baselines3, which is older."""
 
     def __init__(self, env: ServoVectorEnv, seed: int) -> None:
         # First, because VecEnv's constructor asks it for its render mode.
-        self._env = env
+        self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._seed = seed
         self._return = np.zeros(env.num_envs)
-        self.recent_returns: collections.deque[float] = collections.deque(maxlen=100)
+        self._recent: collections.deque[float] = collections.deque(maxlen=100)
+
+    @property
+    def mean_return(self) -> float:
+        """Mean return of the last hundred episodes; 0 before the first ends."""
+        return float(np.mean(self._recent)) if self._recent else 0.0
 
     def reset(self) -> Observation:
-        return self._env.reset(seed=self._seed)[0]
+        return self.env.reset(seed=self._seed)[0]
 
     def step_async(self, actions: FloatArray) -> None:
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, FloatArray, np.ndarray[Any, Any], list[dict[str, Any]]]:
-        observation, reward, terminated, truncated, info = self._env.step(self._actions)
+        observation, reward, terminated, truncated, info = self.env.step(self._actions)
         over = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._return += reward
@@ -213,7 +206,7 @@ class _Adapter(VecEnv):
                 "terminal_observation": info["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i]),
             }
-            self.recent_returns.append(float(self._return[i]))
+            self._recent.append(float(self._return[i]))
         self._return[over] = 0.0
         return observation, reward, over, infos
 
@@ -225,7 +218,7 @@ class _Adapter(VecEnv):
         return [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self._env, attr_name)] * self.num_envs
+        return [getattr(self.env, attr_name)] * self.num_envs
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         raise NotImplementedError("members of the batch have no attributes of their own")
@@ -262,27 +255,61 @@ class _MeanActor(BaseCallback):
             self._count += 1
         return True
 
-    def apply(self) -> Any:
-        """Give the actor its mean weights and return it."""
-        actor = _actor(self.model)
+    def apply(self, model: SAC) -> Any:
+        """Give the actor its mean weights, where there are any yet, and return it."""
+        actor = _actor(model)
         with torch.no_grad():
-            for parameter, total in zip(actor.parameters(), self._sum, strict=True):
+            for parameter, total in zip(actor.parameters(), self._sum, strict=bool(self._sum)):
                 parameter.copy_(total / self._count)
         return actor
 
 
 class _Report(BaseCallback):
-    """Calls the progress callback about a hundred times."""
+    """Reports, writes checkpoints and asks whether to stop, about a hundred times in all."""
 
-    def __init__(self, adapter: _Adapter, total: int, progress: TrainingProgress | None) -> None:
+    def __init__(
+        self,
+        adapter: _Adapter,
+        config: SacConfig,
+        progress: TrainingProgress | None,
+        files: TrainingFiles,
+        log: TrainingLog,
+    ) -> None:
         super().__init__()
-        self._adapter, self._total, self._progress = adapter, total, progress
+        self._adapter, self._config, self._progress, self._files = adapter, config, progress, files
+        self._log = log
         self._next = 0
 
     def _on_step(self) -> bool:
-        done = self.num_timesteps
-        if self._progress is not None and (done >= self._next or done >= self._total):
-            self._next = done + max(1, self._total // 100)
-            recent = self._adapter.recent_returns
-            self._progress(min(done, self._total), self._total, float(np.mean(recent)) if recent else 0.0)
-        return True
+        done, total = self.num_timesteps, self._config.steps
+        if done < self._next and done < total:
+            return True
+        self._next = done + max(1, total // 100)
+        if not is_finite(self.model.policy):
+            raise diverged(done, self._files.checkpoint)
+        status = TrainingStatus(
+            steps=min(done, total), total=total, mean_return=self._adapter.mean_return,
+            measures=self._adapter.env.measures(),
+        )  # fmt: skip
+        self._log.write(status, _losses(self.model))
+        self.keep()
+        if self._progress is not None:
+            self._progress(status)
+        return not self._files.stop()
+
+    def keep(self) -> None:
+        """Write the checkpoint, where one is wanted."""
+        if self._files.checkpoint is None:
+            return
+        model: Any = self.model
+        tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
+        notes = {
+            "trainer": SacTrainer.name, "steps": self.num_timesteps, "hidden": list(self._config.hidden),
+        }  # fmt: skip
+        found = Checkpoint(tensors={**tensors, "entropy.log": model.log_ent_coef}, notes=notes)
+        write_checkpoint(self._files.checkpoint, found, self._adapter.env.layout)
+
+
+def _losses(model: Any) -> dict[str, float]:
+    values = model.logger.name_to_value.items()
+    return {name.removeprefix("train/"): float(v) for name, v in values if name.startswith("train/")}

@@ -32,6 +32,7 @@ class ServoLoop:
         count: Members N.
         sensor: What stands between the true and the reported state; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+        step_s: Physics step [s]; the device period by default.
 
     Attributes:
         reported_position: What the host is told, (N, C): the joints, after a floating base where there is
@@ -47,18 +48,19 @@ class ServoLoop:
         *,
         sensor: SensorModel | None = None,
         threads: int | None = 1,
+        step_s: float | None = None,
     ) -> None:
         self.description = description
         self.count = count
-        step_s = 1.0 / description.device_rate_hz
-        self.batch = ServoBatch(load_model(description, step_s), space, count, threads)
+        period_s = 1.0 / description.device_rate_hz
+        self.batch = ServoBatch(load_model(description, step_s or period_s), space, count, threads)
         self._theta = np.repeat(space.nominal[None], count, axis=0)
         self._sensor = description.sensor if sensor is None else sensor
         self._window = _window_periods(self._sensor, description)
         C = self.batch.position.shape[1]
         self._home = self.batch.position[0].copy()
         self._home[self.batch.robot.joints] = description.default_position
-        self._loop = ClosedLoop(self.batch, description.steps_per_control, whole=True)
+        self._loop = ClosedLoop(self.batch, description.steps_per_control, period_s, whole=True)
         self._reports = np.zeros((self._window + 1, count, C))
         self.reported_position = np.zeros((count, C))
         self.reported_velocity = np.zeros((count, C))

@@ -7,7 +7,10 @@ from typing import Any
 
 from deal_hw.errors import UnknownNameError
 
-TRAINERS: dict[str, str] = {"sac": "deal_hw.policies.sac:SacTrainer"}
+TRAINERS: dict[str, str] = {
+    "ppo": "deal_hw.policies.ppo:PpoTrainer",
+    "sac": "deal_hw.policies.sac:SacTrainer",
+}
 
 
 def make_trainer(name: str) -> Any:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
-from deal_hw.parameters import ParameterDistribution
+from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray
@@ -53,6 +53,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
             of the newest state sample when the policy looks, and the way over the wire.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+        step_s: Physics step [s]; the device period by default.
 
     Attributes:
         layout: What is observed and what an action means.
@@ -72,6 +73,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         host_delay_s: tuple[float, float],
         sensor: SensorModel | None = None,
         threads: int | None = 1,
+        step_s: float | None = None,
     ) -> None:
         self.description, self.distribution, self.layout = description, distribution, layout
         self.num_envs = count
@@ -83,7 +85,19 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, count)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, count)
-        self.loop = ServoLoop(description, distribution.space, count, sensor=sensor, threads=threads)
+        # What is calibrated rules: the task draws only what the distribution says nothing about.
+        given = {(p.kind, name) for p in distribution.space.parameters for name in p.elements}
+        self._extra = ParameterSpace(
+            p for p in self.surroundings() if not given & {(p.kind, name) for name in p.elements}
+        )
+        self.loop = ServoLoop(
+            description,
+            ParameterSpace([*distribution.space.parameters, *self._extra.parameters]),
+            count,
+            sensor=sensor,
+            threads=threads,
+            step_s=step_s,
+        )
         self._builder = ObservationBuilder(layout, (count,))
         self._elapsed = np.zeros(count, dtype=np.int64)
         self._scale = np.array(layout.action_scale)
@@ -102,6 +116,26 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
 
     def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
         """Draw what else a task draws for the members, (N,), that start anew; nothing by default."""
+
+    def surroundings(self) -> Sequence[Parameter]:
+        """Return parameters that the task draws itself, uniformly, for each episode; none by default."""
+        return ()
+
+    def measures(self) -> dict[str, float]:
+        """Return what the task says about the steps since the last call, by name with its unit."""
+        return {}
+
+    def privileged(self) -> FloatArray:
+        """Return what a critic may know beyond the observation, (N, P); nothing by default."""
+        return np.zeros((self.num_envs, 0))
+
+    def target(self, action: FloatArray) -> FloatArray:
+        """Return the targets that the robots are sent for actions, (N, A) each."""
+        return self._default + self._scale * action
+
+    def sensed(self) -> tuple[FloatArray, FloatArray]:
+        """Return the positions and velocities that observations are built from, (N, C) each."""
+        return self.loop.reported_position, self.loop.reported_velocity
 
     def limited(self, action: FloatArray, before: FloatArray) -> FloatArray:
         """Return the actions, (N, A), that are really taken after those before; all by default."""
@@ -145,7 +179,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         action = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
         action = self.limited(action, self._last_action)
         self._builder.record_action(action)
-        diverged = self.loop.step(self._default + self._scale * action, self.np_random)
+        diverged = self.loop.step(self.target(action), self.np_random)
         position, velocity = self.loop.position, self.loop.velocity
         terminated = self.ended(position, velocity) | diverged
         reward = np.where(
@@ -158,14 +192,14 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         if not over.any():
             return self._observe(), reward, terminated, truncated, {}
         # The members that go on must see this tick once only: what the others saw last is built on a copy.
-        final = copy.deepcopy(self._builder).build(self.loop.reported_position, self.loop.reported_velocity)
+        final = copy.deepcopy(self._builder).build(*self.sensed())
         self._restart(over)
         return self._observe(), reward, terminated, truncated, {"final_obs": final, "_final_obs": over}
 
     def _restart(self, where: BoolArray) -> None:
         rng, count = self.np_random, int(where.sum())
         latency = self.distribution.sample_latency(rng, count) + rng.uniform(*self.host_delay_s, count)
-        theta = self.distribution.sample(rng, count)
+        theta = np.hstack([self.distribution.sample(rng, count), self._extra.sample(rng, count)])
         position, velocity = self.start_state(rng, count)
         start = self.start_setpoint()
         setpoint = None if start is None else np.repeat(start[None], count, axis=0)
@@ -176,4 +210,4 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self._last_action[where] = 0.0
 
     def _observe(self) -> Observation:
-        return self._builder.build(self.loop.reported_position, self.loop.reported_velocity)
+        return self._builder.build(*self.sensed())

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from deal_hw.cli.options import Checked, Range, Seed
-from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.reading import read_json, reading
 
 if TYPE_CHECKING:
-    from deal_hw.description import SensorModel
     from deal_hw.policies.onnx_runtime import OnnxPolicy
-    from deal_hw.training import TrainingProgress
+    from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 
-ROBOTS = ("cartpole",)
-UDR_RATIO = 5.0
-UDR_LATENCY_S = (0.0, 0.03)
-"""Total latencies that uniform domain randomisation covers [s]."""
 POLICY_FILE = Path("policies") / "policy.onnx"
+SHOWN_MEASURES = 3
+"""So many of a task's measures stand beside the progress bar; all are in TensorBoard's files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,10 +39,24 @@ class Train(Checked):
     """distribution.json of a calibration: parameters, their uncertainty, latency."""
 
     udr: bool = False
-    """Train under uniform domain randomisation instead: every parameter within a factor of 5 of nominal."""
+    """Train under uniform domain randomisation instead: every parameter within a factor of its nominal value
+    (5; for the Go2 1.75)."""
+
+    nominal: bool = False
+    """Train under the model's own values instead; latency as with --udr."""
+
+    trainer: str | None = None
+    """ppo or sac; by default what the robot's shipped policy was trained with."""
 
     out: Path = Path("runs") / "train"
-    """The .onnx file to write, or a run folder, which gets policies/policy.onnx."""
+    """The .onnx file to write, or a run folder, which gets policies/policy.onnx. Checkpoint (.safetensors),
+    record (.json) and TensorBoard's files go beside it."""
+
+    start: Path | None = None
+    """A checkpoint (.safetensors) to fine-tune: its networks are where training starts."""
+
+    resume: bool = False
+    """Go on where the training that wrote this --out was stopped."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Environment steps; by default what the shipped policy was trained with."""
@@ -59,31 +72,40 @@ class Train(Checked):
 
 
 def train(config: Train) -> OnnxPolicy:
-    """Train a policy as the settings say and return it.
+    """Train a policy as the settings say and return it; Ctrl-C ends the training and keeps what there is.
 
     Raises:
-        ConfigurationError: Not exactly one distribution was asked for, or it cannot be read.
-        UnknownNameError: There is no such robot.
+        ConfigurationError: Not exactly one distribution was asked for, it cannot be read, or there is nothing
+            to go on from.
+        UnknownNameError: There is no such robot or trainer.
+        TrainingError: The training diverged, or a checkpoint does not fit.
     """
-    if config.udr and config.distribution is not None:
-        raise ConfigurationError("--udr and --distribution exclude each other: leave one of them out")
-    if not config.udr and config.distribution is None:
-        raise ConfigurationError(
-            "say under what to train: --distribution FILE (`deal-hw calibrate` writes it) or --udr"
-        )
-    distribution = (
-        udr_distribution(config.robot)
-        if config.distribution is None
-        else read_distribution(config.distribution)
-    )
     path = config.out if config.out.suffix == ".onnx" else config.out / POLICY_FILE
-    with _progress_bar(config.quiet) as bar:
-        policy = train_policy(
-            config.robot, distribution, path, seed=config.seed, steps=config.steps, members=config.members,
-            progress=_follow(bar),
+    distribution = _distribution(config)
+    checkpoint = path.with_suffix(".safetensors")
+    if config.resume and config.start is not None:
+        raise ConfigurationError("--start and --resume exclude each other: leave one of them out")
+    if config.resume and not checkpoint.exists():
+        raise ConfigurationError(
+            f"nothing to resume: {checkpoint} does not exist; leave out --resume, or give the --out of the "
+            "training that was stopped"
+        )
+    with _progress_bar(config.quiet) as bar, _stopped_by_signal() as stopped:
+        from deal_hw.training import TrainingFiles
+
+        files = TrainingFiles(
+            checkpoint=checkpoint, start=config.start, resume=config.resume,
+            log=path.with_name(path.stem + "_tensorboard"), stop=lambda: bool(stopped),
         )  # fmt: skip
+        policy = train_policy(
+            config.robot, distribution, path, trainer=config.trainer, seed=config.seed, steps=config.steps,
+            members=config.members, progress=_follow(bar), files=files,
+        )  # fmt: skip
+    if stopped:
+        print("stopped before the end; --resume goes on from the checkpoint")
     print(f"policy: {path}")
     print(f"record: {path.with_suffix('.json')}")
+    print(f"checkpoint: {checkpoint}")
     return policy
 
 
@@ -92,23 +114,25 @@ def train_policy(
     distribution: ParameterDistribution,
     path: Path,
     *,
+    trainer: str | None = None,
     seed: int = 0,
     steps: int | None = None,
     members: int | None = None,
-    sensor: SensorModel | None = None,
     progress: TrainingProgress | None = None,
+    files: TrainingFiles | None = None,
 ) -> OnnxPolicy:
-    """Train a policy by SAC and write it with its training record.
+    """Train a policy and write it with its training record.
 
     Args:
         robot: The robot's name.
         distribution: What parameters and latency are drawn from.
         path: The .onnx file; the record goes beside it.
+        trainer: The trainer's name; None for the robot's usual one.
         seed: Decides everything random.
         steps: Environment steps; None for the default.
         members: Robots simulated at once; None for the default.
-        sensor: The sensor model to train with; None for the description's.
         progress: Called as the training goes on.
+        files: Checkpoint, TensorBoard files, and the word to stop.
 
     Returns:
         The policy, read back from its file.
@@ -116,34 +140,56 @@ def train_policy(
     import dataclasses
     import inspect
 
-    from deal_hw.drivers import robot_description
-    from deal_hw.policies.cartpole_env import MEMBERS, CartPoleEnv
+    from deal_hw.drivers import recorded_description
     from deal_hw.policies.onnx_export import export_network
-    from deal_hw.policies.sac import SacConfig
-    from deal_hw.policies.trainers import make_trainer
+    from deal_hw.policies.tasks import training_task
 
-    if robot not in ROBOTS:
-        raise UnknownNameError("robot with a training environment", robot, ROBOTS)
-    config = SacConfig() if steps is None else dataclasses.replace(SacConfig(), steps=steps)
-    env = CartPoleEnv(robot_description(robot), distribution, members or MEMBERS, sensor=sensor)
+    task = training_task(robot)
+    teacher, config = task.trainer_and_config(trainer, steps)
+    env = task.make(recorded_description(robot), distribution, members or task.members[teacher.name])
     # Where it cannot be written that is known now and not after the training.
     path.parent.mkdir(parents=True, exist_ok=True)
     started, cpu = time.monotonic(), time.process_time()
-    policy = make_trainer("sac").train(env, config, np.random.default_rng(seed), progress)
+    reached: list[TrainingStatus] = []
+
+    def follow(status: TrainingStatus) -> None:
+        reached[:] = [status]
+        if progress is not None:
+            progress(status)
+
+    policy = teacher.train(env, config, np.random.default_rng(seed), follow, files)
     record = {
         "format": "deal_hw.training/1",
         "robot": robot,
         "seed": seed,
         "training": dict(policy.spec.training),
         "task": dataclasses.asdict(env.task),
-        "reward": inspect.cleandoc(CartPoleEnv.__doc__ or "").partition("\n\nArgs:")[0],
+        "reward": inspect.cleandoc(type(env).__doc__ or "").partition("\n\nArgs:")[0],
         "distribution": distribution.to_json(),
         "distribution_digest": distribution.digest(),
         "spec_digest": policy.spec.digest(),
+        "reached": dataclasses.asdict(reached[0]) if reached else {},
+        "started_from": str(files.start or "") if files is not None else "",
         "seconds": time.monotonic() - started,
         "cpu_seconds": time.process_time() - cpu,
     }
     return export_network(policy.network, policy.spec, path, record)
+
+
+def _distribution(config: Train) -> ParameterDistribution:
+    wanted = {
+        "--distribution": config.distribution is not None, "--udr": config.udr, "--nominal": config.nominal,
+    }  # fmt: skip
+    given = [name for name, is_given in wanted.items() if is_given]
+    if len(given) > 1:
+        raise ConfigurationError(f"{' and '.join(given)} exclude each other: leave one of them")
+    if not given:
+        raise ConfigurationError(
+            "say under what to train: --distribution FILE (`deal-hw calibrate` writes it), --udr or --nominal"
+        )
+    if config.distribution is not None:
+        return read_distribution(config.distribution)
+    return udr_distribution(config.robot) if config.udr else nominal_distribution(config.robot)
 
 
 def udr_distribution(robot: str) -> ParameterDistribution:
@@ -152,7 +198,25 @@ def udr_distribution(robot: str) -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot.
     """
-    return ParameterDistribution.uniform(_space(robot).with_ratio(UDR_RATIO), UDR_LATENCY_S)
+    from deal_hw.policies.tasks import training_task
+
+    task = training_task(robot)
+    return ParameterDistribution.uniform(_space(robot).with_ratio(task.udr_ratio), task.udr_latency_s)
+
+
+def nominal_distribution(robot: str) -> ParameterDistribution:
+    """Return the distribution of the model's own values; only the latency is drawn.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    from deal_hw.policies.tasks import training_task
+
+    task, space = training_task(robot), _space(robot)
+    K = len(space)
+    return ParameterDistribution(
+        space=space, mean=space.nominal, covariance=np.zeros((K, K)), latency_s=task.udr_latency_s
+    )
 
 
 def read_distribution(path: Path) -> ParameterDistribution:
@@ -168,24 +232,50 @@ def read_distribution(path: Path) -> ParameterDistribution:
 
 
 def _space(robot: str) -> ParameterSpace:
-    if robot not in ROBOTS:
-        raise UnknownNameError("robot with a training environment", robot, ROBOTS)
-    from deal_hw.drivers.cartpole.description import k9_space
+    from deal_hw.drivers import parameter_spaces
 
-    return k9_space()
+    return next(iter(parameter_spaces(robot).values()))()
+
+
+@contextlib.contextmanager
+def _stopped_by_signal() -> Iterator[list[int]]:
+    """Yield a list that the first SIGINT or SIGTERM goes into; a second one acts as usual."""
+    seen: list[int] = []
+    try:
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def note(number: int, frame: Any) -> None:
+            seen.append(number)
+            signal.signal(number, before[signal.Signals(number)])
+
+        for number in before:
+            signal.signal(number, note)
+    except ValueError:
+        # Not the main thread: signals are somebody else's.
+        before = {}
+    try:
+        yield seen
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _progress_bar(quiet: bool) -> Progress:
     return Progress(
         TextColumn("training"), BarColumn(), TextColumn("{task.completed}/{task.total} steps"),
-        TextColumn("return {task.fields[recent]:.1f}"), TimeElapsedColumn(), disable=quiet,
+        TextColumn("return {task.fields[recent]:.1f} {task.fields[measures]}"), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(), disable=quiet,
     )  # fmt: skip
 
 
-def _follow(bar: Progress) -> Callable[[int, int, float], None]:
-    row = bar.add_task("training", total=None, recent=0.0)
+def _follow(bar: Progress) -> TrainingProgress:
+    row = bar.add_task("training", total=None, recent=0.0, measures="")
 
-    def follow(done: int, total: int, recent: float) -> None:
-        bar.update(row, completed=done, total=total, recent=recent)
+    def follow(status: TrainingStatus) -> None:
+        shown = [f"{name} {value:.2f}" for name, value in status.measures.items()][:SHOWN_MEASURES]
+        bar.update(
+            row, completed=status.steps, total=status.total, recent=status.mean_return,
+            measures=", ".join(shown),
+        )  # fmt: skip
 
     return follow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deal_hw.errors import CheckpointError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy, PolicySpec
-from deal_hw.training import PolicyTrainer
+from deal_hw.training import PolicyTrainer, TrainingFiles, TrainingProgress, TrainingStatus
 
 _SEED = 3
 _SAME = 1e-5
@@ -45,10 +47,14 @@ class TrainerCase:
     export: Callable[[Policy, Path], Policy]
 
     def train(
-        self, config: Any, seed: int = _SEED, progress: Callable[[int, int, float], None] | None = None
+        self,
+        config: Any,
+        seed: int = _SEED,
+        progress: TrainingProgress | None = None,
+        files: TrainingFiles | None = None,
     ) -> Policy:
         """Train on a new environment."""
-        return self.trainer.train(self.make_env(), config, np.random.default_rng(seed), progress)
+        return self.trainer.train(self.make_env(), config, np.random.default_rng(seed), progress, files)
 
 
 class TrainerSuite:
@@ -112,7 +118,49 @@ class TrainerSuite:
     def test_progress_counts_up_to_the_budget(self, case: TrainerCase) -> None:
         """Progress rises and ends at the number of steps that were asked for."""
         calls: list[tuple[int, int]] = []
-        case.train(case.short_config, progress=lambda done, total, _: calls.append((done, total)))
+        case.train(case.short_config, progress=lambda status: calls.append((status.steps, status.total)))
         done = [d for d, _ in calls]
         assert done == sorted(done)
         assert calls[-1] == (case.short_config.steps, case.short_config.steps)
+
+    def test_a_stopped_training_goes_on_where_it_was(self, case: TrainerCase, tmp_path: Path) -> None:
+        """Told to stop after its first report it leaves a checkpoint; resumed, it does what is left."""
+        file, reports = tmp_path / "checkpoint.safetensors", [0, 0]
+
+        def count(status: TrainingStatus) -> None:
+            reports[0], reports[1] = reports[0] + 1, status.steps
+
+        stop = TrainingFiles(checkpoint=file, log=tmp_path / "log", stop=lambda: reports[0] > 0)
+        case.train(case.config, progress=count, files=stop)
+        stopped = reports[1]
+        assert 0 < stopped < case.config.steps and list((tmp_path / "log").iterdir())
+        config = dataclasses.replace(case.config, steps=stopped + case.short_config.steps)
+        first: list[int] = []
+        case.train(
+            config, progress=lambda status: first.append(status.steps),
+            files=TrainingFiles(checkpoint=file, resume=True),
+        )  # fmt: skip
+        assert stopped < first[0] and first[-1] == config.steps
+
+    def test_a_fine_tune_starts_from_the_networks_of_a_checkpoint(
+        self, case: TrainerCase, tmp_path: Path
+    ) -> None:
+        """Told to stop at once, it acts as the policy whose checkpoint it was given."""
+        file = tmp_path / "checkpoint.safetensors"
+        kept = case.train(case.short_config, files=TrainingFiles(checkpoint=file))
+        started = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(start=file, stop=lambda: True))
+        observation = np.linspace(-1.0, 1.0, len(case.layout.observation), dtype=np.float32)
+        fresh = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(stop=lambda: True))
+        gap = np.abs(started.act(observation) - kept.act(observation)).max()
+        assert gap < np.abs(fresh.act(observation) - kept.act(observation)).max()
+
+    def test_checkpoints_that_do_not_fit_are_refused(self, case: TrainerCase, tmp_path: Path) -> None:
+        """Damaged, or of networks of another size: the message names the file."""
+        file = tmp_path / "checkpoint.safetensors"
+        case.train(case.short_config, files=TrainingFiles(checkpoint=file))
+        other = dataclasses.replace(case.short_config, hidden=(8,))
+        with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors: hidden is"):
+            case.train(other, files=TrainingFiles(start=file))
+        file.write_bytes(file.read_bytes()[:100])
+        with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors cannot be read"):
+            case.train(case.short_config, files=TrainingFiles(checkpoint=file, resume=True))

@@ -1,11 +1,128 @@
-"""The table of trainers."""
+"""The table of trainers, and each on the toy cart-pole: nominal physics, perfect sensor, no latency."""
 
 from __future__ import annotations
 
-import pytest
+from pathlib import Path
+from typing import Any
 
-from deal_hw.errors import UnknownNameError
+import numpy as np
+import pytest
+import torch
+from rsl_rl.algorithms import PPO
+
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.errors import ConfigurationError, TrainingDivergedError, UnknownNameError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.cartpole_env import BalanceTask, CartPoleEnv, balance_spec
+from deal_hw.policies.evaluate import evaluate_batch
+from deal_hw.policies.network_policy import NetworkPolicy
+from deal_hw.policies.onnx_export import export_network
+from deal_hw.policies.ppo import PpoConfig, PpoTrainer
+from deal_hw.policies.sac import SacConfig, SacTrainer
+from deal_hw.policies.servo_loop import EXACT_SENSOR
+from deal_hw.policies.tasks import TASKS
 from deal_hw.policies.trainers import TRAINERS, make_trainer
+from deal_hw.policy import Policy
+from deal_hw.testing.trainer_suite import TrainerCase, TrainerSuite
+from deal_hw.training import TrainingFiles
+
+SPACE = k9_space()
+TOY = ParameterDistribution.point(SPACE, SPACE.nominal, 0.0)
+TASK = BalanceTask(ticks=100, host_delay_s=(0.0, 0.0))
+
+
+def upright_seconds(policy: Policy) -> float:
+    """Return how long a policy holds the pole of the toy upright, of 5 s, in the mean over six starts."""
+    assert isinstance(policy, NetworkPolicy)
+    start = np.zeros((6, 2))
+    start[:, 1] = np.linspace(-0.05, 0.05, 6)
+    theta = np.repeat(SPACE.nominal[None], 6, axis=0)
+    results = evaluate_batch(
+        policy, DESCRIPTION, SPACE, theta, np.zeros(6), np.random.default_rng(0), seconds=5.0,
+        start_position=start, sensor=EXACT_SENSOR,
+    )  # fmt: skip
+    return float(np.mean([r.upright_s for r in results]))
+
+
+def export(policy: Policy, path: Path) -> Policy:
+    assert isinstance(policy, NetworkPolicy)
+    return export_network(policy.network, policy.spec, path)
+
+
+def toy_case(trainer: Any, members: int, config: Any, short_config: Any) -> TrainerCase:
+    """Return a trainer with the toy."""
+    return TrainerCase(
+        trainer=trainer,
+        make_env=lambda: CartPoleEnv(DESCRIPTION, TOY, members, task=TASK, sensor=EXACT_SENSOR),
+        layout=balance_spec(DESCRIPTION, TASK),
+        distribution=TOY,
+        config=config,
+        short_config=short_config,
+        score=upright_seconds,
+        learned=3.5,
+        export=export,
+    )
+
+
+class TestSac(TrainerSuite):
+    """SAC keeps the contract of trainers."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> TrainerCase:
+        """Return SAC and the toy."""
+        return toy_case(
+            SacTrainer(),
+            16,
+            SacConfig(steps=8_000, hidden=(32, 32), warmup=500),
+            SacConfig(steps=800, hidden=(32, 32), warmup=500),
+        )
+
+
+class TestPpo(TrainerSuite):
+    """PPO keeps the contract of trainers."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> TrainerCase:
+        """Return PPO and the toy."""
+        settings: dict[str, Any] = {
+            "hidden": (32, 32),
+            "rollout": 16,
+            "learning_rate": 3e-3,
+            "reward_scale": 0.1,
+        }
+        return toy_case(
+            PpoTrainer(), 64, PpoConfig(steps=60_000, **settings), PpoConfig(steps=1_024, **settings)
+        )
+
+
+def test_a_training_that_diverges_is_stopped_and_keeps_its_checkpoint(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """From the third update on the critic is NaN: the error names steps and checkpoint, which is sound."""
+    file = tmp_path / "checkpoint.safetensors"
+    config = PpoConfig(steps=10_000, hidden=(8,), checkpoint_updates=1)
+    make = toy_case(PpoTrainer(), 16, config, config).make_env
+    real, calls = PPO.update, []
+
+    def update(self: PPO) -> dict[str, float]:
+        losses: dict[str, float] = real(self)
+        calls.append(1)
+        if len(calls) == 3:
+            with torch.no_grad():
+                next(self.critic.parameters()).fill_(float("nan"))
+        return losses
+
+    monkeypatch.setattr(PPO, "update", update)
+    with pytest.raises(TrainingDivergedError, match=r"diverged after 1152 steps.*checkpoint\.safetensors is"):
+        PpoTrainer().train(make(), config, np.random.default_rng(0), files=TrainingFiles(checkpoint=file))
+    steps: list[int] = []
+    PpoTrainer().train(
+        make(), PpoConfig(steps=1_152, hidden=(8,)), np.random.default_rng(0),
+        lambda status: steps.append(status.steps), TrainingFiles(checkpoint=file, resume=True),
+    )  # fmt: skip
+    assert steps == [1_152]
 
 
 @pytest.mark.parametrize("name", list(TRAINERS))
@@ -16,5 +133,34 @@ def test_every_trainer_loads_under_its_name(name: str) -> None:
 
 def test_unknown_trainer_lists_the_trainers() -> None:
     """A wrong name is answered with the right ones."""
-    with pytest.raises(UnknownNameError, match=r"ppo.*sac"):
-        make_trainer("ppo")
+    with pytest.raises(UnknownNameError, match=r"td3.*ppo, sac"):
+        make_trainer("td3")
+
+
+@pytest.mark.parametrize("name", list(TRAINERS))
+@pytest.mark.parametrize("robot", list(TASKS))
+def test_every_task_has_settings_for_every_trainer(robot: str, name: str) -> None:
+    """A trainer beside the usual one can be chosen for each robot, and the steps with it."""
+    trainer, config = TASKS[robot].trainer_and_config(name, 123_456)
+    assert (trainer.name, config.steps) == (name, 123_456)
+    assert TASKS[robot].members[name] > 0
+
+
+@pytest.mark.parametrize(
+    ("config", "settings", "message"),
+    [
+        (PpoConfig, {"steps": 0}, "steps must be positive, got 0"),
+        (PpoConfig, {"trace": 0.0}, r"trace must lie in \(0, 1\], got 0.0"),
+        (PpoConfig, {"hidden": ()}, "hidden must name at least one layer"),
+        (SacConfig, {"steps": 0}, "steps must be positive, got 0"),
+        (SacConfig, {"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
+        (SacConfig, {"hidden": ()}, "hidden must name at least one layer"),
+        (SacConfig, {"steps": 100, "warmup": 100}, r"100 steps: give more than the 100 steps of warmup"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(
+    config: type[PpoConfig | SacConfig], settings: dict[str, Any], message: str
+) -> None:
+    """The message names the setting, what was given and what is allowed."""
+    with pytest.raises(ConfigurationError, match=message):
+        config(**settings)

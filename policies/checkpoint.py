@@ -1,0 +1,114 @@
+"""Checkpoints of trainings: tensors in a safetensors file, which runs no code when it is read."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from deal_hw.errors import CheckpointError, PolicyError
+from deal_hw.policy import PolicySpec
+
+FORMAT: Final = "deal_hw.checkpoint/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checkpoint:
+    """What a trainer keeps.
+
+    Attributes:
+        tensors: Weights and the optimiser's memory, by ``<part>.<name>``.
+        notes: Plain JSON values: the trainer's name, how far it was.
+        path: Where it was read from, for messages.
+    """
+
+    tensors: Mapping[str, torch.Tensor]
+    notes: Mapping[str, Any]
+    path: Path = Path()
+
+    def check(self, **wanted: Any) -> None:
+        """Check notes that must be these.
+
+        Raises:
+            CheckpointError: One is not; the message names it.
+        """
+        for name, value in wanted.items():
+            if self.notes.get(name) != value:
+                raise CheckpointError(
+                    f"{self.path}: {name} is {self.notes.get(name)!r}, this training has {value!r}; give a "
+                    "checkpoint of the same kind, or train with its settings"
+                )
+
+    def part(self, part: str, like: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the tensors of a part, which must have the names and shapes of ``like``.
+
+        Raises:
+            CheckpointError: They have not, or a number is not finite.
+        """
+        found = {
+            name.removeprefix(part + "."): value
+            for name, value in self.tensors.items()
+            if name.startswith(part + ".")
+        }
+        wanted = {name: tuple(value.shape) for name, value in like.items()}
+        have = {name: tuple(value.shape) for name, value in found.items()}
+        if have != wanted:
+            raise CheckpointError(
+                f"{self.path}: the {part} has tensors {have}, this training's has {wanted}; give a "
+                "checkpoint of the same task and settings"
+            )
+        if not all(bool(torch.isfinite(value).all()) for value in found.values()):
+            raise CheckpointError(f"{self.path}: the {part} holds a number that is not finite; give another")
+        return found
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint, layout: PolicySpec) -> None:
+    """Write a checkpoint; a file that is there is replaced when the new one is whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    notes = {**checkpoint.notes, "format": FORMAT, "layout": layout.to_json()}
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        tensors = {name: value.detach().contiguous() for name, value in checkpoint.tensors.items()}
+        save_file(tensors, draft, metadata={"deal_hw": json.dumps(notes, sort_keys=True)})
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
+    """Read a checkpoint of a policy of this layout.
+
+    Raises:
+        CheckpointError: There is no such file, it is no checkpoint, or it is of another layout.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            notes = json.loads((file.metadata() or {}).get("deal_hw", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (OSError, SafetensorError, ValueError) as err:
+        raise CheckpointError(
+            f"the checkpoint {path} cannot be read ({err}); `deal-hw train` writes checkpoint.safetensors"
+        ) from err
+    if not isinstance(notes, dict) or notes.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is no checkpoint of deal-hw; `deal-hw train` writes one")
+    try:
+        found = PolicySpec.from_json(str(notes.get("layout")))
+    except PolicyError as err:
+        raise CheckpointError(f"{path} is damaged: its layout is {err}; give another checkpoint") from err
+    wrong = [
+        name
+        for name in ("robot", "joint_names", "observation", "action_scale", "control_rate_hz", "clock_hz")
+        if getattr(found, name) != getattr(layout, name)
+    ]
+    if wrong:
+        raise CheckpointError(
+            f"{path} is of a policy with another {', '.join(wrong)}; give a checkpoint of the same task"
+        )
+    return Checkpoint(tensors=tensors, notes=notes, path=path)

@@ -1,0 +1,97 @@
+"""A policy that is a torch network, and what trainers of such policies share."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from deal_hw.errors import TrainingDivergedError
+from deal_hw.policies.vector_env import ServoVectorEnv
+from deal_hw.policy import Observation, PolicySpec
+from deal_hw.types import FloatArray
+
+
+class NetworkPolicy:
+    """A policy that is a torch network: observations (B, O) in, actions (B, A) in [-1, 1] out."""
+
+    def __init__(self, network: torch.nn.Module, spec: PolicySpec) -> None:
+        self.network = network.eval()
+        self._spec = spec
+
+    @property
+    def spec(self) -> PolicySpec:
+        """What the policy observes and what its action means."""
+        return self._spec
+
+    def reset(self) -> None:
+        """Nothing to forget: the observation carries the past."""
+
+    def act(self, observation: Observation) -> FloatArray:
+        """Return the action, (A,), for an observation, (O,)."""
+        action: FloatArray = self.act_batch(observation[None])[0]
+        return action
+
+    def act_batch(self, observations: Observation) -> FloatArray:
+        """Return the actions, (B, A), for observations, (B, O)."""
+        with torch.no_grad():
+            action = self.network(torch.as_tensor(observations, dtype=torch.float32))
+        return np.asarray(action.numpy(), dtype=np.float64)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute on one thread meanwhile.
+
+    For networks of this size a second thread costs more than it computes; and one thread sums in one order.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def is_finite(*networks: torch.nn.Module) -> bool:
+    """Return whether all weights are numbers."""
+    return all(bool(torch.isfinite(p).all()) for network in networks for p in network.parameters())
+
+
+def diverged(steps: int, checkpoint: Path | None) -> TrainingDivergedError:
+    """Return the error of a training whose weights are no numbers any more."""
+    kept = "no checkpoint was kept" if checkpoint is None else f"the checkpoint {checkpoint} is of before"
+    return TrainingDivergedError(
+        f"the training diverged after {steps} steps: a network holds a number that is not finite; {kept}. "
+        "Lower the learning rate and start from there"
+    )
+
+
+def trained_spec(env: ServoVectorEnv, algorithm: str, config: Any, seed: int, **versions: str) -> PolicySpec:
+    """Return the spec of a policy with the record of its training.
+
+    Args:
+        env: What it was trained in.
+        algorithm: The trainer's name.
+        config: The trainer's settings, a dataclass.
+        seed: What all randomness came from.
+        **versions: Versions of packages by name.
+    """
+    settings = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in dataclasses.asdict(config).items()
+    }
+    training = {
+        **env.layout.training,
+        "algorithm": algorithm,
+        "members": env.num_envs,
+        "seed": seed,
+        "config": settings,
+        "versions": versions,
+    }
+    return dataclasses.replace(env.layout, training=training)

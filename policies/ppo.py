@@ -1,0 +1,247 @@
+"""Proximal policy optimisation, by rsl-rl-lib, on a vectorised environment of ours."""
+
+from __future__ import annotations
+
+import collections
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from deal_hw.policies.network_policy import NetworkPolicy, diverged, is_finite, one_thread, trained_spec
+from deal_hw.policies.training_log import TrainingLog
+from deal_hw.policies.vector_env import ServoVectorEnv
+from deal_hw.policy import Observation
+from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PpoConfig:
+    """Settings of PPO; the defaults are what the shipped walking policy was trained with.
+
+    Attributes:
+        steps: Environment steps of all members together; rounded up to whole rollouts.
+        hidden: Units of the hidden layers of actor and critic.
+        rollout: Control periods of each member between updates.
+        epochs: How often an update goes through a rollout.
+        batches: Parts that it goes through it in.
+        learning_rate: Adam's, at the start; from there it follows ``divergence``.
+        divergence: Kullback-Leibler divergence of an update that the learning rate is tuned for [nat].
+        clip: Share by which an update may change the probability of an action.
+        gamma: Discount a tick.
+        trace: Lambda of the generalised advantage estimate.
+        entropy: Weight of the entropy of the actions.
+        exploration: Standard deviation of the actions at the start.
+        reward_scale: Rewards are multiplied by this before the critic sees them.
+        checkpoint_updates: A checkpoint is written every so many updates, and at the end.
+    """
+
+    steps: int = 8_000_000
+    hidden: tuple[int, ...] = (128, 128)
+    rollout: int = 24
+    epochs: int = 5
+    batches: int = 4
+    learning_rate: float = 1e-3
+    divergence: float = 0.01
+    clip: float = 0.2
+    gamma: float = 0.99
+    trace: float = 0.95
+    entropy: float = 0.005
+    exploration: float = 0.5
+    reward_scale: float = 0.02
+    checkpoint_updates: int = 25
+
+    def __post_init__(self) -> None:
+        for name in (
+            "steps", "rollout", "epochs", "batches", "learning_rate", "divergence", "clip", "exploration",
+            "reward_scale", "checkpoint_updates",
+        ):  # fmt: skip
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
+        for name in ("gamma", "trace"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigurationError(f"{name} must lie in (0, 1], got {getattr(self, name)!r}")
+        if not self.hidden or min(self.hidden) < 1:
+            raise ConfigurationError(
+                f"hidden must name at least one layer of at least one unit, got {self.hidden!r}"
+            )
+
+
+class PpoTrainer:
+    """Trains on one CPU core; the same generator state gives the same policy on the same machine."""
+
+    name = "ppo"
+    config = PpoConfig
+
+    def train(
+        self,
+        env: ServoVectorEnv,
+        config: PpoConfig,
+        rng: np.random.Generator,
+        progress: TrainingProgress | None = None,
+        files: TrainingFiles | None = None,
+    ) -> NetworkPolicy:
+        """Return the policy after ``config.steps`` environment steps, or as it is when it is told to stop.
+
+        Args:
+            env: The environment; it is seeded from ``rng``.
+            config: The settings.
+            rng: Where all randomness comes from. The global generator of torch is seeded from it.
+            progress: Called after each update.
+            files: Checkpoint, TensorBoard files, and the word to stop.
+
+        Returns:
+            The mean action, without exploration, cut off at -1 and 1.
+
+        Raises:
+            TrainingDivergedError: The networks hold numbers that are not finite.
+            CheckpointError: A checkpoint cannot be read, or does not fit.
+        """
+        files = files or TrainingFiles()
+        with one_thread(), TrainingLog(files.log) as log:
+            seed = int(rng.integers(2**31))
+            torch.manual_seed(seed)
+            learner = _Learner(env, config)
+            found = files.source(env.layout, read_checkpoint)
+            if found is not None:
+                learner.load(found, whole=files.resume)
+                # Another seed than at the start: the same episodes again would teach the same again.
+                seed = int(np.random.default_rng([seed, learner.steps]).integers(2**31))
+                torch.manual_seed(seed)
+            learner.begin(seed)
+            while learner.steps < config.steps and not files.stop():
+                losses = learner.update()
+                if not learner.is_finite:
+                    raise diverged(learner.steps, files.checkpoint)
+                status = TrainingStatus(
+                    steps=min(learner.steps, config.steps), total=config.steps,
+                    mean_return=learner.mean_return, measures=env.measures(),
+                )  # fmt: skip
+                log.write(status, losses)
+                if files.checkpoint is not None and learner.updates % config.checkpoint_updates == 0:
+                    write_checkpoint(files.checkpoint, learner.checkpoint(), env.layout)
+                if progress is not None:
+                    progress(status)
+            if files.checkpoint is not None:
+                write_checkpoint(files.checkpoint, learner.checkpoint(), env.layout)
+        spec = trained_spec(
+            env, self.name, config, seed, rsl_rl=version("rsl-rl-lib"), torch=str(torch.__version__)
+        )
+        return NetworkPolicy(learner.network(), spec)
+
+
+class _Learner:
+    """rsl-rl's PPO with an environment of ours."""
+
+    def __init__(self, env: ServoVectorEnv, config: PpoConfig) -> None:
+        self._env, self._config = env, config
+        O, A = len(env.layout.observation), len(env.layout.actuated)  # noqa: E741
+        example = self._batch(np.zeros((env.num_envs, O), dtype=np.float32))
+        groups = {"actor": ["observation"], "critic": ["observation", "privileged"]}
+        spread = {
+            "class_name": "GaussianDistribution", "init_std": config.exploration, "std_type": "log",
+        }  # fmt: skip
+        hidden = list(config.hidden)
+        self._actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
+        self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu")
+        # Small first actions: the default pose, and not a random one, is where learning starts.
+        with torch.no_grad():
+            list(self._actor.mlp)[-1].weight.mul_(0.1)
+        storage = RolloutStorage("rl", env.num_envs, config.rollout, example, [A])
+        self._ppo = PPO(
+            self._actor, self._critic, storage,
+            num_learning_epochs=config.epochs, num_mini_batches=config.batches, clip_param=config.clip,
+            gamma=config.gamma, lam=config.trace, entropy_coef=config.entropy,
+            learning_rate=config.learning_rate, desired_kl=config.divergence,
+        )  # fmt: skip
+        self.steps = self.updates = 0
+        self._return = np.zeros(env.num_envs)
+        self._recent: collections.deque[float] = collections.deque(maxlen=100)
+
+    def begin(self, seed: int) -> None:
+        """Start the episodes."""
+        self._seen = self._batch(self._env.reset(seed=seed)[0])
+
+    def update(self) -> dict[str, float]:
+        """Roll out once, learn from it, and return the losses."""
+        config, ppo = self._config, self._ppo
+        with torch.no_grad():
+            for _ in range(config.rollout):
+                action = ppo.act(self._seen)
+                seen, reward, terminated, truncated, _ = self._env.step(action.numpy().astype(np.float64))
+                over = terminated | truncated
+                self._return += reward
+                self._recent.extend(float(x) for x in self._return[over])
+                self._return[over] = 0.0
+                self._seen = self._batch(seen)
+                scaled = torch.as_tensor(reward * config.reward_scale, dtype=torch.float32)
+                ends = {"time_outs": torch.as_tensor(truncated)}
+                ppo.process_env_step(self._seen, scaled, torch.as_tensor(over), ends)
+            ppo.compute_returns(self._seen)
+        losses = ppo.update()
+        self.steps += config.rollout * self._env.num_envs
+        self.updates += 1
+        return {**losses, "learning_rate": ppo.learning_rate, "exploration": self._exploration()}
+
+    @property
+    def mean_return(self) -> float:
+        """Mean return of the last hundred episodes; 0 before the first ends."""
+        return float(np.mean(self._recent)) if self._recent else 0.0
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all weights are numbers."""
+        return is_finite(self._actor, self._critic)
+
+    def network(self) -> torch.nn.Module:
+        """Return the actor without exploration, as layers."""
+        return torch.nn.Sequential(*self._actor.mlp, torch.nn.Hardtanh())
+
+    def checkpoint(self) -> Checkpoint:
+        """Return all that is needed to go on."""
+        tensors = {
+            f"{part}.{name}": value
+            for part, model in (("actor", self._actor), ("critic", self._critic))
+            for name, value in model.state_dict().items()
+        }
+        for i, state in self._ppo.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{i}.{name}": value for name, value in state.items()}
+        notes = {
+            "trainer": PpoTrainer.name, "steps": self.steps, "updates": self.updates,
+            "learning_rate": self._ppo.learning_rate, "hidden": list(self._config.hidden),
+        }  # fmt: skip
+        return Checkpoint(tensors=tensors, notes=notes)
+
+    def load(self, found: Checkpoint, *, whole: bool) -> None:
+        """Take over networks and, with ``whole``, where the training was."""
+        found.check(trainer=PpoTrainer.name, hidden=list(self._config.hidden))
+        for part, model in (("actor", self._actor), ("critic", self._critic)):
+            model.load_state_dict(found.part(part, model.state_dict()))
+        if not whole:
+            return
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in found.tensors.items():
+            if name.startswith("optimizer."):
+                _, index, key = name.split(".", 2)
+                state.setdefault(int(index), {})[key] = value
+        groups = self._ppo.optimizer.state_dict()["param_groups"]
+        self._ppo.learning_rate = groups[0]["lr"] = float(found.notes["learning_rate"])
+        self._ppo.optimizer.load_state_dict({"state": state, "param_groups": groups})
+        self.steps, self.updates = int(found.notes["steps"]), int(found.notes["updates"])
+
+    def _batch(self, observation: Observation) -> TensorDict:
+        parts = {"observation": observation, "privileged": self._env.privileged().astype(np.float32)}
+        tensors = {name: torch.as_tensor(part) for name, part in parts.items()}
+        return TensorDict(tensors, batch_size=[self._env.num_envs])
+
+    def _exploration(self) -> float:
+        spread: Any = self._actor.distribution
+        return float(spread.log_std_param.detach().exp().mean())

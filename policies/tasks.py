@@ -1,0 +1,101 @@
+"""The table of training tasks: robot -> environment, trainer and settings; classes are imported on use."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from deal_hw.errors import UnknownNameError
+from deal_hw.policies.trainers import make_trainer
+
+_SMALL_PPO: Final = {"hidden": (64, 64), "learning_rate": 3e-3, "gamma": 0.98, "reward_scale": 0.1}
+_LEGGED_SAC: Final = {
+    "hidden": (128, 128), "gradient_steps": 8, "batch": 256, "learning_rate": 1e-3,
+    "final_learning_rate": 3e-4, "gamma": 0.98, "tau": 0.02, "entropy": 0.1, "warmup": 5_000,
+    "buffer": 500_000, "averaged": 0.05, "steps": 240_000,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingTask:
+    """What a robot is trained for, and how; the defaults are what its shipped policy was trained with.
+
+    Attributes:
+        environment: The environment, "module:class"; it is called as ``environment(description,
+            distribution, members)``.
+        trainer: The usual trainer's name.
+        members: Robots simulated at once, by trainer.
+        settings: The trainers' settings that are not their defaults, by trainer.
+        udr_ratio: Uniform domain randomisation reaches this factor to either side of each nominal value.
+        udr_latency_s: Lowest and highest total latency of it [s].
+    """
+
+    environment: str
+    trainer: str
+    members: Mapping[str, int]
+    settings: Mapping[str, Mapping[str, Any]]
+    udr_ratio: float
+    udr_latency_s: tuple[float, float]
+
+    def make(self, *arguments: Any, **more: Any) -> Any:
+        """Return the environment, made with these arguments."""
+        module, _, name = self.environment.partition(":")
+        return getattr(importlib.import_module(module), name)(*arguments, **more)
+
+    def trainer_and_config(self, trainer: str | None = None, steps: int | None = None) -> tuple[Any, Any]:
+        """Return a trainer and its settings for this task.
+
+        Args:
+            trainer: Its name; the usual one by default.
+            steps: Environment steps; None for the default.
+
+        Raises:
+            UnknownNameError: There is no such trainer.
+        """
+        name = trainer or self.trainer
+        made = make_trainer(name)
+        settings = dict(self.settings.get(name, {}))
+        if steps is not None:
+            settings["steps"] = steps
+        return made, made.config(**settings)
+
+
+TASKS: Final = {
+    "ant": TrainingTask(
+        environment="deal_hw.policies.ant_env:AntEnv",
+        trainer="sac",
+        members={"ppo": 200, "sac": 64},
+        settings={"ppo": {"steps": 3_000_000}, "sac": {**_LEGGED_SAC, "target_entropy": -8.0}},
+        udr_ratio=5.0,
+        udr_latency_s=(0.0, 0.02),
+    ),
+    "cartpole": TrainingTask(
+        environment="deal_hw.policies.cartpole_env:CartPoleEnv",
+        trainer="sac",
+        members={"ppo": 64, "sac": 32},
+        settings={"ppo": {**_SMALL_PPO, "steps": 500_000}},
+        udr_ratio=5.0,
+        udr_latency_s=(0.0, 0.03),
+    ),
+    "go2": TrainingTask(
+        environment="deal_hw.policies.go2_env:Go2Env",
+        trainer="ppo",
+        members={"ppo": 200, "sac": 64},
+        settings={"sac": {**_LEGGED_SAC, "target_entropy": -12.0}},
+        udr_ratio=1.75,
+        udr_latency_s=(0.0, 0.012),
+    ),
+}
+
+
+def training_task(robot: str) -> TrainingTask:
+    """Return a robot's task.
+
+    Raises:
+        UnknownNameError: There is none; the message lists the robots.
+    """
+    if robot not in TASKS:
+        raise UnknownNameError("robot with a training environment", robot, TASKS)
+    return TASKS[robot]
