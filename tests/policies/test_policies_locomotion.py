@@ -8,22 +8,26 @@ import json
 import math
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
-from deal_hw.drivers import parameter_spaces, robot_description
+from deal_hw.control.safety_filter import SafetyFilter
+from deal_hw.drivers import parameter_spaces, recorded_description, robot_description
 from deal_hw.errors import ConfigurationError
-from deal_hw.parameters import ParameterDistribution
+from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.ant_env import AntEnv, RunTask, run_spec
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
 from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import Observation, PolicySpec
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, JointCommand
 
 ROOT = Path(__file__).resolve().parents[2]
 ROBOTS = ("ant", "go2")
+GO2 = recorded_description("go2")
+NEVER = 10**9
 
 
 def udr(robot: str) -> ParameterDistribution:
@@ -31,16 +35,16 @@ def udr(robot: str) -> ParameterDistribution:
     return ParameterDistribution.uniform(space.with_ratio(5.0), (0.0, 0.02))
 
 
-def make(robot: str, count: int = 4, **task: float) -> LocomotionEnv:
+def make(robot: str, count: int = 4, **task: Any) -> LocomotionEnv:
     if robot == "ant":
-        return AntEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))  # type: ignore[arg-type]
-    return Go2Env(robot_description(robot), udr(robot), count, task=WalkTask(**task))  # type: ignore[arg-type]
+        return AntEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
+    return Go2Env(GO2, udr(robot), count, task=WalkTask(**task))
 
 
 @pytest.fixture(scope="module", params=ROBOTS)
 def env(request: pytest.FixtureRequest) -> LocomotionEnv:
     """Return an environment of four robots with episodes of 0.4 s."""
-    return make(request.param, ticks=20)
+    return make(request.param, ticks=20, **({"start_speed": 0.0} if request.param == "go2" else {}))
 
 
 def state(count: int, joints: int) -> tuple[FloatArray, FloatArray]:
@@ -106,60 +110,140 @@ def test_ant_ends_on_its_back_or_in_the_air() -> None:
 
 
 def test_go2_reward_by_hand() -> None:
-    """Upright: tracking and height; turned by 90 degrees about z: velocities count in the base's frame."""
-    env = make("go2", 3)
+    """Tracking, height, tilt, fast joints; velocities count in the base's frame. Feet are tested below."""
+    env = make("go2", 3, gait_weight=0.0, slip_weight=0.0)
     assert isinstance(env, Go2Env)
     env.command[:] = 0.0
     env.command[1:, 0] = 0.4
     position, velocity = state(3, 12)
-    # Stands as told, 2 cm low: 1.5 + 0.5 - 10 * 0.02^2 = 1.996.
-    position[0, 2] = 0.24
+    position[:, 2], position[:, 6:] = 0.27, GO2.default_position
+    # Stands as told, 2 cm low: 1.5 + 0.8 + 0.3 - 20 * 0.02^2 = 2.592.
+    position[0, 2] = 0.25
     # Heads along the world's y axis at 0.2 m/s, 0.2 too slow, and yaws at 0.5 rad/s; one action changed by 1:
-    # 1.5 exp(-0.04 / 0.08) + 0.5 - 0.1 * 0.25 - 0.02 = 1.5 exp(-0.5) + 0.455.
+    # 1.5 exp(-0.04 / 0.2) + 0.8 exp(-0.25 / 0.2) + 0.3 - 0.03.
     position[1, 5] = math.pi / 2
     velocity[1, :6] = 0.0, 0.2, 0.0, 0.0, 0.0, 0.5
-    # Tilted by 30 degrees, sin^2 = 0.25: 1.5 exp(-0.16 / 0.08) + 0.5 - 2 * 0.25 = 1.5 exp(-2).
+    # Tilted by 30 degrees, sin^2 = 0.25, a hip 0.2 rad off, another joint at 0.8 of its trip speed:
+    # 1.5 exp(-0.16 / 0.2) + 0.8 + 0.3 - 3 * 0.25 - 0.3 * 0.04 - 5 * 0.2^2.
     position[2, 3] = math.pi / 6
+    position[2, 6] += 0.2
+    velocity[2, 8] = -0.8 * GO2.limits.trip_velocity[2]
     before, action = np.zeros((3, 12)), np.zeros((3, 12))
     action[1, 7] = -1.0
-    wanted = [1.996, 1.5 * math.exp(-0.5) + 0.455, 1.5 * math.exp(-2.0)]
+    wanted = [2.592, 1.5 * math.exp(-0.2) + 0.8 * math.exp(-1.25) + 0.27, 1.5 * math.exp(-0.8) + 0.138]
     np.testing.assert_allclose(env.reward(position, velocity, action, before), wanted, atol=1e-12)
 
 
+def test_go2_feet_are_paid_for_following_the_clock() -> None:
+    """Over a whole step, who stands earns all of it if told to stand; if told to walk, not the half sine.
+
+    Its mean over a step is (2 / pi) / 2, so 1 - 0.318 is left.
+    """
+    for standing, wanted in ((1.0, 1.0), (0.0, 1.0 - 1.0 / math.pi)):
+        env = make(
+            "go2", 4, standing=standing, zeroed=0.0, push_ticks=NEVER, command_ticks=NEVER, start_speed=0.0,
+            start_noise_rad=0.0, payload_kg=(0.0, 0.0),
+        )  # fmt: skip
+        env.reset(seed=1)
+        env.step(np.zeros((4, 12)))
+        env.measures()
+        for _ in range(20):
+            env.step(np.zeros((4, 12)))
+        assert env.measures()["gait"] == pytest.approx(wanted, abs=0.12)
+
+
 def test_go2_ends_when_it_tilts_or_sinks() -> None:
-    """The limits are 60 degrees and 0.1 m."""
+    """The limits are a cosine of 0.7, 45.6 degrees, and 0.15 m."""
     env = make("go2", 4)
     position, velocity = state(4, 12)
-    position[:2, 3] = np.radians([59.0, 61.0])
-    position[2:, 2] = 0.101, 0.099
+    position[:2, 3] = np.radians([45.0, 46.0])
+    position[2:, 2] = 0.151, 0.149
     assert env.ended(position, velocity).tolist() == [False, True, False, True]
 
 
 def test_go2_commands_are_drawn_and_observed() -> None:
-    """A fifth of the episodes stand, the others walk at 0.1 to 0.5 m/s, and the policy is told which."""
-    env = make("go2", 200)
+    """A tenth stands, a quarter of the others' parts is zero, all are in range, and the policy is told."""
+    env = make("go2", 400)
     assert isinstance(env, Go2Env)
     observation, _ = env.reset(seed=0)
-    speed = env.command[:, 0]
-    assert 20 <= (speed == 0).sum() <= 60
-    assert ((speed == 0) | ((speed >= 0.1) & (speed <= 0.5))).all()
-    told = [term.quantity for term in env.layout.observation].index("command")
-    np.testing.assert_allclose(observation[:, told], 2.0 * speed, rtol=1e-6)
+    command = env.command
+    still = (command == 0).all(axis=1)
+    assert 20 <= still.sum() <= 70
+    assert 0.2 <= (command[~still] == 0).mean() <= 0.3
+    low, high = np.array(env.task.command_range).T
+    assert (command >= low).all() and (command <= high).all()
+    told = [k for k, term in enumerate(env.layout.observation) if term.quantity == "command"]
+    np.testing.assert_allclose(observation[:, told], command, rtol=1e-6)
 
 
-def test_targets_move_no_faster_than_safety_allows() -> None:
-    """From rest, an action of 1 moves the calf's target by 0.5 rad, and the policy sees 0.5 / 0.8."""
-    env = make("go2", 1)
+def test_go2_targets_are_those_of_the_filter_that_deploys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Batched, and from what is reported, each member is sent what the filter makes of its command alone."""
+    env = make("go2", 3, push_ticks=NEVER, command_ticks=NEVER)
+    env.reset(seed=0)
+    assert isinstance(env, Go2Env)
+    sent: list[FloatArray] = []
+    real = env.loop.step
+
+    def step(target: FloatArray, rng: np.random.Generator) -> FloatArray:
+        sent.append(target.copy())
+        return real(target, rng)  # type: ignore[return-value]
+
+    monkeypatch.setattr(env.loop, "step", step)
+    filters, spec, previous = SafetyFilter(GO2), env.layout, np.tile(GO2.default_position, (3, 1))
+    rng, changed = np.random.default_rng(2), 0
+    for _ in range(6):
+        action = rng.uniform(-1.0, 1.0, (3, 12))
+        seen = env.loop.reported_position[:, 6:].copy(), env.loop.reported_velocity[:, 6:].copy()
+        env.step(action)
+        for i in range(3):
+            wanted = JointCommand(
+                position_target=np.array(GO2.default_position) + np.array(spec.action_scale) * action[i],
+                velocity_target=np.zeros(12), effort=np.zeros(12), stiffness=np.array(spec.stiffness),
+                damping=np.array(spec.damping), effort_limit=np.array(spec.effort_limit),
+                speed_limit=np.array(spec.speed_limit),
+            )  # fmt: skip
+            command, clipped = filters.clip(wanted, previous[i], seen[0][i], seen[1][i])
+            np.testing.assert_allclose(sent[-1][i], command.position_target, atol=1e-12)
+            previous[i] = command.position_target
+            changed += bool(clipped)
+    assert changed > 3
+
+
+def test_go2_sees_what_it_asked_for_and_not_what_was_sent() -> None:
+    """As when deployed, where the policy is not told what the filter made of its action."""
+    env = make("go2", 1, push_ticks=NEVER)
     env.reset(seed=0)
     observation = env.step(np.ones((1, 12)))[0]
-    last = [k for k, t in enumerate(env.layout.observation) if t.quantity == "action" and "calf" in t.joint]
-    np.testing.assert_allclose(observation[0, last], 0.5 / 0.8, rtol=1e-6)
+    last = [k for k, t in enumerate(env.layout.observation) if t.quantity == "action"]
+    np.testing.assert_allclose(observation[0, last], 1.0)
+    assert env.measures()["clipped"] == 1.0
+
+
+def test_go2_is_pushed() -> None:
+    """At rest by its own doing; with a push at every tick the base moves within one."""
+    speeds = []
+    for ticks in (NEVER, 1):
+        env = make("go2", 8, push_ticks=ticks, start_speed=0.0, start_noise_rad=0.0)
+        env.reset(seed=0)
+        env.step(np.zeros((8, 12)))
+        speeds.append(np.abs(env.loop.velocity[:, :2]).max())
+    assert speeds[0] < 0.15 < speeds[1]
+
+
+def test_what_is_calibrated_is_not_drawn_by_the_task() -> None:
+    """A distribution that holds the floor's friction rules; payload and encoders are still drawn."""
+    friction = Parameter(
+        name="grip", kind="geom_friction", elements=("floor",), unit="-", nominal=0.6, low=0.5, high=0.7
+    )
+    given = ParameterDistribution.uniform(ParameterSpace([friction]), (0.0, 0.0))
+    names = Go2Env(GO2, given, 2).loop.batch.space.names
+    assert names[:2] == ("grip", "base.body_mass") and len(names) == 14
 
 
 @pytest.mark.parametrize(("spec", "robot"), [(run_spec, "ant"), (walk_spec, "go2")])
 def test_specs_fit_their_robots_and_stay_inside_the_limits(spec: type[PolicySpec], robot: str) -> None:
     """What is trained here may be deployed there: no reachable target is outside the safety limits."""
-    description = robot_description(robot)
+    description = recorded_description(robot)
     layout: PolicySpec = spec(description)  # type: ignore[call-arg, arg-type]
     layout.check_fits(description)
     low, high = np.array(description.limits.target).T
@@ -197,9 +281,11 @@ def test_what_ended_early_is_judged_up_to_there() -> None:
 
 def test_a_fixed_base_is_refused() -> None:
     """The message names the robot and what it lacks."""
-    description = dataclasses.replace(robot_description("go2"), floating_base=None)
+    description = dataclasses.replace(GO2, floating_base=None)
     with pytest.raises(ConfigurationError, match="'go2' has a fixed base; locomotion needs a free one"):
-        Go2Env(description, udr("go2"), 1)
+        AntEnv(description, udr("go2"), 1)
+    with pytest.raises(ConfigurationError, match="'go2' has 0 feet in its description; walking needs 4"):
+        Go2Env(robot_description("go2"), udr("go2"), 1)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +295,8 @@ def test_a_fixed_base_is_refused() -> None:
         (RunTask, {"top_height_m": 0.0}, "top_height_m must be positive, got 0.0"),
         (WalkTask, {"ticks": 0}, "ticks must be at least 1, got 0"),
         (WalkTask, {"tracking_width": 0.0}, "tracking_width must be positive, got 0.0"),
-        (WalkTask, {"speed_m_s": (0.5, 0.1)}, "speed_m_s must be"),
+        (WalkTask, {"friction": (0.5, 0.1)}, r"friction must be \(low, high\)"),
+        (WalkTask, {"command_range": ((1.0, 0.0),)}, r"command_range\[0\] must be \(low, high\)"),
         (WalkTask, {"standing": 2.0}, r"standing must lie in \[0, 1\], got 2.0"),
     ],
 )
@@ -237,11 +324,11 @@ def tool() -> ModuleType:
 def test_a_short_training_makes_a_policy_that_acts(robot: str, tool: ModuleType, tmp_path: Path) -> None:
     """A few hundred steps give a small file, its record, and actions in [-1, 1]."""
     path = tmp_path / f"{robot}.onnx"
-    tool.train(robot, path, seed=1, steps=160, members=8, judged=4)
+    tool.train(robot, path, seed=1, steps=6_000, members=8, judged=4)
     policy = OnnxPolicy(path)
     observation = np.random.default_rng(0).standard_normal(len(policy.spec.observation)).astype(np.float32)
     assert np.abs(policy.act(observation)).max() <= 1.0
     record = json.loads(path.with_suffix(".json").read_text())
-    assert record["training"]["config"]["steps"] == 160
+    assert record["training"]["config"]["steps"] == 6_000
     assert record["evaluation"]["robots"] == record["at_rest"]["robots"] == 4
     assert path.stat().st_size < 200_000

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import deal_hw.cli.train as train_module
 from deal_hw.cli.train import Train, read_distribution, train, udr_distribution
+from deal_hw.drivers import driver_description
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.training import TrainingProgress, TrainingStatus
 
 STEPS = 1_200
 """Enough for a few updates."""
@@ -47,11 +52,61 @@ def test_udr_covers_a_factor_of_five_and_30_ms() -> None:
     assert distribution.latency_s == (0.0, 0.03)
 
 
-@pytest.mark.parametrize("config", [Train(), Train(udr=True, distribution=Path("x.json"))])
-def test_exactly_one_distribution_must_be_given(config: Train) -> None:
-    """Neither and both are refused, with what to give."""
-    with pytest.raises(ConfigurationError, match=r"--distribution .* --udr|--udr and --distribution"):
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (Train(), r"say under what to train: --distribution FILE .*, --udr or --nominal"),
+        (Train(udr=True, distribution=Path("x.json")), "--distribution and --udr exclude each other"),
+        (Train(udr=True, nominal=True), "--udr and --nominal exclude each other"),
+        (
+            Train(udr=True, resume=True, start=Path("x.safetensors")),
+            "--start and --resume exclude each other",
+        ),
+        (Train(udr=True, resume=True, out=Path("none")), r"nothing to resume: none/policies/policy\.safe"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(config: Train, words: str) -> None:
+    """The message says what to give or to leave out."""
+    with pytest.raises(ConfigurationError, match=words):
         train(config)
+
+
+def test_a_go2_is_trained_stopped_and_resumed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C after the first update leaves policy, record, checkpoint and log; --resume does the rest."""
+    seen: list[TrainingStatus] = []
+
+    def follow(bar: object) -> TrainingProgress:
+        def note(status: TrainingStatus) -> None:
+            seen.append(status)
+            if len(seen) == 1:
+                signal.raise_signal(signal.SIGINT)
+
+        return note
+
+    monkeypatch.setattr(train_module, "_follow", follow)
+    # Two updates of 24 ticks of 4 robots.
+    config = Train(robot="go2", nominal=True, out=tmp_path, steps=192, members=4, quiet=True)
+    handler = signal.getsignal(signal.SIGINT)
+    train(config)
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert "stopped before the end; --resume goes on" in capsys.readouterr().out
+    policies = tmp_path / "policies"
+    OnnxPolicy(policies / "policy.onnx").spec.check_fits(driver_description("go2"))
+    record = json.loads((policies / "policy.json").read_text(encoding="utf-8"))
+    assert record["training"]["algorithm"] == "ppo" and record["reached"]["steps"] == 96
+    assert {"velocity_error_m_s", "yaw_error_rad_s", "falls_a_minute"} <= record["reached"]["measures"].keys()
+    assert list((policies / "policy_tensorboard").iterdir())
+    policy = train(dataclasses.replace(config, resume=True))
+    assert [status.steps for status in seen] == [96, 192]
+    tuned = dataclasses.replace(
+        config, out=tmp_path / "tuned", start=policies / "policy.safetensors", steps=96
+    )
+    train(tuned)
+    observation = np.zeros(len(policy.spec.observation), dtype=np.float32)
+    again = OnnxPolicy(tmp_path / "tuned" / "policies" / "policy.onnx")
+    assert np.abs(again.act(observation) - policy.act(observation)).max() < 0.2
 
 
 def test_a_missing_distribution_names_the_verb_that_writes_it(tmp_path: Path) -> None:
@@ -82,6 +137,6 @@ def test_a_file_that_holds_no_distribution_is_refused(tmp_path: Path, text: str,
 def test_an_unknown_robot_is_refused_by_name() -> None:
     """The message lists the robots that can be trained."""
     with pytest.raises(
-        UnknownNameError, match=r"unknown robot with a training environment 'go3'; known: cartpole"
+        UnknownNameError, match=r"unknown robot with a training environment 'go3'; known: ant, cartpole, go2"
     ):
         train(Train(robot="go3", udr=True, quiet=True))
