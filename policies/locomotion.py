@@ -174,16 +174,18 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
     Returns:
         Plain JSON values: returns (undiscounted), the share that fell, the share of the time they were up;
         of those that did not fall, the mean forward speed [m/s] and how far each one's mean speed is from
-        the wanted one, on average.
+        the mean of the wanted one, on average; and what the task measures.
     """
     observation, _ = env.reset(seed=seed)
     count = env.num_envs
     going, total, lasted, way = np.ones(count, dtype=bool), np.zeros(count), np.zeros(count), np.zeros(count)
     fell: BoolArray = np.zeros(count, dtype=bool)
-    wanted = env.wanted_speed()
-    wanted = None if wanted is None else wanted.copy()
+    wish: FloatArray | None = None if env.wanted_speed() is None else np.zeros(count)
+    env.measures()
     for _ in range(env.ticks):
-        speed = env.forward_speed()
+        speed, wanted = env.forward_speed(), env.wanted_speed()
+        if wish is not None and wanted is not None:
+            wish += np.where(going, wanted, 0.0)
         observation, reward, terminated, truncated, _ = env.step(policy.act_batch(observation))
         total += np.where(going, reward, 0.0)
         way += np.where(going, speed, 0.0)
@@ -191,7 +193,7 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         fell |= going & terminated
         going &= ~(terminated | truncated)
     up, mean = ~fell, way / lasted
-    error = None if wanted is None else np.abs(mean - wanted)
+    error = None if wish is None else np.abs(mean - wish / lasted)
     return {
         "robots": count,
         "seed": seed,
@@ -203,4 +205,5 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         "time_up": float((lasted / env.ticks).mean()),
         "forward_speed_m_s": float(mean[up].mean()) if up.any() else None,
         "speed_error_m_s": float(error[up].mean()) if up.any() and error is not None else None,
+        "measures": env.measures(),
     }

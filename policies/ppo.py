@@ -44,7 +44,7 @@ class PpoConfig:
         checkpoint_updates: A checkpoint is written every so many updates, and at the end.
     """
 
-    steps: int = 8_000_000
+    steps: int = 12_000_000
     hidden: tuple[int, ...] = (128, 128)
     rollout: int = 24
     epochs: int = 5

@@ -3,15 +3,16 @@
     python tools/train_demo_policy.py ant
     python tools/train_demo_policy.py go2
 
-writes policies/assets/ROBOT_udr.onnx and, beside it, the record of its training and of what it can do with
-robots that it has not seen. Task, trainer and settings are those of `deal-hw train ROBOT --udr`. The ant's is
-an early checkpoint, made in minutes on one core: good enough to excite a robot for calibration (the paper's
-Table 5 studies such ones), not good locomotion.
+writes policies/assets/ant_udr.onnx or go2_walk.onnx and, beside it, the record of its training and of what it
+can do with robots that it has not seen. Task, trainer and settings are those of `deal-hw train ROBOT --udr`.
+The ant's is an early checkpoint, made in minutes on one core: good enough to excite a robot for calibration
+(the paper's Table 5 studies such ones), not good locomotion.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import json
 import platform
@@ -23,13 +24,14 @@ import numpy as np
 
 from deal_hw.cli.train import train_policy, udr_distribution
 from deal_hw.drivers import recorded_description
+from deal_hw.policies.checkpoint import read_checkpoint, write_checkpoint
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.tasks import training_task
 from deal_hw.training import TrainingFiles, TrainingStatus
 
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
-ROBOTS = ("ant", "go2")
+FILES = {"ant": "ant_udr", "go2": "go2_walk"}
 JUDGED = 256
 JUDGE_SEED = 1_000_003
 """Robots, commands and starts that the policy is judged by are the draws of this seed, none of training's."""
@@ -54,7 +56,18 @@ def train(
     record["machine"] = f"one thread of {platform.machine()}, shared, Python {platform.python_version()}"
     record["onnx_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     add_judgement(robot, policy, record, judged)
+    if files is not None and files.checkpoint is not None:
+        ship_checkpoint(files.checkpoint, policy)
     return policy
+
+
+def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:
+    """Write a checkpoint's networks beside a policy, to fine-tune from; not the optimiser's memory."""
+    found = read_checkpoint(source, policy.spec)
+    kept = {name: value for name, value in found.tensors.items() if not name.startswith("optimizer.")}
+    write_checkpoint(
+        policy.path.with_suffix(".safetensors"), dataclasses.replace(found, tensors=kept), policy.spec
+    )
 
 
 def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged: int) -> None:
@@ -100,20 +113,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("robot", choices=ROBOTS)
+    parser.add_argument("robot", choices=sorted(FILES))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="environment steps; by default those of the shipped policy")
     parser.add_argument("--members", type=int, help="by default those of the shipped policy")
     parser.add_argument("--judged", type=int, default=JUDGED, help="robots that the policy is judged by")
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--checkpoint", type=Path, help="a .safetensors file to keep while it trains")
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        help="a .safetensors file to keep while it trains; its networks are shipped beside the policy",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from --checkpoint")
     parser.add_argument("--judge", action="store_true", help="train nothing, judge the file that is there")
     args = parser.parse_args()
-    path = args.out or ASSETS / f"{args.robot}_udr.onnx"
+    path = args.out or ASSETS / f"{FILES[args.robot]}.onnx"
     if args.judge:
         record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
         add_judgement(args.robot, OnnxPolicy(path), record, args.judged)
+        if args.checkpoint is not None:
+            ship_checkpoint(args.checkpoint, OnnxPolicy(path))
         return
     files = TrainingFiles(checkpoint=args.checkpoint, resume=args.resume)
     train(

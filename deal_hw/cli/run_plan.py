@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Final, Literal, get_args
 
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
@@ -125,9 +125,14 @@ class RunPlan:
         return from_values(cls, values)
 
 
+SHIPPED: Final[Mapping[str, str]] = {"go2": "go2_walk"}
+"""Shipped policies that are not called ROBOT_udr: the Go2's of that name is what benches excite it with."""
+
+
 def shipped_policy(robot: str) -> Path | None:
     """Return the policy that is shipped for a robot; None where there is none."""
-    path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{robot}_udr.onnx"))
+    name = SHIPPED.get(robot, f"{robot}_udr")
+    path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{name}.onnx"))
     return path if path.is_file() else None
 
 

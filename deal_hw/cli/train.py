@@ -157,6 +157,7 @@ def train_policy(
         if progress is not None:
             progress(status)
 
+    spent = _spent(path.with_suffix(".json")) if files is not None and files.resume else {}
     policy = teacher.train(env, config, np.random.default_rng(seed), follow, files)
     record = {
         "format": "deal_hw.training/1",
@@ -170,10 +171,21 @@ def train_policy(
         "spec_digest": policy.spec.digest(),
         "reached": dataclasses.asdict(reached[0]) if reached else {},
         "started_from": str(files.start or "") if files is not None else "",
-        "seconds": time.monotonic() - started,
-        "cpu_seconds": time.process_time() - cpu,
+        "seconds": spent.get("seconds", 0.0) + time.monotonic() - started,
+        "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
+        "resumed": bool(spent),
     }
     return export_network(policy.network, policy.spec, path, record)
+
+
+def _spent(record: Path) -> dict[str, float]:
+    """Return what the training that is resumed had taken, by its record; nothing where there is none."""
+    if not record.exists():
+        return {}
+    values = read_json(
+        record, dict[str, Any], "a training record", "`deal-hw train` writes it", error=ConfigurationError
+    )
+    return {name: float(values[name]) for name in ("seconds", "cpu_seconds")}
 
 
 def _distribution(config: Train) -> ParameterDistribution:

@@ -61,7 +61,8 @@ def position_command(
 class PolicyBehaviour:
     """Runs a policy: target = default + scale x action, with the gains and limits of the policy's spec.
 
-    Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on.
+    Actions are clipped to [-1, 1]; NaN passes through, for the safety filter to trip on. A wanted velocity is
+    clipped to what the policy was trained for, where its spec notes that.
 
     Args:
         policy: The policy.
@@ -88,6 +89,7 @@ class PolicyBehaviour:
                 f"{description.name!r} reports; train one that does without"
             )
         self._source = source or FixedVelocity()
+        self._slowest, self._fastest = np.array(spec.command_range or ((-np.inf, np.inf),) * 3).T
         self._observes_base = spec.observes_base
         self._policy = policy
         self._observations = ObservationBuilder(spec)
@@ -108,7 +110,8 @@ class PolicyBehaviour:
 
     def command(self, state: RobotState, time_s: float) -> JointCommand:
         """Return the policy's command."""
-        self._observations.command = self._source.velocity(state, time_s)
+        wanted = self._source.velocity(state, time_s)
+        self._observations.command = np.clip(wanted, self._slowest, self._fastest)
         observation = self._observations.build(*self._coordinates(state))
         action = np.asarray(self._policy.act(observation), dtype=float)
         if action.shape != self._scale.shape:

@@ -73,6 +73,15 @@ def test_gravity_turning_and_command_by_hand() -> None:
     assert ear.heard[0].dtype == np.float32
 
 
+def test_a_command_beyond_the_training_is_clipped_to_it() -> None:
+    """Trained for -0.2 to 0.5 m/s ahead: asked for -1, it is told -0.2; what lies inside passes."""
+    ear = Ear(*SENSED)
+    ear.spec = dataclasses.replace(ear.spec, command_range=((-0.2, 0.5), (-0.3, 0.3), (-1.0, 1.0)))
+    behaviour = PolicyBehaviour(ear, DRIVER, FixedVelocity((-1.0, 0.1, 1.0)))
+    behaviour.command(state(wxyz(Rotation.identity()), np.zeros(3)), 0.0)
+    np.testing.assert_allclose(ear.heard[0][-3:], [-0.2, 0.1, 1.0], atol=1e-6)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.booleans())
 def test_any_orientation_gives_gravity_as_scipy_has_it(values: list[float], negated: bool) -> None:

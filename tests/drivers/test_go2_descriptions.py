@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from importlib import resources
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand, on_stand_recording
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -59,7 +58,8 @@ def test_the_recording_on_a_stand_keeps_its_own_step() -> None:
 
 def test_the_shipped_policy_fits_the_driven_robot() -> None:
     """Trained on the simulated description, it meets the same names, poses, gains and rate."""
-    path = Path(str(resources.files("deal_hw.policies") / "assets" / "go2_udr.onnx"))
+    path = shipped_policy("go2")
+    assert path is not None
     OnnxPolicy(path).spec.check_fits(DRIVER)
     assert (DRIVER.name, DRIVER.stiffness, DRIVER.damping) == (
         DESCRIPTION.name,

@@ -100,6 +100,8 @@ def test_a_go2_is_trained_stopped_and_resumed(
     assert list((policies / "policy_tensorboard").iterdir())
     policy = train(dataclasses.replace(config, resume=True))
     assert [status.steps for status in seen] == [96, 192]
+    whole = json.loads((policies / "policy.json").read_text(encoding="utf-8"))
+    assert whole["resumed"] and whole["cpu_seconds"] > record["cpu_seconds"]
     tuned = dataclasses.replace(
         config, out=tmp_path / "tuned", start=policies / "policy.safetensors", steps=96
     )

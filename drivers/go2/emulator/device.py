@@ -145,6 +145,12 @@ class Go2Device:
         return float(self.base_position[2])
 
     @property
+    def heading(self) -> float:
+        """Angle of the base's x axis about the vertical, from the world's x axis [rad]; never on the wire."""
+        w, x, y, z = self._sim.orientation()
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+    @property
     def tilt(self) -> float:
         """Angle between the base's z axis and the vertical [rad]; never on the wire."""
         _, x, y, _ = self._sim.orientation()
