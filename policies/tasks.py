@@ -10,7 +10,10 @@ from typing import Any, Final
 from deal_hw.errors import UnknownNameError
 from deal_hw.policies.trainers import make_trainer
 
-_SMALL_PPO: Final = {"hidden": (64, 64), "learning_rate": 3e-3, "gamma": 0.98, "reward_scale": 0.1}
+_BALANCE_PPO: Final = {
+    "hidden": (64, 64), "rollout": 32, "gamma": 0.98, "entropy": 0.0, "reward_scale": 0.1,
+    "steps": 1_500_000,
+}  # fmt: skip
 _LEGGED_SAC: Final = {
     "hidden": (128, 128), "gradient_steps": 8, "batch": 256, "learning_rate": 1e-3,
     "final_learning_rate": 3e-4, "gamma": 0.98, "tau": 0.02, "entropy": 0.1, "warmup": 5_000,
@@ -67,15 +70,18 @@ TASKS: Final = {
         environment="deal_hw.policies.ant_env:AntEnv",
         trainer="sac",
         members={"ppo": 200, "sac": 64},
-        settings={"ppo": {"steps": 3_000_000}, "sac": {**_LEGGED_SAC, "target_entropy": -8.0}},
+        settings={
+            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
+            "sac": {**_LEGGED_SAC, "target_entropy": -8.0},
+        },
         udr_ratio=5.0,
         udr_latency_s=(0.0, 0.02),
     ),
     "cartpole": TrainingTask(
         environment="deal_hw.policies.cartpole_env:CartPoleEnv",
         trainer="sac",
-        members={"ppo": 64, "sac": 32},
-        settings={"ppo": {**_SMALL_PPO, "steps": 500_000}},
+        members={"ppo": 128, "sac": 32},
+        settings={"ppo": _BALANCE_PPO},
         udr_ratio=5.0,
         udr_latency_s=(0.0, 0.03),
     ),

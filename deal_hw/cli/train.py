@@ -72,9 +72,10 @@ class Train(Checked):
 
 
 def train(config: Train) -> OnnxPolicy:
-    """Train a policy as the settings say and return it; Ctrl-C ends the training and keeps what there is.
+    """Train a policy as the settings say and return it.
 
     Raises:
+        KeyboardInterrupt: Ctrl-C, or a request to end: the training has ended, and what there is was written.
         ConfigurationError: Not exactly one distribution was asked for, it cannot be read, or there is nothing
             to go on from.
         UnknownNameError: There is no such robot or trainer.
@@ -101,11 +102,13 @@ def train(config: Train) -> OnnxPolicy:
             config.robot, distribution, path, trainer=config.trainer, seed=config.seed, steps=config.steps,
             members=config.members, progress=_follow(bar), files=files,
         )  # fmt: skip
-    if stopped:
-        print("stopped before the end; --resume goes on from the checkpoint")
     print(f"policy: {path}")
     print(f"record: {path.with_suffix('.json')}")
     print(f"checkpoint: {checkpoint}")
+    if stopped:
+        print("stopped before the end; --resume goes on from the checkpoint")
+        # A demo that trains must not go on to deploy what is half trained.
+        raise KeyboardInterrupt
     return policy
 
 

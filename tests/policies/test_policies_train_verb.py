@@ -89,7 +89,8 @@ def test_a_go2_is_trained_stopped_and_resumed(
     # Two updates of 24 ticks of 4 robots.
     config = Train(robot="go2", nominal=True, out=tmp_path, steps=192, members=4, quiet=True)
     handler = signal.getsignal(signal.SIGINT)
-    train(config)
+    with pytest.raises(KeyboardInterrupt):
+        train(config)
     assert signal.getsignal(signal.SIGINT) is handler
     assert "stopped before the end; --resume goes on" in capsys.readouterr().out
     policies = tmp_path / "policies"
