@@ -13,6 +13,7 @@ import dataclasses
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -115,8 +116,12 @@ class CalibrationRun:
         """Report what could be the answer, and the stage that found it."""
         theta = found.theta if isinstance(found, Refined) else found.estimate
         if self.progress is not None:
-            values = {"chi2": found.chi2}
-            self.progress(Progress(stage, 1, 1, estimate=theta, latency_s=found.latency_s, values=values))
+            self.progress(
+                Progress(
+                    stage, 1, 1, f"chi2 {found.chi2:.3g}", estimate=theta, latency_s=found.latency_s,
+                    values={"chi2": found.chi2},
+                )
+            )  # fmt: skip
 
 
 class Fits(abc.ABC):
@@ -171,7 +176,6 @@ class Calibration(CalibrationMethod[Problem]):
         began, steps = time.perf_counter(), problem.steps
         check_excitation(problem)
         attempts = Restarts(self.search, rng, checkpoint)
-        local = local_fit(problem, progress) if self.settings.local_first else None
         run = CalibrationRun(
             problem=problem,
             budget=budget,
@@ -181,9 +185,8 @@ class Calibration(CalibrationMethod[Problem]):
             settings=self.settings,
             progress=progress,
         )
-        if local is not None:
-            run.offer("local fit", local)
-        elif self.settings.local_first:
+        local = local_fit(problem, partial(run.offer, "local fit")) if self.settings.local_first else None
+        if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
         # What another minimum leaves can be as small as noise, but it has a pattern.
         if local is not None and conclusive(problem, local, MISMATCH.white_samples):
@@ -241,7 +244,6 @@ class Refinement(Fits):
             run.offer("search", searched)
             left -= len(searched.trace)
             refined = from_search(run, searched)
-            run.offer("refinement", refined)
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or self._better(refined, best[1]):
                 best = (searched, refined)
@@ -394,10 +396,7 @@ def without_search(problem: Problem, budget: Budget, local: Refined) -> Calibrat
 def from_search(run: CalibrationRun, searched: CalibrationResult) -> Refined:
     """Refine a search's estimate."""
     given = run.problem.fixed_latency_s
-
-    def notify(done: int, chi2: float) -> None:
-        if run.progress is not None:
-            run.progress(Progress("refinement", done, done, f"chi2 {chi2:.3g}", values={"chi2": chi2}))
-
-    latency_s = searched.latency_s if given is None else given
-    return refine(run.problem, searched.estimate, latency_s, fixed_latency=given is not None, notify=notify)
+    return refine(
+        run.problem, searched.estimate, searched.latency_s if given is None else given,
+        fixed_latency=given is not None, notify=partial(run.offer, "refinement"),
+    )  # fmt: skip

@@ -16,7 +16,6 @@ from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, huber_weights, settled, solve
-from deal_hw.calibration import Progress, ProgressCallback
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -105,7 +104,7 @@ def refine(
     stages_s: Sequence[float] | None = None,
     iterations: int = 12,
     fixed_latency: bool = False,
-    notify: Callable[[int, float], None] | None = None,
+    notify: Callable[[Refined], None] | None = None,
     states: States | None = None,
     shake: bool = True,
 ) -> Refined:
@@ -118,7 +117,7 @@ def refine(
         stages_s: Window lengths, in order [s]; the usual ones by default.
         iterations: Most iterations of the solver at a time.
         fixed_latency: Keep the latency.
-        notify: Called with iterations done and chi2.
+        notify: Called with the fit after each window length that is kept.
         states: Where the first stage's windows start; the smoothed states by default.
         shake: Search other start states where contacts leave the solver stuck; where states are exact, let
             windows that no small step explains weigh less.
@@ -163,8 +162,8 @@ def refine(
         result, theta, latency_s = found, found.theta, found.latency_s
         if not shooting.given:
             states = shooting.states(point)
-        if notify is not None:
-            notify(done, found.chi2)
+        if notify is not None and np.isfinite(found.chi2):
+            notify(found)
     if result is None:
         raise InsufficientDataError("no window length was given")
     return result
@@ -330,20 +329,20 @@ def _with_contacts(
     return point, normal, used
 
 
-def local_fit(problem: Problem, progress: ProgressCallback | None) -> Refined | None:
+def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None) -> Refined | None:
     """Refine the model's own values; return None where they are too far to be refined.
 
     Costs a small part of a search. Where its residual is explained by the sensors' noise nothing is left to
     search for. A part of the recordings says where the fit goes; all of them are fitted only where that part
     can be explained.
+
+    Args:
+        problem: The problem.
+        notify: Called with the fit after each window length; on a damped robot the first is often nearly the
+            end, at a third of the time.
     """
     fixed = problem.fixed_latency_s is not None
     latency_s = problem.first_latency_s
-
-    def notify(done: int, chi2: float) -> None:
-        if progress is not None:
-            words = f"from the model's own values: chi2 {chi2:.3g}"
-            progress(Progress("local fit", done, done, words, values={"chi2": chi2}))
 
     def fit(part: Problem, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None) -> Refined:
         return refine(
@@ -357,10 +356,6 @@ def local_fit(problem: Problem, progress: ProgressCallback | None) -> Refined | 
     stages_s = SETTINGS.contact_stages_s if problem.robot.base is not None else SETTINGS.stages_s
     short, *longer = stages_s
     found = fit(part, nominal, latency_s, (short,))
-    if progress is not None and np.isfinite(found.chi2):
-        # On a damped robot this is often nearly the end, at a third of the time.
-        values = {"chi2": found.chi2}
-        progress(Progress("local fit", 1, 2, estimate=found.theta, latency_s=found.latency_s, values=values))
     if not found.chi2 < SETTINGS.local_hopeless:
         return found if np.isfinite(found.chi2) else None
     try:
