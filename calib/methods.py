@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 from typing import TYPE_CHECKING, cast
 
@@ -70,12 +69,7 @@ def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem
     if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
         return search
     from deal_hw.calib.pipeline import Calibration
-    from deal_hw.calib.search.eki import Eki
     from deal_hw.calib.validation.verdict import Validation
 
-    if isinstance(search, Eki):
-        search = dataclasses.replace(
-            search, settings=dataclasses.replace(search.settings, before_refinement=True)
-        )
     # Who names a search wants it run, also where the model's own values could be refined without one.
     return Calibration(search, name, Validation(local_first=name == "default"))

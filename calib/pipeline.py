@@ -227,6 +227,9 @@ class Calibration(CalibrationMethod[Problem]):
 class Refinement(Fits):
     """A search and its refinement; searched again from other draws while the residual is unexplained.
 
+    The first search is brief: a few generations find the basin, and the refinement its bottom with fewer
+    simulations. The next ones go to their end, but for a free base: long windows of contacts say little.
+
     Attributes:
         restarts: When.
     """
@@ -235,11 +238,11 @@ class Refinement(Fits):
 
     def best(self, run: CalibrationRun) -> Outcome:
         """Search, refine, let cross-validation say whether the refinement helps. See :meth:`Fits.best`."""
-        settings, left = self.restarts, run.budget.generations
+        settings, left, floating = self.restarts, run.budget.generations, run.problem.robot.base is not None
         best: tuple[CalibrationResult, Refined] | None = None
         attempt = 0
         for attempt in range(1 + settings.restarts):
-            budget = dataclasses.replace(run.budget, generations=left)
+            budget = dataclasses.replace(run.budget, generations=left, brief=attempt == 0 or floating)
             searched = run.attempts.run(run.problem, attempt, budget, run.progress)
             run.offer("search", searched)
             left -= len(searched.trace)
@@ -247,6 +250,9 @@ class Refinement(Fits):
             previous = best[1].chi2 if best is not None else np.inf
             if best is None or self._better(refined, best[1]):
                 best = (searched, refined)
+            elif attempt == 1:
+                # Cross-validation compares the refinement with a search that went to its end.
+                best = (searched, best[1])
             # Two searches that end at the same unexplained residual say that the model is wrong, not the
             # search.
             same = abs(refined.chi2 - previous) < settings.same * previous

@@ -68,12 +68,14 @@ class Budget:
     Attributes:
         population: Members N.
         generations: Search steps T; restarts count.
-        refinement: Whether the search is followed by multiple shooting.
+        refine: Whether the search is followed by multiple shooting.
+        brief: Whether a search that can tell ends as soon as that may begin, instead of at its best.
     """
 
     population: int = 100
     generations: int = 50
     refine: bool = True
+    brief: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,7 @@ class DealSettings:
         noisy_ticks: The same where they do; a long window of a far simulator says nothing.
         widen: Least spread of a coordinate at the start of each further stage, in logits.
         least_spread: Spread in logits below which members cannot be told apart and the search ends.
+        near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
         keep: Share of the statistics' residual that one step leaves (noise-free recordings).
         step_clip: Largest step of a coordinate, in logits.
         alarm_chi2: A noisy recording's residual above this is not explained, and the result says so.
@@ -70,6 +71,7 @@ class DealSettings:
     noisy_ticks: tuple[int, ...] = (5, 20)
     widen: float = 0.5
     least_spread: float = 1e-4
+    near_spread: float = 0.8
     keep: float = 0.25
     step_clip: float = 2.0
     alarm_chi2: float = 3.0
@@ -90,6 +92,10 @@ class _Deal(KalmanStepper):
         settings = self.settings
         self._noisy = is_noisy(self.problem)
         self._lengths = settings.noisy_ticks if self._noisy else settings.clean_ticks
+        self._least_spread = settings.least_spread
+        if log.budget.brief:
+            self._lengths = self._lengths[:1]
+            self._least_spread = settings.near_spread
         self._most = min(settings.generations, log.budget.generations)
         self._view: _View
         self._enter_stage(0)
@@ -147,7 +153,7 @@ class _Deal(KalmanStepper):
     def _stage_over(self) -> bool:
         # Earlier stages bring the population near; a third of the budget is kept for the last.
         end = self._most if self._last else 2 * self._most // 3
-        told_apart = self._spread > self.settings.least_spread
+        told_apart = self._spread > self._least_spread
         return len(self.log.trace) >= end or self.kalman.finished or not told_apart
 
     def _skip_empty_stages(self) -> None:

@@ -188,10 +188,7 @@ class EkiSettings:
         widen: Least spread of a coordinate at the start of each further stage, in logits.
         restart_chi2: A residual above this is not explained: the search starts again from the whole range.
         stage_generations: Most generations of one stage.
-        before_refinement: Whether a refinement follows. With a free base, and where states are known without
-            error, the short windows of the first stage are enough: it starts from there, and long ones of
-            contacts say little to a population.
-        least_spread: Spread in logits at which that stage ends on exact states.
+        near_spread: Spread at which a brief search ends, in logits: the refinement's basin is that wide.
     """
 
     noisy_ticks: tuple[int, ...] = (5, 20, 20)
@@ -200,8 +197,7 @@ class EkiSettings:
     widen: float = 0.5
     restart_chi2: float = 3.0
     stage_generations: int = 20
-    before_refinement: bool = False
-    least_spread: float = 0.01
+    near_spread: float = 0.8
 
 
 class _Eki(KalmanStepper):
@@ -215,7 +211,7 @@ class _Eki(KalmanStepper):
         super().__init__(log, rng, search)
         problem, settings = self.problem, self.settings
         self._lengths = settings.noisy_ticks if is_noisy(problem) else settings.clean_ticks
-        self._brief = settings.before_refinement and (problem.robot.base is not None or problem.noise_free)
+        self._brief = log.budget.brief
         if self._brief:
             self._lengths = self._lengths[:1]
         self._near = False
@@ -237,7 +233,7 @@ class _Eki(KalmanStepper):
         residual = whitened_residual(self.problem, members, centre, self._windows, self._offsets)
         step = self.kalman.tell(residual)
         self._generation += 1
-        self._near = self._brief and self.problem.noise_free and step.spread < self.settings.least_spread
+        self._near = self._brief and step.spread < self.settings.near_spread
         ticks = self._lengths[self._stage]
         self.log.note(
             f"windows of {ticks} ticks: misfit {step.misfit:.3g}, spread {step.spread:.3g}",

@@ -20,7 +20,7 @@ class FixedSearch(CalibrationMethod[Any]):
     """Ends where it is told, or near it, with the whole range as its interval.
 
     Attributes:
-        runs: How often it was run.
+        budgets: What each run was given.
 
     Args:
         theta: Where it ends, (K,).
@@ -32,7 +32,7 @@ class FixedSearch(CalibrationMethod[Any]):
 
     def __init__(self, theta: FloatArray, latency_s: float, spread: float = 0.0) -> None:
         self._theta, self._latency_s, self._spread = theta, latency_s, spread
-        self.runs = 0
+        self.budgets: list[Budget] = []
 
     def run(
         self,
@@ -43,7 +43,7 @@ class FixedSearch(CalibrationMethod[Any]):
         checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
         """Return that place."""
-        self.runs += 1
+        self.budgets.append(budget)
         return CalibrationResult(
             method=self.name,
             space=problem.space,

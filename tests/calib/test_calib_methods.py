@@ -11,6 +11,7 @@ import pytest
 from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.methods import METHODS, NO_DATA_METHODS, check_method, make_method
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.search.deal import Deal
@@ -212,6 +213,20 @@ def test_deal_finds_nine_parameters_of_a_noisy_robot() -> None:
     result = Deal().run(problem, Budget(population=60, generations=20), np.random.default_rng(0))
     assert np.mean(np.abs(np.log(result.estimate / d.theta))) < 0.2
     assert abs(result.latency_s - d.truth.latency_s) < 10e-3
+
+
+@pytest.mark.parametrize(("search", "population"), [(Eki(), 60), (Deal(), 100)])
+def test_a_brief_search_ends_in_the_refinements_basin(search: Eki | Deal, population: int) -> None:
+    """Tuning seed 0, profile sensor: at most half the generations, refined to where the truth refines to."""
+    d = recorded("sensor", 0)
+    problem = Problem(d.robot, d.space, [d.fit], threads=1)
+    budget = Budget(population=population, generations=30, brief=True)
+    found = search.run(problem, budget, np.random.default_rng(0))
+    assert found.trace[-1]["spread"] < search.settings.near_spread
+    assert len(found.trace) <= 15
+    refined = refine(problem, found.estimate, found.latency_s)
+    best = refine(problem, d.theta, d.truth.latency_s)
+    assert refined.theta == pytest.approx(best.theta, rel=0.02)
 
 
 def test_eki_says_when_the_residual_is_not_explained() -> None:

@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from deal_hw.bench.tasks import Case
+from deal_hw.calib import pipeline
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
@@ -72,6 +73,25 @@ def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: Ca
     assert Refinement().best(run).theta == pytest.approx(best.theta, rel=0.01)
 
 
+def test_only_the_first_search_is_brief(noisy: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a brief search leaves unexplained is searched for to the end, and that search is compared."""
+    problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
+    refined = dataclasses.replace(refine(problem, noisy.theta, noisy.truth.latency_s), chi2=9.0)
+    monkeypatch.setattr(pipeline, "from_search", lambda run, searched: refined)
+    search = FixedSearch(noisy.theta, noisy.truth.latency_s, 0.05)
+    run = CalibrationRun(
+        problem=problem,
+        budget=Budget(population=8, generations=60),
+        rng=np.random.default_rng(0),
+        search=search,
+        attempts=Restarts(search, np.random.default_rng(0), None),
+        settings=Validation(cross_validation=False),
+    )
+    outcome = Refinement().best(run)
+    assert [budget.brief for budget in search.budgets] == [True, False]
+    assert outcome.facts["restarts"] == 1
+
+
 def test_refinement_recovers_an_ideal_robot_exactly(ideal: Case) -> None:
     """Truth recovery: from 10 % off, all parameters within 0.01 % and the latency within a microsecond."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1)
@@ -117,7 +137,7 @@ def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal:
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
     search = FixedSearch(ideal.theta, 0.021, 0.05)
     result = Calibration(search).run(problem, Budget(), np.random.default_rng(0))
-    assert search.runs >= 2
+    assert len(search.budgets) >= 2
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
 
@@ -235,7 +255,7 @@ def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) 
     search = FixedSearch(ideal.theta, 1e-3, 0.05)
     with pytest.raises(InsufficientDataError, match=r"hardly moves.*--profile rich"):
         Calibration(search).run(problem, Budget(), np.random.default_rng(0))
-    assert search.runs == 0
+    assert search.budgets == []
     short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 60)
     with pytest.raises(InsufficientDataError, match=r"0\.30 s of usable samples"):
         check_excitation(Problem(ideal.robot, ideal.space, [short], threads=1))
