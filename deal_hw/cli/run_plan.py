@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -24,7 +25,7 @@ from deal_hw.control.excitation_plan import (
     read_plan,
 )
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
-from deal_hw.control.velocity import VelocitySource, make_source
+from deal_hw.control.velocity import BoundedSource, VelocitySource, limited_axes, make_source
 from deal_hw.control.vigor import with_vigor
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
@@ -111,7 +112,7 @@ class RunPlan:
         """Length of the run with standing up and lying down [s]."""
         return self.seconds + (self.posture.added_s if self.stand else 0.0)
 
-    def velocity_source(self) -> VelocitySource:
+    def velocity_source(self) -> BoundedSource:
         """Return where the wanted velocity comes from.
 
         Raises:
@@ -157,6 +158,14 @@ def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
             policy = stack.enter_context(TrialPolicy(Path(plan.policy)))
             try_policy(policy, description)
             digests.append(policy.digest)
+            walks = plan.profile not in ("excite", "rich")
+            limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
+            if limited:
+                print(
+                    f"--velocity {plan.velocity} may ask for more [m/s, m/s, rad/s] than "
+                    f"{Path(plan.policy).stem} was trained for: {'; '.join(limited)}",
+                    file=sys.stderr,
+                )
             return policy
 
         make_behaviour(plan, description, load=load)

@@ -36,6 +36,14 @@ class VelocitySource(Protocol):
         ...
 
 
+class BoundedSource(VelocitySource, Protocol):
+    """A source that knows how far it goes."""
+
+    def reach(self) -> FloatArray:
+        """Return the lowest and the highest velocity that it may ask for, (2, 3)."""
+        ...
+
+
 class FixedVelocity:
     """One velocity all the time.
 
@@ -49,6 +57,10 @@ class FixedVelocity:
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
         """Return the velocity."""
         return self._velocity
+
+    def reach(self) -> FloatArray:
+        """Return it twice, (2, 3)."""
+        return np.stack([self._velocity, self._velocity])
 
 
 class ScriptVelocity:
@@ -68,6 +80,10 @@ class ScriptVelocity:
         row = int(np.searchsorted(self._time_s, time_s, side="right")) - 1
         return self._velocity[row] if row >= 0 else np.zeros(3)
 
+    def reach(self) -> FloatArray:
+        """Return the ends of what its lines ask for, (2, 3)."""
+        return np.stack([self._velocity.min(axis=0), self._velocity.max(axis=0)])
+
 
 class RemoteVelocity:
     """The sticks of the robot's own remote: left for ahead and sideways, right for turning.
@@ -83,6 +99,10 @@ class RemoteVelocity:
         left_x, left_y, right_x, _ = np.clip(body.sticks, -1.0, 1.0)
         wish = np.array([left_y, -left_x, -right_x])
         return np.asarray(np.where(np.abs(wish) < _DEAD_ZONE, 0.0, wish) * LARGEST)
+
+    def reach(self) -> FloatArray:
+        """Return what the sticks ask for at their ends, (2, 3)."""
+        return np.outer([-1.0, 1.0], LARGEST)
 
 
 @dataclass(slots=True)
@@ -107,8 +127,28 @@ class KeyboardVelocity:
         self._now_s = time_s
         return np.array(self._wish if time_s - self._since_s <= KEY_LIFE_S else (0.0, 0.0, 0.0))
 
+    def reach(self) -> FloatArray:
+        """Return the ends of what the keys ask for, (2, 3)."""
+        keys = np.array(list(KEYS.values()))
+        return np.stack([keys.min(axis=0), keys.max(axis=0)])
 
-def make_source(text: str) -> VelocitySource:
+
+def limited_axes(source: BoundedSource, command_range: Sequence[tuple[float, float]]) -> list[str]:
+    """Return in words which axes of a source a policy's range limits.
+
+    Args:
+        source: What asks for velocities.
+        command_range: Lowest and highest velocity that the policy was trained for, each axis; () for all.
+    """
+    asked = source.reach().T
+    return [
+        f"{axis} {low:g}{f' to {high:g}' if high > low else ''}, limited to {least:g} to {most:g}"
+        for axis, (low, high), (least, most) in zip(AXES, asked, command_range or (), strict=False)
+        if low < least or high > most
+    ]
+
+
+def make_source(text: str) -> BoundedSource:
     """Return the source that a command line names.
 
     Args:

@@ -17,6 +17,7 @@ from deal_hw.control.velocity import (
     FixedVelocity,
     KeyboardVelocity,
     RemoteVelocity,
+    limited_axes,
     make_source,
 )
 from deal_hw.errors import ConfigurationError
@@ -105,6 +106,25 @@ def test_the_sticks_give_the_velocity() -> None:
 def test_without_a_remote_the_robot_stands(sticks: tuple[float, float, float, float] | None) -> None:
     """No body and no number both ask for nothing."""
     np.testing.assert_array_equal(RemoteVelocity().velocity(state(sticks), 0.0), np.zeros(3))
+
+
+def test_what_a_policy_was_not_trained_for_is_told(tmp_path: Path) -> None:
+    """Each axis that the source may ask more of than the policy's range, with both ranges."""
+    trained = ((-0.6, 1.0), (-0.5, 0.5), (-1.0, 1.0))
+    script = tmp_path / "walk.csv"
+    script.write_text("time_s,x,y,yaw\n0,0.5,0,0\n1,-0.8,0.1,0\n")
+    told = ["x -0.8 to 0.5, limited to -0.6 to 1"]
+    assert limited_axes(make_source(str(script)), trained) == told
+    assert limited_axes(make_source("remote"), trained) == ["x -1 to 1, limited to -0.6 to 1"]
+    assert limited_axes(make_source("1,0.5,-1"), trained) == []
+    assert limited_axes(make_source("-1,0,0"), trained) == ["x -1, limited to -0.6 to 1"]
+    assert limited_axes(make_source("keyboard"), trained) == []
+    assert limited_axes(make_source("keyboard"), ((0.0, 1.0), (-0.5, 0.5), (0.0, 0.0))) == [
+        "x -0.5 to 0.5, limited to 0 to 1",
+        "yaw -0.6 to 0.6, limited to 0 to 0",
+    ]
+    # A policy that notes no range is not limited.
+    assert limited_axes(make_source("1,0,0"), ()) == []
 
 
 def test_a_key_counts_while_it_is_held() -> None:
