@@ -43,7 +43,7 @@ demo: $(STAMP) ## the whole loop on an emulated cart-pole
 test: $(STAMP) ## all tests that need no robot
 	@tools/build_dds_peer.sh || true
 	@tools/install_avr_tools.sh || true
-	$(BIN)/python -m pytest -n 2 --dist loadgroup $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
 dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 	@tools/build_dds_peer.sh

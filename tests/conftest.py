@@ -1,6 +1,7 @@
 """What holds for all tests."""
 
-from pathlib import Path
+from pathlib import PurePosixPath
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -13,13 +14,14 @@ REAL_TIME = {"cli", "contracts", "control", "drivers", "tools"}
 """Folders of tests with processes that run in real time; two of these at once would disturb each other."""
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Under pytest-xdist one worker gets all tests in real time, and others get whole files."""
-    if not config.pluginmanager.hasplugin("xdist"):
-        return
-    tests = Path(__file__).parent
-    for item in items:
-        file = item.path.relative_to(tests)
-        group = "real time" if file.parts[0] in REAL_TIME else str(file)
-        item.add_marker(pytest.mark.xdist_group(group))
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduling(LoadScopeScheduling):  # type: ignore[misc, unused-ignore]
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return "real time" if PurePosixPath(file).parts[1] in REAL_TIME else file
+
+    return Scheduling(config, log)
