@@ -22,11 +22,13 @@ class Message:
         channel: CAN id, topic or key; "" for a byte stream.
         payload: The bytes.
         stamp_ns: Host clock at reception or sending [ns].
+        attachment: Further bytes beside the payload, where the path has room for them (Zenoh); b"" for none.
     """
 
     channel: str
     payload: bytes
     stamp_ns: int
+    attachment: bytes = b""
 
 
 class Transport(abc.ABC):

@@ -8,11 +8,12 @@ import json
 import queue
 import re
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.transports import zenoh_session
+from deal_hw.drivers.transports.zenoh_stamps import Echoes
 from deal_hw.errors import (
     ConfigurationError,
     PortBusyError,
@@ -46,19 +47,30 @@ class ZenohTransport(TopicTransport):
     The side that listens has no peer in particular, so silence is all it notices. The side that went to an
     end point knows when its link is gone: then ``send`` and ``receive`` raise
     :class:`~deal_hw.errors.TransportLostError`, ``receive`` only after it has handed out what was at hand.
-    Zenoh goes on trying to reach the end point, and once it is back both work again.
+    Zenoh goes on trying to reach the end point, and once it is back both work again. That side also numbers
+    its messages and returns the newest stamp of the other with each (:mod:`zenoh_stamps`), unless a message
+    brings an attachment of its own.
 
     Args:
         port: End points, comma separated: "tcp/127.0.0.1:7447". A peer goes to all of them, a client to the
             first that answers.
         clock: Gives the stamps.
         options: Whether to listen there, the mode, and who may connect.
+        settings: Further settings of the session, by their paths in Zenoh's configuration.
     """
 
-    def __init__(self, port: str, clock: Clock | None = None, options: WireOptions | None = None) -> None:
+    def __init__(
+        self,
+        port: str,
+        clock: Clock | None = None,
+        options: WireOptions | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
         self.port = port
         self._clock = clock or MonotonicClock()
         self._options = options or WireOptions()
+        self._settings = settings or {}
+        self._echoes: Echoes | None = None
         self._publish: set[str] = set()
         self._subscribe: set[str] = set()
         self._session: zenoh.Session | None = None
@@ -97,6 +109,7 @@ class ZenohTransport(TopicTransport):
         if self._session is not None:
             return
         self._arrived, self._lost = queue.SimpleQueue(), False
+        self._echoes = None if self._options.listen else Echoes()
         self._session = self._open_session()
         # A process that dies of an exception must not stay behind, alive for its peers.
         atexit.register(self.close)
@@ -151,8 +164,9 @@ class ZenohTransport(TopicTransport):
                 )
             if self._lost:
                 raise self._gone()
+            attachment = message.attachment or (self._echoes.next() if self._echoes else None)
             try:
-                publisher.put(message.payload)
+                publisher.put(message.payload, attachment=attachment)
             except Exception as error:  # Zenoh raises an error of its own, which is not imported here.
                 raise TransportLostError(f"{self.port}: sending failed: {error}") from error
 
@@ -184,7 +198,8 @@ class ZenohTransport(TopicTransport):
 
         try:
             config = zenoh.Config()
-            for key, value in zenoh_session.settings(endpoints, self._options).items():
+            chosen = zenoh_session.settings(endpoints, self._options) | dict(self._settings)
+            for key, value in chosen.items():
                 config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
             raise ConfigurationError(f"{self.port}: Zenoh refuses a setting: {error}") from error
@@ -238,7 +253,10 @@ class ZenohTransport(TopicTransport):
         arrived: queue.SimpleQueue[Message | None],
     ) -> None:
         for sample in _until_closed(subscriber.recv):
-            arrived.put(Message(topic, sample.payload.to_bytes(), self._clock.now_ns()))
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            if attachment and self._echoes is not None:
+                self._echoes.hear(attachment)
+            arrived.put(Message(topic, sample.payload.to_bytes(), self._clock.now_ns(), attachment))
             if arrived.qsize() > _AT_HAND:
                 with contextlib.suppress(queue.Empty):
                     arrived.get_nowait()
