@@ -120,6 +120,18 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             example="emulate cartpole --profile realistic --seed 0",
             extra="sim",
         ),
+        "bridge": _verb(
+            "bridge",
+            help="run on the Go2's computer: DDS to Zenoh, one certified controller, damping without one",
+            example="bridge go2 --port eth0",
+            extra="dds",
+        ),
+        "keys": _verb(
+            "keys",
+            help="make certificates for the bridge, its controllers and observers; show how long they hold",
+            example="keys make --out keys --robot 192.168.1.20",
+            extra="keys",
+        ),
         "data": _verb(
             "data",
             help="tell about a dataset, verify it, repair it, import and export recordings",

@@ -33,7 +33,7 @@ FINE_AT_ZERO = {
 FINE_BELOW_ZERO = {"vigor", "known", "range", "push"}
 REQUIRED: dict[str, Any] = {
     "robot": "cartpole", "port": "p", "out": Path("o"), "paths": (Path("p"),), "path": Path("p"),
-    "episode": Path("e"), "bench": "loop", "dataset": Path("d"),
+    "episode": Path("e"), "bench": "loop", "dataset": Path("d"), "folder": Path("f"), "name": "n",
 }  # fmt: skip
 
 

@@ -82,7 +82,7 @@ def test_unknown_verb_lists_the_verbs_and_the_nearest(capsys: pytest.CaptureFixt
     assert out == ""
     assert err == (
         "deal-hw: error: unknown verb 'calibrat'; known: collect, calibrate, train, deploy, inspect, demo, "
-        "excite, emulate, data, replay, doctor, bench; did you mean 'calibrate'?\n"
+        "excite, emulate, bridge, keys, data, replay, doctor, bench; did you mean 'calibrate'?\n"
     )
 
 

@@ -25,10 +25,12 @@ BASE_FOLDERS = (
 )  # fmt: skip
 BASE_MODULES = (
     "deal_hw.cli.main",
+    "deal_hw.cli.bridge",
     "deal_hw.cli.collect",
     "deal_hw.cli.data",
     "deal_hw.cli.deploy",
     "deal_hw.cli.doctor",
+    "deal_hw.cli.keys",
     "deal_hw.cli.replay",
     "deal_hw.drivers",
     "deal_hw.drivers.cartpole.description",
@@ -44,7 +46,7 @@ BASE_MODULES = (
 )
 EXTRAS = (
     "torch", "mujoco", "scipy", "rerun", "gymnasium", "stable_baselines3", "onnx", "onnxscript", "matplotlib",
-    "psutil", "pytest", "hypothesis", "cyclonedds", "zenoh",
+    "psutil", "pytest", "hypothesis", "cryptography", "cyclonedds", "zenoh",
 )  # fmt: skip
 """Zenoh comes with the base install, but only a robot that is reached over it needs it loaded."""
 

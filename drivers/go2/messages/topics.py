@@ -21,6 +21,9 @@ WIRELESS: Final = "rt/wirelesscontroller"
 CLAIM: Final = "rt/deal_hw/claim"
 """Who commands the robot, said by deal-hw to deal-hw; the robot does not know it. The type is a request's."""
 
+BRIDGE: Final = "rt/deal_hw/bridge"
+"""Who has the robot, said by deal-hw's bridge to its clients. The type is a request's."""
+
 SERVICES: Final = ("motion_switcher", "sport", "robot_state")
 """Services that answer requests: who moves the robot, the vendor's gaits, what runs on the robot."""
 
@@ -57,6 +60,7 @@ TYPES: Final[Mapping[str, str]] = {
     SPORT_STATE_SLOW: "unitree_go::msg::dds_::SportModeState_",
     WIRELESS: "unitree_go::msg::dds_::WirelessController_",
     CLAIM: "unitree_api::msg::dds_::Request_",
+    BRIDGE: "unitree_api::msg::dds_::Request_",
     **{request(service): "unitree_api::msg::dds_::Request_" for service in SERVICES},
     **{response(service): "unitree_api::msg::dds_::Response_" for service in SERVICES},
 }

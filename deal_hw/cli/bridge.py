@@ -1,0 +1,158 @@
+"""``deal-hw bridge``: what runs on the Go2's own computer, between its DDS and a network."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from deal_hw.cli.emulate_common import run_until, signalled
+from deal_hw.cli.emulate_go2 import free_port
+from deal_hw.cli.options import Checked, Range, refuse
+from deal_hw.clock import MonotonicClock
+from deal_hw.control.claim import LocalClaim
+from deal_hw.control.realtime import become_realtime
+from deal_hw.drivers import claim_name
+from deal_hw.drivers.go2.bridge.bridge import COMMANDS, READABLE, Go2Bridge
+from deal_hw.drivers.go2.bridge.config import BridgeConfig
+from deal_hw.drivers.transports.dds_transport import DdsTransport
+from deal_hw.drivers.transports.zenoh_access import access_settings
+from deal_hw.drivers.transports.zenoh_session import parse_endpoints
+from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
+from deal_hw.errors import UnknownNameError
+from deal_hw.transport import WireOptions
+
+ROBOTS = ("go2",)
+LOOPBACK_PORT = 7447
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bridge(Checked):
+    """Carry a Go2's messages between its DDS and Zenoh, admit one controller, and damp the robot without one.
+
+    Runs on the robot's own computer until Ctrl-C or SIGTERM, which damp the robot first.
+    """
+
+    robot: tyro.conf.Positional[str]
+    """The robot: go2."""
+
+    port: str
+    """The robot's side: network interface of its DDS, by name or address, such as eth0."""
+
+    listen: str = ""
+    """The network's side: end point such as tls/192.168.1.20:7447. By default this computer alone:
+    tls/127.0.0.1:7447, or tcp/127.0.0.1:7447 without certificates."""
+
+    controllers: tuple[str, ...] = ("controller",)
+    """Names in the certificates that may command the robot."""
+
+    observers: tuple[str, ...] = ("observer",)
+    """Names in the certificates that may only read."""
+
+    ca: Path | None = None
+    """The authority that signed the certificates (PEM); `deal-hw keys` makes all these files."""
+
+    certificate: Path | None = None
+    """The robot's certificate (PEM)."""
+
+    key: Path | None = None
+    """Its private key (PEM)."""
+
+    insecure: bool = False
+    """Allow plain TCP beyond this computer: whoever reaches the port may then command the robot."""
+
+    domain: Annotated[int, Range(0, 232)] = 0
+    """DDS domain."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """What the states of the robot must pass to be known here: strict, or length for other firmware."""
+
+    rules: tyro.conf.OmitArgPrefixes[BridgeConfig] = field(default_factory=BridgeConfig)
+    """What is admitted, and when the robot is damped."""
+
+    duration_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """Stop after this time [s]; without it, at Ctrl-C."""
+
+    parent: Annotated[int | None, Range(1, 2**22)] = None
+    """Stop when the process with this id is no longer the parent (for programs that start a bridge)."""
+
+    @property
+    def end_point(self) -> str:
+        """Where it listens."""
+        return self.listen or f"{'tls' if self.certificate else 'tcp'}/127.0.0.1:{LOOPBACK_PORT}"
+
+
+def bridge(config: Bridge) -> int:
+    """Serve until a signal or the time given; return the exit status.
+
+    The first line on standard output is ``port END-POINT``.
+
+    Raises:
+        UnknownNameError: There is no bridge for the robot.
+        ConfigurationError: The end point and the certificates do not fit.
+        TransportError: One of the networks cannot be joined, or another bridge runs there.
+    """
+    if config.robot not in ROBOTS:
+        raise UnknownNameError("robot with a bridge", config.robot, ROBOTS)
+    with signalled() as (stop, _):
+        port = free_port(config.end_point)
+        clock = MonotonicClock()
+        options = WireOptions(domain=config.domain)
+        with LocalClaim(f"bridge of go2, {claim_name('dds', config.port, options)}"):
+            made = Go2Bridge(
+                DdsTransport(config.port, clock, options), _network(config, port), clock, config.rules,
+                state_check=config.state_check, tell=_tell,
+            )  # fmt: skip
+            # The transports' threads inherit the priority that holds when they are opened.
+            for warning in become_realtime().warnings:
+                print(f"warning: {warning}", file=sys.stderr)
+            made.open()
+            try:
+                print(f"port {port}", flush=True)
+
+                def step() -> bool:
+                    made.step()
+                    return True
+
+                run_until(step, stop, config.duration_s, config.parent)
+            finally:
+                made.close()
+    for line in summary(made):
+        print(line, file=sys.stderr)
+    return 0
+
+
+def _network(config: Bridge, port: str) -> ZenohTransport:
+    options = WireOptions(
+        listen=True, insecure=config.insecure, ca=config.ca, certificate=config.certificate, key=config.key
+    )
+    settings: Mapping[str, Any] = {}
+    if any(end.protocol == "tls" for end in parse_endpoints(port)):
+        settings = access_settings(config.controllers, config.observers, write=COMMANDS, read=READABLE)
+    else:
+        default = {f.name: f.default for f in dataclasses.fields(Bridge)}
+        named = [
+            f"--{name}" for name in ("controllers", "observers") if getattr(config, name) != default[name]
+        ]
+        refuse(named, f"{port} has no TLS, so nobody's certificate is known; listen on tls/")
+    return ZenohTransport(port, MonotonicClock(), options, settings)
+
+
+def _tell(text: str) -> None:
+    print(text, flush=True)
+
+
+def summary(made: Go2Bridge) -> list[str]:
+    """Return what happened, in words."""
+    judge = made.admission
+    kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(judge.refused.items()))
+    return [
+        f"bridge: {made.counts['rt/lowstate']} states and {judge.admitted} commands passed, {made.unsent} "
+        f"messages not sent; refused: {kinds or 'none'}"
+        + (f" (the last: {judge.last_refusal})" if kinds else "")
+    ]

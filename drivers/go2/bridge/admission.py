@@ -1,0 +1,239 @@
+"""Who may command the robot through the bridge, and when the bridge damps it. Pure: time is an argument.
+
+    IDLE ----a controller's damping----> CONTROLLED ----silence----> DAMPING ----a controller's damping--> ...
+      ▲                                      │                          │
+      └--- handed back to sport mode --------┴--- or another program on the robot's side commands it
+
+The first command of a controller is damping: that is the hand-over, which nobody sends who believes to walk.
+Then the robot is that stream's until it is silent for longer than the limit. Whoever lost the robot in the
+middle of a walk takes it over anew, as everybody does.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+from collections import Counter, OrderedDict
+from typing import Any, Final
+
+from deal_hw.drivers.go2.bridge.config import BridgeConfig
+from deal_hw.drivers.go2.bridge.limits import CommandLimits, is_damping
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame
+from deal_hw.drivers.go2.messages.protocol import LowCommand, decode_low_command
+from deal_hw.drivers.go2.messages.rpc import Request, decode_request
+from deal_hw.drivers.go2.motion_switcher import ROBOT_STATE, SELECT_MODE, SERVICE_SWITCH, SWITCHER
+from deal_hw.drivers.transports.zenoh_stamps import Echo, read_echo
+from deal_hw.errors import FrameError, SafetyError
+from deal_hw.transport import Message
+
+_STREAMS: Final = 64
+"""Streams whose newest sequences are remembered; those of older ones are too old anyway."""
+_REQUESTS: Final = {topics.request(name): name for name in topics.SERVICES}
+
+
+class Control(enum.Enum):
+    """Who has the robot."""
+
+    IDLE = "idle"
+    """Not the bridge: it sends nothing."""
+    CONTROLLED = "controlled"
+    """A controller, through the bridge."""
+    DAMPING = "damping"
+    """The bridge, which damps it."""
+
+
+class RefusedMessageError(SafetyError):
+    """A message that does not go through.
+
+    Attributes:
+        kind: One word for counting.
+    """
+
+    def __init__(self, kind: str, text: str) -> None:
+        self.kind = kind
+        super().__init__(text)
+
+
+class Admission:
+    """Judges what comes from the network.
+
+    Attributes:
+        control: Who has the robot.
+        reason: Why, in words.
+        admitted: Commands that went through.
+        refused: Messages that did not, by kind.
+        last_refusal: Why, of the last one.
+
+    Args:
+        config: Settings.
+        limits: What a command may ask for.
+        session: The number in the bridge's own stamps.
+    """
+
+    def __init__(self, config: BridgeConfig, limits: CommandLimits, session: int) -> None:
+        self._config, self._limits, self._session = config, limits, session
+        self._age_ns = round(config.command_age_s * 1e9)
+        self._release_ns = round(config.release_s * 1e9)
+        self.control, self.reason = Control.IDLE, "nobody has taken the robot over yet"
+        self.admitted = 0
+        self.refused: Counter[str] = Counter()
+        self.last_refusal = self._refusal = ""
+        self._holder: int | None = None
+        self._stiff = False
+        self._last_ns = 0
+        self._newest: OrderedDict[tuple[int, str], int] = OrderedDict()
+
+    def command(self, message: Message, now_ns: int, frame: LowStateFrame | None) -> LowCommand | None:
+        """Return the command in a message where it may go to the robot, None where it may not.
+
+        Args:
+            message: Of ``rt/lowcmd``, with its attachment.
+            now_ns: The bridge's clock [ns].
+            frame: The robot's newest state; None before the first.
+        """
+        try:
+            echo = self._link(message, now_ns)
+            command = self._decode(message.payload)
+            if text := self._limits.complaint(command, frame):
+                raise RefusedMessageError("limits", f"beyond the robot's limits: {text}")
+            self._hand_over(echo, is_damping(command))
+        except RefusedMessageError as refusal:
+            self._count(refusal)
+            return None
+        self._note(echo, message.channel)
+        self._stiff, self._last_ns, self._refusal = not is_damping(command), now_ns, ""
+        self.admitted += 1
+        return command
+
+    def request(self, message: Message, now_ns: int) -> bool:
+        """Return whether a request to the robot's services may pass; one that hands it back ends control."""
+        try:
+            echo = self._link(message, now_ns)
+            self._check_holder(echo)
+            if self._gives_back(message):
+                if self._stiff and self.control is Control.CONTROLLED:
+                    raise RefusedMessageError(
+                        "handover", "the robot cannot be handed back while it is commanded: damp it first"
+                    )
+                self._become(Control.IDLE, "the robot was handed back to its own controller")
+        except RefusedMessageError as refusal:
+            self._count(refusal)
+            return False
+        self._note(echo, message.channel)
+        return True
+
+    def take_charge(self, reason: str) -> None:
+        """Damp the robot from now on, until a controller takes it over."""
+        self._become(Control.DAMPING, reason)
+
+    def yield_to_robot_side(self) -> None:
+        """Stop damping: somebody on the robot's side commands it, and two who command make it jump."""
+        if self.control is Control.DAMPING:
+            self._become(Control.IDLE, "another program on the robot's side commands the motors")
+
+    def tick(self, now_ns: int) -> bool:
+        """Look for silence; return whether a damping command must go out now."""
+        if self.control is not Control.CONTROLLED:
+            return self.control is Control.DAMPING
+        silent_ns = now_ns - self._last_ns
+        if silent_ns <= self._age_ns:
+            return False
+        if self._stiff:
+            self._become(
+                Control.DAMPING,
+                f"no command that may pass for {silent_ns / 1e6:.0f} ms, at most {self._age_ns / 1e6:g} ms "
+                "are allowed" + (f"; the last refusal: {self._refusal}" if self._refusal else ""),
+            )
+        elif silent_ns > self._release_ns:
+            self._become(Control.DAMPING, "the controller went passive and left")
+        return True
+
+    def status(self) -> dict[str, Any]:
+        """Return who has the robot and why, as plain values."""
+        return {
+            "control": self.control.value, "reason": self.reason, "admitted": self.admitted,
+            "refused": dict(self.refused), "last_refusal": self.last_refusal,
+        }  # fmt: skip
+
+    def _become(self, control: Control, reason: str) -> None:
+        self.control, self.reason = control, reason
+        self._holder, self._stiff = None, False
+
+    def _count(self, refusal: RefusedMessageError) -> None:
+        self.refused[refusal.kind] += 1
+        self.last_refusal = self._refusal = str(refusal)
+
+    def _link(self, message: Message, now_ns: int) -> Echo:
+        """Return the sender's stream and number, where the message is new and young."""
+        try:
+            echo = read_echo(message.attachment)
+        except FrameError as error:
+            raise RefusedMessageError("unstamped", str(error)) from error
+        if echo.heard.session != self._session:
+            raise RefusedMessageError(
+                "session",
+                "its sender has heard no state of this bridge yet"
+                if not echo.heard.session
+                else "it answers states of another bridge, or of this one before its restart",
+            )
+        age_ns = now_ns - echo.heard.time_ns
+        if not 0 <= age_ns <= self._age_ns:
+            raise RefusedMessageError(
+                "age",
+                f"its sender's newest state was {age_ns / 1e6:.1f} ms old when it came, at most "
+                f"{self._age_ns / 1e6:g} ms are allowed: the network is slow, or the message is a replay",
+            )
+        newest = self._newest.get((echo.stream, message.channel), -1)
+        if echo.sequence <= newest:
+            raise RefusedMessageError(
+                "sequence", f"number {echo.sequence} came after number {newest}: a replay, or overtaken"
+            )
+        return echo
+
+    def _note(self, echo: Echo, channel: str) -> None:
+        self._newest[echo.stream, channel] = echo.sequence
+        self._newest.move_to_end((echo.stream, channel))
+        if len(self._newest) > _STREAMS:
+            self._newest.popitem(last=False)
+
+    def _decode(self, payload: bytes) -> LowCommand:
+        try:
+            return decode_low_command(payload)
+        except FrameError as error:
+            raise RefusedMessageError("bytes", str(error)) from error
+
+    def _check_holder(self, echo: Echo) -> None:
+        if self._holder is not None and echo.stream != self._holder:
+            raise RefusedMessageError(
+                "holder", "another controller commands the robot; end that run first, this one is refused"
+            )
+
+    def _hand_over(self, echo: Echo, damping: bool) -> None:
+        self._check_holder(echo)
+        if self._holder is None:
+            if not damping:
+                raise RefusedMessageError(
+                    "handover",
+                    f"whoever takes the robot over begins with damping (kp 0, kd above 0): {self.reason}",
+                )
+            self._become(Control.CONTROLLED, "a controller took the robot over")
+            self._holder = echo.stream
+
+    def _gives_back(self, message: Message) -> bool:
+        try:
+            request = decode_request(message.payload)
+        except FrameError as error:
+            raise RefusedMessageError("bytes", str(error)) from error
+        service = _REQUESTS[message.channel]
+        return (service, request.api) == (SWITCHER, SELECT_MODE) or (
+            (service, request.api) == (ROBOT_STATE, SERVICE_SWITCH) and _switches_on(request)
+        )
+
+
+def _switches_on(request: Request) -> bool:
+    try:
+        asked = json.loads(request.parameter)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(asked, dict) and bool(asked.get("switch"))

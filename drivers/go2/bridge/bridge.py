@@ -1,0 +1,253 @@
+"""The bridge itself: two transports, a thread that passes states on, and a loop that judges and damps."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.drivers.go2.bridge.admission import Admission, Control
+from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
+from deal_hw.drivers.go2.bridge.limits import CommandLimits
+from deal_hw.drivers.go2.bridge.status import encode_status
+from deal_hw.drivers.go2.claim import read_claim
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
+from deal_hw.drivers.go2.messages.refusals import StateCheck
+from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, Services
+from deal_hw.drivers.transports.zenoh_stamps import Stamp
+from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
+from deal_hw.transport import Message, TopicTransport
+
+REQUESTS: Final = tuple(topics.request(name) for name in topics.SERVICES)
+RESPONSES: Final = tuple(topics.response(name) for name in topics.SERVICES)
+COMMANDS: Final = (topics.LOW_COMMAND, *REQUESTS, topics.CLAIM)
+"""Topics that a controller may write."""
+TO_NETWORK: Final = (
+    topics.LOW_STATE, topics.LOW_STATE_SLOW, topics.SPORT_STATE, topics.SPORT_STATE_SLOW, topics.WIRELESS,
+    topics.LOW_COMMAND, topics.CLAIM, *RESPONSES,
+)  # fmt: skip
+"""Topics that pass from the robot's side; motor commands are those of others, such as sport mode."""
+READABLE: Final = (*TO_NETWORK, topics.BRIDGE)
+_ASK_S: Final = 2.0
+_RECEIVE_S: Final = 0.1
+_JOIN_S: Final = 2.0
+_MOST_MESSAGES: Final = 64
+"""Messages judged at a time before silence is looked for: a flood must not put the damping off."""
+
+
+class Go2Bridge:
+    """Carries a Go2's messages between its own network and another, and keeps it safe.
+
+    Attributes:
+        admission: The judge; only the thread that steps changes it.
+        counts: Messages that passed, by topic.
+        unsent: Messages that a transport did not take.
+
+    Args:
+        robot: Topics of the robot (DDS); not open.
+        network: Topics of its clients (Zenoh); not open.
+        clock: The bridge's own time.
+        config: Settings.
+        state_check: What a state must pass to count as known here; all states are passed on as they come.
+        tell: Called with a line for the operator whenever something changes.
+    """
+
+    def __init__(
+        self,
+        robot: TopicTransport,
+        network: TopicTransport,
+        clock: Clock,
+        config: BridgeConfig | None = None,
+        *,
+        state_check: StateCheck = "strict",
+        tell: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        self._robot, self._network, self._clock = robot, network, clock
+        self._config = config or BridgeConfig()
+        self._strict, self._tell = state_check == "strict", tell
+        self._session = secrets.randbits(64) | 1
+        self.admission = Admission(
+            self._config, CommandLimits(DESCRIPTION, self._config.effort_margin), self._session
+        )
+        self.counts: Counter[str] = Counter()
+        self.unsent = 0
+        self._encoder = LowCommandEncoder()
+        self._damping = np.array(DESCRIPTION.passive_damping)
+        self._frame: LowStateFrame | None = None
+        self._services: Services | None = None
+        self._foreign = 0
+        self._told = self.admission.control
+        self._status_ns = self._due_ns = clock.now_ns()
+        self._end = threading.Event()
+        self._failure: BaseException | None = None
+        self._thread: threading.Thread | None = None
+
+    def open(self) -> None:
+        """Join both networks; sends nothing to the motors.
+
+        Raises:
+            TransportError: One of them cannot be joined.
+        """
+        self._robot.declare(publish=COMMANDS, subscribe=TO_NETWORK)
+        self._network.declare(publish=READABLE, subscribe=COMMANDS)
+        self._robot.open()
+        try:
+            self._ask_who_moves_it()
+            self._network.open()
+        except BaseException:
+            self._robot.close()
+            raise
+        self._thread = threading.Thread(target=self._pass_states, name="bridge states", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Damp the robot where the bridge or a controller behind it has it, and leave both networks."""
+        self._end.set()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(_JOIN_S)
+        if self.admission.control is not Control.IDLE:
+            self.admission.take_charge("the bridge ends")
+            self._say_status()
+            end_ns = self._clock.now_ns() + round(self._config.leave_s * 1e9)
+            while self._clock.now_ns() < end_ns:
+                self._clock.sleep_until_ns(self._clock.now_ns() + self._period_ns)
+                self._damp()
+        self._network.close()
+        self._robot.close()
+
+    def step(self) -> None:
+        """Serve until the next look for silence is due, and look.
+
+        Raises:
+            DealHwError: The robot's side broke down.
+        """
+        while (left_ns := self._due_ns - self._clock.now_ns()) > 0:
+            with contextlib.suppress(TransportTimeoutError):
+                self._take(self._network.receive(left_ns * 1e-9))
+        if self._failure is not None:
+            raise self._failure
+        # Late or not, what has come is judged first: it shows that the controller is not silent.
+        with contextlib.suppress(TransportTimeoutError):
+            for _ in range(_MOST_MESSAGES):
+                self._take(self._network.receive(0.0))
+        now_ns = self._clock.now_ns()
+        self._tick(now_ns)
+        self._due_ns = max(self._due_ns + self._period_ns, now_ns)
+
+    @property
+    def _period_ns(self) -> int:
+        return round(1e9 / self._config.rate_hz)
+
+    # From the network to the robot.
+
+    def _take(self, message: Message) -> None:
+        now_ns = self._clock.now_ns()
+        if message.channel == topics.LOW_COMMAND:
+            command = self.admission.command(message, now_ns, self._frame)
+            if command is not None:
+                # Made anew: what a LowCmd has beside the joints (battery switch, lights) does not pass.
+                self._to_robot(topics.LOW_COMMAND, self._encoder.encode(command))
+        elif message.channel == topics.CLAIM:
+            if read_claim(message.payload) is not None:
+                self._to_robot(message.channel, message.payload)
+        elif self.admission.request(message, now_ns):
+            self._to_robot(message.channel, message.payload)
+
+    def _to_robot(self, topic: str, payload: bytes) -> None:
+        self._send(self._robot, Message(topic, payload, self._clock.now_ns()))
+
+    def _damp(self) -> None:
+        zero = np.zeros(len(self._damping))
+        self._to_robot(
+            topics.LOW_COMMAND, self._encoder.encode(LowCommand(zero, zero, zero, self._damping, zero))
+        )
+
+    def _tick(self, now_ns: int) -> None:
+        foreign, self._foreign = self._foreign, 0
+        if foreign:
+            self.admission.yield_to_robot_side()
+        if self.admission.tick(now_ns):
+            self._damp()
+        if self.admission.control is not self._told:
+            self._told = self.admission.control
+            self._tell(f"{self._told.value}: {self.admission.reason}")
+            self._status_ns = now_ns
+        if now_ns >= self._status_ns:
+            self._status_ns = now_ns + round(self._config.status_s * 1e9)
+            self._say_status()
+
+    def _say_status(self) -> None:
+        payload = encode_status(self.admission.status())
+        self._send(self._network, Message(topics.BRIDGE, payload, self._clock.now_ns()))
+
+    def _send(self, side: TopicTransport, message: Message) -> None:
+        try:
+            side.send(message)
+            self.counts[message.channel] += 1
+        except (TransportError, FrameError):
+            self.unsent += 1
+
+    # From the robot to the network, in a thread of its own once the network is open.
+
+    def _pass_states(self) -> None:
+        try:
+            while not self._end.is_set():
+                with contextlib.suppress(TransportTimeoutError):
+                    self._send(self._network, self._heard(self._robot.receive(_RECEIVE_S)))
+        except BaseException as error:
+            self._failure = error
+
+    def _heard(self, message: Message) -> Message:
+        """Take note of a message of the robot's side; return it as clients get it."""
+        if message.channel == topics.LOW_STATE:
+            with contextlib.suppress(FrameError):
+                self._frame = decode_low_state(message.payload, self._strict)
+            stamp = Stamp(self._session, message.stamp_ns).encode()
+            return Message(message.channel, message.payload, message.stamp_ns, stamp)
+        if message.channel == topics.LOW_COMMAND:
+            self._foreign += 1
+        elif self._services is not None:
+            self._services.take(message)
+        return message
+
+    # At the beginning.
+
+    def _ask_who_moves_it(self) -> None:
+        """Damp the robot at once where nobody moves it: a bridge before this one may have died in a walk.
+
+        A robot whose own controller is released holds its last command for ever. Where that controller has
+        it, or somebody else commands it, the bridge keeps quiet.
+        """
+        self._services = Services(self._to_robot, self._pump, self._clock)
+        switcher = MotionSwitcher(self._services, self._clock)
+        try:
+            mode = switcher.active(_ASK_S)
+        except DealHwError as error:
+            self._tell(f"who moves the robot is not known, so it is not damped yet: {error}")
+            return
+        finally:
+            self._services = None
+        if mode:
+            self._tell(f"idle: the robot's own controller {mode!r} has it")
+            return
+        until_ns = self._clock.now_ns() + round(self._config.listen_s * 1e9)
+        while not self._foreign and (left_ns := until_ns - self._clock.now_ns()) > 0:
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump(left_ns * 1e-9)
+        if self._foreign:
+            self._tell("idle: another program on the robot's side commands the motors")
+            return
+        self.admission.take_charge("the bridge started, and the robot's own controller is released")
+        self._damp()
+
+    def _pump(self, timeout_s: float) -> None:
+        self._heard(self._robot.receive(timeout_s))
