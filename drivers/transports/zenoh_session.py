@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import re
 import socket
@@ -22,6 +23,21 @@ _FORM: Final = re.compile(r"(\w+)/(\[[0-9a-fA-F:.%\w]+\]|[^\s\[\]:/?#]+):(\d{1,5
 _BUFFER_BYTES: Final = 16_384
 _LEASE_MS: Final = 2000
 _RETRY_MS: Final = (100, 1000)
+_NOT_YET_VALID, _EXPIRED = 9, 10
+"""Codes of OpenSSL (X509_V_ERR_...)."""
+_FLIGHTS: Final = 4
+"""Messages to and fro that a handshake needs at most."""
+_ALERTS: Final = {
+    "CERTIFICATE_REQUIRED": "it wants a certificate of ours: give --certificate and --key",
+    "CERTIFICATE_EXPIRED": (
+        "it finds our certificate expired, or not valid yet: is the other computer's clock right? "
+        "`deal-hw keys show DIR` tells how long ours holds"
+    ),
+    "UNKNOWN_CA": (
+        "it does not know the authority that signed our certificate: both sides need the same ca.pem"
+    ),
+}
+"""Parts of OpenSSL's names for what a peer says of our certificate -> what it means."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +114,37 @@ def _check_files(options: WireOptions) -> None:
     if options.listen and options.certificate is None:
         raise ConfigurationError("listening on a tls/ end point needs --certificate and --key (PEM)")
     tls_context(options)
+    code, text = own_certificate_trouble(options)
+    if code in (_NOT_YET_VALID, _EXPIRED):
+        raise ConfigurationError(
+            f"{options.certificate}, or its authority {options.ca}: {text}. Is this computer's clock right? "
+            "Otherwise make a new one (`deal-hw keys add`); `deal-hw keys show DIR` tells how long each holds"
+        )
+
+
+def own_certificate_trouble(options: WireOptions) -> tuple[int, str]:
+    """Return OpenSSL's code and words for what is wrong with our certificate; 0 and "" where nothing is.
+
+    It is shown to ourselves, in memory: the peer's judgement would come as a closed connection.
+    """
+    if options.certificate is None or options.ca is None:
+        return 0, ""
+    judge, bearer = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    for context in (judge, bearer):
+        context.load_cert_chain(options.certificate, options.key, password=lambda: "")
+    judge.verify_mode = ssl.CERT_REQUIRED
+    judge.load_verify_locations(options.ca)
+    bearer.check_hostname, bearer.verify_mode = False, ssl.CERT_NONE
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    sides = bearer.wrap_bio(back, there), judge.wrap_bio(there, back, server_side=True)
+    try:
+        for _ in range(_FLIGHTS):
+            for side in sides:
+                with contextlib.suppress(ssl.SSLWantReadError):
+                    side.do_handshake()
+    except ssl.SSLCertVerificationError as error:
+        return error.verify_code, error.verify_message
+    return 0, ""
 
 
 def tls_context(options: WireOptions) -> ssl.SSLContext:
@@ -243,12 +290,14 @@ def _tls_trouble(endpoint: Endpoint, options: WireOptions) -> str:
             secure.settimeout(0.5)
             secure.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return f"its certificate is not accepted: {error.verify_message}"
+        clock = "; is this computer's clock right?" * (error.verify_code in (_NOT_YET_VALID, _EXPIRED))
+        return f"its certificate is not accepted: {error.verify_message}{clock}"
     except TimeoutError:
         return "TLS works, but what listens there does not speak Zenoh"
     except ssl.SSLError as error:
-        own = "" if options.certificate else "; it may want a certificate of ours: --certificate and --key"
-        return f"TLS fails: {error.reason or error}{own}"
+        reason = error.reason or str(error)
+        meant = [text for name, text in _ALERTS.items() if name in reason]
+        return f"TLS fails: {reason}" + (f"; {meant[0]}" if meant else "")
     except OSError as error:
         return f"TLS fails: {error.strerror or error}"
     return "it closes the connection; it may not accept our certificate"
