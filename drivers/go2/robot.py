@@ -11,6 +11,7 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2.bridge.status import read_status
 from deal_hw.drivers.go2.command_sender import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.go2.connect import await_robot
 from deal_hw.drivers.go2.descriptions import on_stand
@@ -31,10 +32,13 @@ from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 STOP_BUTTONS: Final = "L2+B"
 PASSIVE_DELAY_NS: Final = 10_000_000
 """States that were sensed sooner after the passive command say nothing about it [ns]."""
+BRIDGE_DELAY_NS: Final = 100_000_000
+"""What a bridge says sooner after the arming may be from before it [ns]."""
 PUBLISHED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES))
 SUBSCRIBED: Final = (
     topics.LOW_STATE,
     topics.LOW_COMMAND,
+    topics.BRIDGE,
     *(topics.response(name) for name in topics.SERVICES),
 )
 _QUEUE: Final = 4096
@@ -122,6 +126,7 @@ class Go2Robot(Robot):
         self._frame: LowStateFrame | None = None
         self._armed = self._homed = self._in_charge = False
         self._passive_ns: int | None = None
+        self._armed_ns = 0
         self._fault = self._operator_stop = ""
 
     def connect(self) -> None:
@@ -204,7 +209,7 @@ class Go2Robot(Robot):
                 raise TransportTimeoutError(f"go2: no new states within {timeout_s:g} s of the first command")
             with contextlib.suppress(TransportTimeoutError):
                 self._pump(left_ns * 1e-9)
-        self._armed, self._passive_ns = True, None
+        self._armed, self._passive_ns, self._armed_ns = True, None, self._clock.now_ns()
         self._states.clear()
 
     def read_state(self, timeout_s: float) -> RobotState:
@@ -259,7 +264,7 @@ class Go2Robot(Robot):
 
     @property
     def fault(self) -> str:
-        """That another program commanded the motors since the robot was armed; "": none did."""
+        """That another program, or a bridge, took the robot since it was armed; "": nobody did."""
         return self._fault
 
     @property
@@ -301,9 +306,32 @@ class Go2Robot(Robot):
             if (frame := self._stream.take(message)) is not None:
                 self._take_frame(frame, message.stamp_ns)
             return
+        if message.channel == topics.BRIDGE:
+            self._take_bridge(message)
+            return
         self._takeover.take(message)
         if message.channel == topics.LOW_COMMAND and self._armed and not self._fault:
             self._fault = self._takeover.complaint()
+
+    def _take_bridge(self, message: Message) -> None:
+        """Hear from a bridge who has the robot.
+
+        Raises:
+            SafetyError: Another controller has it, and this one has just begun to take it over.
+        """
+        status = read_status(message.payload)
+        if status is None:
+            return
+        controlled = status["control"] == "controlled"
+        ours = bool(self._sender.in_force or self._armed_ns)
+        if controlled and self._in_charge and not ours:
+            raise SafetyError(
+                "go2: another controller commands the robot through the bridge; end that run first (Ctrl-C "
+                "in its terminal)"
+            )
+        later = message.stamp_ns - self._armed_ns > BRIDGE_DELAY_NS
+        if self._armed and later and not controlled and not self._fault:
+            self._fault = f"go2: the bridge took the robot from this run: {status['reason']}"
 
     def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:
         self._frame = frame
