@@ -144,7 +144,7 @@ def _network(config: Bridge, port: str) -> ZenohTransport:
 
 
 def _tell(text: str) -> None:
-    print(text, flush=True)
+    print(text, file=sys.stderr, flush=True)
 
 
 def summary(made: Go2Bridge) -> list[str]:

@@ -1,4 +1,4 @@
-"""Starts ``deal-hw emulate`` as a process of its own, for programs that need a robot on a port."""
+"""Starts a verb that serves as a process of its own, for programs that need a robot on a port."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import select
 import subprocess
 import sys
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
@@ -15,23 +16,28 @@ from deal_hw.errors import TransportError
 START_TIMEOUT_S = 60.0
 
 
-class EmulatorProcess:
-    """A running emulator; a context manager. It ends when this process ends, however that happens.
+class VerbProcess:
+    """A running verb that prints ``port PORT`` first; a context manager.
+
+    It ends when this process ends, however that happens.
 
     Args:
-        robot: The robot to emulate.
-        options: Further command-line options, such as ``"--seed", "3"``.
+        verb: The verb.
+        arguments: Its options, as on the command line.
+        what: What messages call it; by default after the verb.
+        prefix: A command to run it under, such as ``ip netns exec NAME``.
     """
 
-    def __init__(self, robot: str, *options: str) -> None:
+    def __init__(self, verb: str, *arguments: str, what: str = "", prefix: Sequence[str] = ()) -> None:
+        self._what = what or f"deal-hw {verb}"
         self._command = [
-            sys.executable, "-m", "deal_hw.cli.emulate", robot, "--parent", str(os.getpid()), *options,
+            *prefix, sys.executable, "-m", "deal_hw", verb, "--parent", str(os.getpid()), *arguments,
         ]  # fmt: skip
         self._process: subprocess.Popen[bytes] | None = None
         self.port = ""
 
     def start(self) -> str:
-        """Start the emulator and return its port.
+        """Start it and return its port.
 
         Raises:
             TransportError: It did not come up; the message holds what it said.
@@ -42,18 +48,18 @@ class EmulatorProcess:
             self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, bufsize=0
         )
         if self._process.stdout is None:
-            raise TransportError("the emulator has no standard output")
+            raise TransportError(f"{self._what} has no standard output")
         readable, _, _ = select.select([self._process.stdout], [], [], START_TIMEOUT_S)
         line = self._process.stdout.readline().decode() if readable else ""
         word, _, port = line.strip().partition(" ")
         if word != "port" or not port:
             _, errors = self.stop()
-            raise TransportError(f"the emulator did not start: {errors.strip()[-2000:] or 'it said nothing'}")
+            raise TransportError(f"{self._what} did not start: {errors.strip()[-2000:] or 'it said nothing'}")
         self.port = port
         return port
 
     def stop(self, timeout_s: float = 10.0) -> tuple[str, str]:
-        """Stop the emulator; return what it printed since its first line, and its messages."""
+        """Stop it; return what it printed since its first line, and its messages."""
         process, self._process = self._process, None
         if process is None:
             return "", ""
@@ -68,13 +74,13 @@ class EmulatorProcess:
 
     @property
     def pid(self) -> int:
-        """Process id of the running emulator.
+        """Its process id.
 
         Raises:
             TransportError: It is not running.
         """
         if self._process is None:
-            raise TransportError("the emulator is not running")
+            raise TransportError(f"{self._what} is not running")
         return self._process.pid
 
     def __enter__(self) -> Self:
@@ -85,3 +91,15 @@ class EmulatorProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
+
+
+class EmulatorProcess(VerbProcess):
+    """A running emulator.
+
+    Args:
+        robot: The robot to emulate.
+        options: Further command-line options, such as ``"--seed", "3"``.
+    """
+
+    def __init__(self, robot: str, *options: str) -> None:
+        super().__init__("emulate", robot, *options, what="the emulator")

@@ -9,6 +9,7 @@ import datetime
 import ipaddress
 import os
 import re
+import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,8 @@ def make_authority(folder: Path, days: float, now: datetime.datetime) -> None:
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     _refuse_overwriting(folder, AUTHORITY)
     key = _new_key()
-    name = _common_name("deal-hw authority")
+    # Two authorities need two names, or a mix-up of their files is a puzzling error.
+    name = _common_name(f"deal-hw authority {secrets.token_hex(3)}")
     usage = _usage(key_cert_sign=True, crl_sign=True)
     builder = (
         _builder(name, name, key, days, now)

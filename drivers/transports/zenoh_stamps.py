@@ -87,12 +87,15 @@ def read_echo(attachment: bytes) -> Echo:
 class Echoes:
     """Numbers a client's messages and returns the newest stamp with each.
 
+    Attributes:
+        stream: Number of the stream.
+
     Args:
-        stream: Number of the stream; random by default.
+        stream: The same; random by default.
     """
 
     def __init__(self, stream: int | None = None) -> None:
-        self._stream = secrets.randbits(64) if stream is None else stream
+        self.stream = secrets.randbits(64) if stream is None else stream
         self._sequence = -1
         self._heard = Stamp(0, 0)
 
@@ -103,4 +106,4 @@ class Echoes:
     def next(self) -> bytes:
         """Return the attachment of the next message."""
         self._sequence += 1
-        return Echo(self._stream, self._sequence, self._heard).encode()
+        return Echo(self.stream, self._sequence, self._heard).encode()

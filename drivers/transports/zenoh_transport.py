@@ -189,6 +189,11 @@ class ZenohTransport(TopicTransport):
         """Return nothing: Zenoh does not tell who writes."""
         return ()
 
+    @property
+    def stream(self) -> int | None:
+        """Number of the stream of our messages, which a bridge knows us by; None where there is none."""
+        return None if self._echoes is None else self._echoes.stream
+
     def _open_session(self) -> zenoh.Session:
         endpoints = zenoh_session.parse_endpoints(self.port)
         zenoh_session.check_security(endpoints, self._options)

@@ -152,7 +152,8 @@ class Admission:
     def status(self) -> dict[str, Any]:
         """Return who has the robot and why, as plain values."""
         return {
-            "control": self.control.value, "reason": self.reason, "admitted": self.admitted,
+            "control": self.control.value, "reason": self.reason,
+            "stream": "" if self._holder is None else f"{self._holder:016x}", "admitted": self.admitted,
             "refused": dict(self.refused), "last_refusal": self.last_refusal,
         }  # fmt: skip
 

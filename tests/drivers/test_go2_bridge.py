@@ -1,0 +1,187 @@
+"""The bridge in real time: TLS on one side, DDS and an emulated Go2 on the other."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from random import SystemRandom
+
+import numpy as np
+import pytest
+from bridge_client import BridgeClient
+from bridge_rig import BridgeRig
+
+from deal_hw.clock import MonotonicClock
+from deal_hw.drivers.go2.robot import Go2Robot
+from deal_hw.drivers.transports import zenoh_session
+from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
+from deal_hw.errors import ConfigurationError, PortNotFoundError, SafetyError, TransportTimeoutError
+from deal_hw.types import JointCommand
+
+pytestmark = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("cyclonedds", "cryptography", "mujoco")),
+    reason="pip install 'deal-hw[dds,keys,sim]'",
+)
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BridgeRig]:
+    """An emulated Go2 whose sport mode is off, and a bridge."""
+    with BridgeRig(tmp_path_factory.mktemp("bridge"), SystemRandom().randrange(10, 100)) as made:
+        yield made
+
+
+@pytest.fixture
+def controller(rig: BridgeRig) -> Iterator[BridgeClient]:
+    """A client that may command, in charge; at the end it damps the robot."""
+    with BridgeClient(rig.port, rig.options("controller")) as client:
+        client.take_over()
+        yield client
+        client.repeat(client.damping(), lambda: rig.commands()[-1] == "damping")
+
+
+def test_a_robot_without_a_commander_is_damped_from_the_start(rig: BridgeRig) -> None:
+    """Sport mode is off and nobody commands: it may hold anything, so the bridge damps it."""
+    with BridgeClient(rig.port, rig.options("observer")) as observer:
+        observer.hear(lambda: bool(observer.status) and bool(rig.commands()))
+    assert observer.status["control"] == "damping"
+    rig.await_commands(["damping"])
+
+
+def test_the_driver_works_through_it(rig: BridgeRig) -> None:
+    """A whole run's life: connect, home, arm, command, passive; a second run is refused meanwhile."""
+    clock = MonotonicClock()
+    robot, other = (
+        Go2Robot(ZenohTransport(rig.port, clock, rig.options("controller")), clock, support_check=False)
+        for _ in range(2)
+    )
+    with robot, other:
+        robot.home(10.0)
+        robot.arm(5.0)
+        state = robot.read_state(1.0)
+        facts = robot.description
+        zero, gain = np.zeros(12), np.ones(12)
+        stay = JointCommand(
+            np.clip(state.position, *np.array(facts.limits.target).T), zero, 20 * gain, gain, zero, gain, gain
+        )
+        before = rig.commands()
+        while rig.commands() == before:
+            robot.send_command(stay)
+            robot.read_state(1.0)
+        rig.await_commands([*before, "stiff"])
+        with pytest.raises(SafetyError, match="another controller commands the robot through the bridge"):
+            while True:
+                robot.send_command(stay)
+                robot.read_state(1.0)
+                with contextlib.suppress(TransportTimeoutError):
+                    other.home(0.005)
+        robot.passive()
+        assert robot.fault == ""
+
+
+def test_an_observer_reads_and_cannot_command(rig: BridgeRig, controller: BridgeClient) -> None:
+    """Its commands do not even reach the judge."""
+    with BridgeClient(rig.port, rig.options("observer")) as observer:
+        observer.repeat(observer.damping(), lambda: observer.states > 200 and bool(observer.status))
+        assert observer.status["control"] == "controlled"
+        refused = observer.status["refused"]
+        admitted = observer.status["admitted"]
+        observer.hear(lambda: observer.status["admitted"] > admitted + 200)
+        assert observer.status["refused"] == refused
+        assert not observer.in_charge
+
+
+def test_a_second_controller_and_replays_are_refused(rig: BridgeRig, controller: BridgeClient) -> None:
+    """Both are counted, and the first one's commands go on: nothing else moved the robot."""
+    told = rig.commands()
+
+    def refused(*kinds: str) -> int:
+        return sum(controller.status["refused"].get(kind, 0) for kind in kinds)
+
+    with BridgeClient(rig.port, rig.options("controller")) as second:
+        second.hear(lambda: second.frame is not None)
+        before = refused("holder")
+        second.repeat(second.damping(), lambda: bool(second.status) and second.states > 100)
+        controller.hear(lambda: refused("holder") > before + 20)
+        assert "another controller" in controller.status["last_refusal"]
+    before = refused("sequence", "age")
+    command, old = controller.pose(), controller.echoes.next()
+
+    def replay() -> bool:
+        controller.send(command, old)
+        return refused("sequence", "age") > before + 20
+
+    controller.hear(replay)
+    assert controller.in_charge
+    assert rig.commands() == told
+
+
+def test_a_silent_controller_is_replaced_by_damping(rig: BridgeRig) -> None:
+    """Its link is gone without a word; the stream that comes back has to take the robot over anew."""
+    with BridgeClient(rig.port, rig.options("controller")) as client:
+        client.take_over()
+        told = rig.commands()
+        client.repeat(b"", lambda: client.status["control"] == "damping")
+        assert "no command that may pass" in client.status["reason"]
+        rig.await_commands([*told, "damping"])
+        refused = client.status["refused"].get("handover", 0)
+        client.repeat(client.pose(), lambda: client.status["refused"].get("handover", 0) > refused + 20)
+        rig.await_commands([*told, "damping"])
+
+
+def test_a_killed_bridge_damps_when_it_is_back(rig: BridgeRig) -> None:
+    """The robot holds its last command; the next bridge damps it, and the old stream stays out."""
+    with BridgeClient(rig.port, rig.options("controller")) as client:
+        client.take_over()
+        told = rig.commands()
+        assert told[-1] == "stiff"
+        rig.kill_bridge()
+        assert rig.commands() == told
+        client.status = {}
+        rig.start_bridge()
+        client.hear(lambda: client.status.get("refused", {}).get("handover", 0) > 20)
+        assert client.status["control"] == "damping"
+        rig.await_commands([*told, "damping"])
+        client.take_over()
+        rig.await_commands([*told, "damping", "stiff"])
+
+
+def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig) -> None:
+    """SIGTERM while it walks."""
+    with BridgeClient(rig.port, rig.options("controller")) as client:
+        client.take_over()
+        told = rig.commands()
+        _, said = rig.bridge.stop()
+        rig.await_commands([*told, "damping"])
+        assert "commands passed" in said
+    rig.start_bridge()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [
+        ("expired", ConfigurationError, "certificate has expired"),
+        ("", PortNotFoundError, "--certificate and --key"),
+    ],
+)
+def test_others_are_refused_and_told_why(
+    rig: BridgeRig, monkeypatch: pytest.MonkeyPatch, name: str, kind: type[Exception], words: str
+) -> None:
+    """An expired certificate, and none."""
+    monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.5)
+    with pytest.raises(kind, match=words), BridgeClient(rig.port, rig.options(name)):
+        pass
+
+
+def test_a_certificate_of_another_name_reads_nothing(rig: BridgeRig, tmp_path: Path) -> None:
+    """Signed by the same authority, and named neither controller nor observer: the robot's own, here."""
+    with (
+        BridgeClient(rig.port, rig.options("robot")) as stranger,
+        BridgeClient(rig.port, rig.options("observer")) as observer,
+    ):
+        observer.hear(lambda: observer.states > 100)
+        stranger.listen()
+        assert stranger.states == 0
+        assert not stranger.status

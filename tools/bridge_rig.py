@@ -1,0 +1,130 @@
+"""An emulated Go2 on DDS with a bridge before it, each a process of its own, and their certificates."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from bridge_client import PATIENCE_S
+
+from deal_hw.cli.emulator_process import VerbProcess
+from deal_hw.cli.keys import Make, make
+from deal_hw.clock import MonotonicClock
+from deal_hw.drivers.transports.certificates import sign
+from deal_hw.errors import TransportTimeoutError
+from deal_hw.transport import WireOptions
+
+
+def make_keys(folder: Path, *addresses: str) -> None:
+    """Make the certificates of ``deal-hw keys make``, and one that has expired, named ``expired``."""
+    now = datetime.datetime.now(datetime.UTC)
+    make(Make(out=folder, robot=addresses, days=30), now)
+    sign(folder, "expired", addresses=(), days=1, now=now - datetime.timedelta(days=2))
+
+
+def wire(folder: Path, name: str) -> WireOptions:
+    """Return the options of who holds a certificate; of nobody in particular for ""."""
+    own = {"certificate": folder / f"{name}.pem", "key": folder / f"{name}.key"} if name else {}
+    return WireOptions(ca=folder / "ca.pem", **own)
+
+
+class BridgeRig:
+    """The two processes; a context manager.
+
+    Attributes:
+        keys: Folder of the certificates.
+        port: End point of the bridge.
+        bridge: Its process.
+
+    Args:
+        folder: For certificates and logs.
+        domain: DDS domain.
+        address: Where the bridge listens.
+        prefix: A command to run both under, such as ``ip netns exec NAME``.
+        emulator: More options of the emulator.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        *,
+        address: str = "127.0.0.1",
+        prefix: Sequence[str] = (),
+        emulator: Sequence[str] = ("--profile", "ideal", "--nominal", "--sport", "off"),
+    ) -> None:
+        self.keys = folder / "keys"
+        make_keys(self.keys, address)
+        self._events, self._domain, self._prefix = folder / "events.jsonl", str(domain), prefix
+        self._events.touch()
+        self._robot = VerbProcess(
+            "emulate", "go2", "--port", "lo", "--domain", self._domain,
+            "--events-to", str(self._events), *emulator, prefix=prefix,
+        )  # fmt: skip
+        self.port = f"tls/{address}:0"
+        self.bridge = self._make_bridge()
+
+    def __enter__(self) -> Self:
+        self._robot.start()
+        try:
+            self.start_bridge()
+        except BaseException:
+            self._robot.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.bridge.stop()
+        self._robot.stop()
+
+    def start_bridge(self) -> None:
+        """Start the bridge, at the end point of the one before."""
+        self.bridge = self._make_bridge()
+        self.port = self.bridge.start()
+
+    def kill_bridge(self) -> None:
+        """Kill it as the kernel does that is out of memory: it cannot do anything any more."""
+        os.kill(self.bridge.pid, signal.SIGKILL)
+        self.bridge.stop()
+
+    def options(self, name: str) -> WireOptions:
+        """Return the options of a client by its certificate's name."""
+        return wire(self.keys, name)
+
+    def told(self) -> list[tuple[int, str]]:
+        """Return what the robot was told so far: host time [ns], kind of command."""
+        lines = self._events.read_text(encoding="utf-8").splitlines()
+        return [(stamp_ns, what) for _, stamp_ns, what in map(json.loads, lines)]
+
+    def commands(self) -> list[str]:
+        """Return the kinds of motor commands so far, in order of change."""
+        return [what for _, what in self.told() if what in ("stiff", "damping", "off")]
+
+    def await_commands(self, kinds: Sequence[str]) -> None:
+        """Return once the motor commands so far are of these kinds: the robot hears of them last.
+
+        Raises:
+            TransportTimeoutError: They are not in time.
+        """
+        clock = MonotonicClock()
+        end_ns = clock.now_ns() + round(PATIENCE_S * 1e9)
+        while (found := self.commands()) != list(kinds):
+            if clock.now_ns() > end_ns:
+                raise TransportTimeoutError(f"the robot was told {found}, expected {list(kinds)}")
+            clock.sleep_until_ns(clock.now_ns() + 10_000_000)
+
+    def _make_bridge(self) -> VerbProcess:
+        options = wire(self.keys, "robot")
+        return VerbProcess(
+            "bridge", "go2", "--port", "lo", "--domain", self._domain, "--listen", self.port,
+            "--ca", str(options.ca), "--certificate", str(options.certificate), "--key", str(options.key),
+            prefix=self._prefix,
+        )  # fmt: skip
