@@ -12,6 +12,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from deal_hw.clock import MonotonicClock
+from deal_hw.control.realtime import FIFO_PRIORITY, priority
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
@@ -54,7 +55,9 @@ class BridgeClient:
         self._end = threading.Event()
 
     def __enter__(self) -> Self:
-        self._link.open()
+        # Zenoh's threads inherit the priority; a late command would count as silence.
+        with priority(FIFO_PRIORITY, children=True):
+            self._link.open()
         self._end.clear()
         self._thread = threading.Thread(target=self._send_all, name="commands", daemon=True)
         self._thread.start()
@@ -141,11 +144,12 @@ class BridgeClient:
 
     def _send_all(self) -> None:
         due_ns = self._clock.now_ns()
-        while not self._end.is_set():
-            if self._payload:
-                self.send(self._payload)
-            due_ns = max(due_ns + PERIOD_NS, self._clock.now_ns())
-            self._clock.sleep_until_ns(due_ns)
+        with priority(FIFO_PRIORITY):
+            while not self._end.is_set():
+                if self._payload:
+                    self.send(self._payload)
+                due_ns = max(due_ns + PERIOD_NS, self._clock.now_ns())
+                self._clock.sleep_until_ns(due_ns)
 
 
 def decode_status(payload: bytes) -> dict[str, Any]:

@@ -48,6 +48,7 @@ class BridgeRig:
         address: Where the bridge listens.
         prefix: A command to run both under, such as ``ip netns exec NAME``.
         emulator: More options of the emulator.
+        bridge: More options of the bridge.
     """
 
     def __init__(
@@ -58,9 +59,11 @@ class BridgeRig:
         address: str = "127.0.0.1",
         prefix: Sequence[str] = (),
         emulator: Sequence[str] = ("--profile", "ideal", "--nominal", "--sport", "off"),
+        bridge: Sequence[str] = (),
     ) -> None:
         self.keys = folder / "keys"
         make_keys(self.keys, address)
+        self._options = tuple(bridge)
         self._events, self._domain, self._prefix = folder / "events.jsonl", str(domain), prefix
         self._events.touch()
         self._robot = VerbProcess(
@@ -126,5 +129,5 @@ class BridgeRig:
         return VerbProcess(
             "bridge", "go2", "--port", "lo", "--domain", self._domain, "--listen", self.port,
             "--ca", str(options.ca), "--certificate", str(options.certificate), "--key", str(options.key),
-            prefix=self._prefix,
+            *self._options, prefix=self._prefix,
         )  # fmt: skip

@@ -122,12 +122,12 @@ def test_a_hand_over_begins_with_damping(bench: Bench) -> None:
 
 
 def test_silence_beyond_the_limit_damps_until_a_new_hand_over(bench: Bench) -> None:
-    """50 ms without a command, then damping at each look, whatever the old stream goes on to say."""
+    """Within 50 ms of the last command, then at each look, whatever the old stream goes on to say."""
     bench.walk()
-    assert bench.wait(50) == 0
+    assert bench.wait(48) == 0
     assert bench.wait(10) == 5
     assert bench.judge.control is Control.DAMPING
-    assert "no command that may pass for 52 ms, at most 50 ms" in bench.judge.reason
+    assert "no command that may pass for 50 ms, the limit is 50 ms" in bench.judge.reason
     assert bench.send(HOLD) is None
     assert "no command that may pass" in bench.why()
     assert bench.wait(10_000) == 5000
@@ -138,7 +138,7 @@ def test_silence_beyond_the_limit_damps_until_a_new_hand_over(bench: Bench) -> N
 def test_a_controller_that_went_passive_keeps_the_robot_for_a_while(bench: Bench) -> None:
     """Between damping and the first target a policy may take its time; damping is repeated meanwhile."""
     assert bench.send(DAMPING) is not None
-    assert bench.wait(900) == 425
+    assert bench.wait(900) == 426
     assert bench.judge.control is Control.CONTROLLED
     assert bench.send(HOLD) is not None
     assert bench.send(DAMPING) is not None
@@ -384,7 +384,7 @@ def test_whatever_comes_the_rules_hold(
             bench.now_ns += 2 * MS
             bench.judge.tick(bench.now_ns)
         silent_ns = bench.now_ns - last_ns
-        if holder is not None and silent_ns > (50 if stiff else 1000) * MS:
+        if holder is not None and silent_ns > (48 if stiff else 1000) * MS:
             holder = None
             assert bench.judge.control is Control.DAMPING
         if kind == "wait":

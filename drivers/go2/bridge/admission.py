@@ -74,6 +74,8 @@ class Admission:
     def __init__(self, config: BridgeConfig, limits: CommandLimits, session: int) -> None:
         self._config, self._limits, self._session = config, limits, session
         self._age_ns = round(config.command_age_s * 1e9)
+        # The last look before the limit: the robot is to be damped within it, not after it.
+        self._silence_ns = self._age_ns - round(1e9 / config.rate_hz)
         self._release_ns = round(config.release_s * 1e9)
         self.control, self.reason = Control.IDLE, "nobody has taken the robot over yet"
         self.admitted = 0
@@ -137,13 +139,14 @@ class Admission:
         if self.control is not Control.CONTROLLED:
             return self.control is Control.DAMPING
         silent_ns = now_ns - self._last_ns
-        if silent_ns <= self._age_ns:
+        if silent_ns <= self._silence_ns:
             return False
         if self._stiff:
             self._become(
                 Control.DAMPING,
-                f"no command that may pass for {silent_ns / 1e6:.0f} ms, at most {self._age_ns / 1e6:g} ms "
-                "are allowed" + (f"; the last refusal: {self._refusal}" if self._refusal else ""),
+                f"no command that may pass for {silent_ns / 1e6:.0f} ms, the limit is "
+                f"{self._age_ns / 1e6:g} ms"
+                + (f"; the last refusal: {self._refusal}" if self._refusal else ""),
             )
         elif silent_ns > self._release_ns:
             self._become(Control.DAMPING, "the controller went passive and left")
