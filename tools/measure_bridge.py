@@ -6,8 +6,8 @@ monotonic clock is the same.
 ``latency``: a controller and a robot that only measure, 500 commands and states a second, over TLS; through
 the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge stand in a
 network namespace, and its interface goes down in a command stream; time from there to the first damping at
-the robot. ``restart``: the bridge is killed with SIGKILL in a command stream and started again. ``refuse``:
-replayed commands and a second controller beside one that commands.
+the robot, beside a stall monitor. ``restart``: the bridge is killed with SIGKILL in a command stream and
+started again. ``refuse``: replayed commands and a second controller beside one that commands.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ import numpy as np
 import tyro
 from bridge_client import BridgeClient
 from bridge_rig import BridgeRig, make_keys, wire
+from stall_monitor import watch_stalls
 
 from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.cli.emulator_process import VerbProcess
@@ -44,6 +45,7 @@ SIDES: Final = Path(__file__).with_name("bridge_sides.py")
 HOSTS: Final = "10.97.43.1", "10.97.43.2"
 """Addresses of the pair of interfaces: this side, and that in the namespace."""
 _CLONE_NEWNET, _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x40000000, 0x8913, 0x8914, 0x1
+_PAUSE_NS: Final = 500_000
 ACTS: Final = ("latency", "cut", "restart", "refuse")
 
 
@@ -173,23 +175,26 @@ def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any
 def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
     """Return how soon the robot is damped when the interface of the bridge's computer goes down."""
     name = f"go2-{os.getpid()}"
-    delays: list[float] = []
-    with _namespace(name) as (prefix, switch):
-        with BridgeRig(folder, config.domain, address=HOSTS[1], prefix=prefix) as rig:
-            for _ in range(config.cuts):
-                with BridgeClient(rig.port, rig.options("controller")) as client:
-                    client.take_over()
-                    told = rig.commands()
-                    cut_ns = MonotonicClock().now_ns()
-                    switch(False)
-                    rig.await_commands([*told, "damping"])
-                    damped_ns = rig.told()[-1][0]
-                    delays.append((damped_ns - cut_ns) * 1e-6)
-                    switch(True)
+    times: list[tuple[int, int]] = []
+    with (
+        watch_stalls(_PAUSE_NS) as seen,
+        _namespace(name) as (prefix, switch),
+        BridgeRig(folder, config.domain, address=HOSTS[1], prefix=prefix) as rig,
+    ):
+        for _ in range(config.cuts):
+            with BridgeClient(rig.port, rig.options("controller")) as client:
+                client.take_over()
+                told = rig.commands()
+                cut_ns = MonotonicClock().now_ns()
+                switch(False)
+                rig.await_commands([*told, "damping"])
+                times.append((cut_ns, rig.told()[-1][0]))
+                switch(True)
     return {
         "how": "interface of a network namespace set down (SIOCSIFFLAGS)",
         "limit_ms": 1e3 * BridgeConfig().command_age_s,
-        **_spread(delays),
+        **_spread([(damped - cut) * 1e-6 for cut, damped in times]),
+        "longest_while_the_machine_ran_ms": round(max(seen.awake_ns(*each) for each in times) * 1e-6, 2),
     }
 
 

@@ -20,7 +20,8 @@ from deal_hw.robot import Robot
 HOLDS_LAST_COMMAND = (
     "note: {robot} holds its last command for ever. deal-hw damps it when a run ends, when one of its two "
     "processes dies, and when a lost link comes back. Where both are killed (out of memory, kill -9, power) "
-    "or the link stays away, only the robot's own remote or power switch can: keep it in your hand"
+    "or the link stays away, only a bridge on the robot's side (deal-hw bridge), its own remote or its power "
+    "switch can: keep the remote in your hand"
 )
 
 

@@ -126,7 +126,7 @@ class Go2Robot(Robot):
         self._frame: LowStateFrame | None = None
         self._armed = self._homed = self._in_charge = False
         self._passive_ns: int | None = None
-        self._armed_ns = 0
+        self._armed_ns, self._bridged = 0, False
         self._fault = self._operator_stop = ""
 
     def connect(self) -> None:
@@ -309,6 +309,9 @@ class Go2Robot(Robot):
         if message.channel == topics.BRIDGE:
             self._take_bridge(message)
             return
+        if message.channel == topics.LOW_COMMAND and self._bridged and message.attachment:
+            # Another client's: the bridge judges it. What it passes on from the robot's side has none.
+            return
         self._takeover.take(message)
         if message.channel == topics.LOW_COMMAND and self._armed and not self._fault:
             self._fault = self._takeover.complaint()
@@ -322,6 +325,7 @@ class Go2Robot(Robot):
         status = read_status(message.payload)
         if status is None:
             return
+        self._bridged = True
         controlled = status["control"] == "controlled"
         ours = bool(self._sender.in_force or self._armed_ns)
         if controlled and self._in_charge and not ours:

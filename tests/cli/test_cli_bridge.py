@@ -37,6 +37,7 @@ print(json.dumps({"code": code, "loaded": sorted({name.partition(".")[0] for nam
         ("go2 --port lo --observers wall", "--observers would have no effect"),
         ("go2 --port nosuch0", "there is no network interface 'nosuch0'"),
         ("go2 --port lo --command-age-s 9", "command_age_s is 9.0; allowed: 0.01 to 0.5"),
+        ("go2 --port lo --command-age-s 0.02 --rate-hz 50", "looked for less than 5 times within it"),
         ("go2 --port lo --listen lo", "write protocol/host:port"),
     ],
 )

@@ -80,8 +80,17 @@ def test_the_driver_works_through_it(rig: BridgeRig) -> None:
                 robot.read_state(1.0)
                 with contextlib.suppress(TransportTimeoutError):
                     other.home(0.005)
+        with BridgeClient(rig.port, rig.options("controller")) as rude:
+            rude.hear(lambda: rude.frame is not None)
+            refused = rude.status.get("refused", {}).get("holder", 0)
+            robot.send_command(stay)
+            while rude.status.get("refused", {}).get("holder", 0) <= refused + 5:
+                robot.send_command(stay)
+                robot.read_state(1.0)
+                rude.repeat(rude.damping(), lambda: True)
+                rude.listen()
+        assert robot.fault == "", "another client's commands are the bridge's to refuse"
         robot.passive()
-        assert robot.fault == ""
 
 
 def test_an_observer_reads_and_cannot_command(rig: BridgeRig, controller: BridgeClient) -> None:
@@ -175,6 +184,19 @@ def test_others_are_refused_and_told_why(
     """An expired certificate, and none."""
     monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.5)
     with pytest.raises(kind, match=words), BridgeClient(rig.port, rig.options(name)):
+        pass
+
+
+def test_the_robots_side_refuses_an_expired_certificate_itself(
+    rig: BridgeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client that does not look at its own, such as another program: the peer's verdict is put in words."""
+    monkeypatch.setattr(zenoh_session, "OPEN_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(zenoh_session, "own_certificate_trouble", lambda options: (0, ""))
+    with (
+        pytest.raises(PortNotFoundError, match="it finds our certificate expired"),
+        BridgeClient(rig.port, rig.options("expired")),
+    ):
         pass
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.control.passive import make_passive
+from deal_hw.drivers.go2.bridge.status import encode_status
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.fake import RESTING, STIFF, FakeBench, FakeGo2
 from deal_hw.drivers.go2.messages import topics
@@ -438,6 +439,38 @@ def test_make_passive_reports_what_the_robot_shows() -> None:
     drained(robot, 5)
     wire.device.hears = False
     assert not make_passive(robot, wire.clock)
+
+
+def status(control: str, reason: str = "no command that may pass") -> bytes:
+    """Return what a bridge says."""
+    return encode_status({"control": control, "reason": reason})
+
+
+def test_a_bridge_that_took_the_robot_is_a_fault_with_its_reason() -> None:
+    """What it said before the arming, or just after it, is from before; its own hand-over is none."""
+    wire = FakeBench(mode="")
+    robot = wire.armed()
+    wire.topics.say(topics.BRIDGE, status("damping"), 0.05)
+    wire.topics.say(topics.BRIDGE, status("controlled"), 0.15)
+    wire.topics.say(topics.BRIDGE, b"rubbish", 0.16)
+    drained(robot, 200)
+    assert robot.fault == ""
+    wire.topics.say(topics.BRIDGE, status("damping"), 0.05)
+    drained(robot, 100)
+    assert robot.fault == "go2: the bridge took the robot from this run: no command that may pass"
+
+
+def test_a_robot_that_another_controls_through_the_bridge_is_not_taken_over() -> None:
+    """It is said before sport mode is asked for anything; one that only listens does not mind."""
+    wire = FakeBench()
+    wire.robot.connect()
+    wire.topics.say(topics.BRIDGE, status("controlled"), 0.001)
+    drained(wire.robot, 10)
+    wire.topics.say(topics.BRIDGE, status("controlled"), 0.0)
+    with pytest.raises(SafetyError, match="another controller commands the robot through the bridge"):
+        wire.robot.home(10.0)
+    assert wire.device.mode == "normal"
+    assert wire.device.heard == []
 
 
 def test_another_process_can_make_it_passive() -> None:

@@ -74,8 +74,7 @@ class Admission:
     def __init__(self, config: BridgeConfig, limits: CommandLimits, session: int) -> None:
         self._config, self._limits, self._session = config, limits, session
         self._age_ns = round(config.command_age_s * 1e9)
-        # The last look before the limit: the robot is to be damped within it, not after it.
-        self._silence_ns = self._age_ns - round(1e9 / config.rate_hz)
+        self._silence_ns = self._age_ns - round(config.margin_s * 1e9)
         self._release_ns = round(config.release_s * 1e9)
         self.control, self.reason = Control.IDLE, "nobody has taken the robot over yet"
         self.admitted = 0

@@ -201,10 +201,14 @@ class Go2Bridge:
     def _pass_states(self) -> None:
         try:
             while not self._end.is_set():
-                with contextlib.suppress(TransportTimeoutError):
-                    self._send(self._network, self._heard(self._robot.receive(_RECEIVE_S)))
+                self.pass_one(_RECEIVE_S)
         except BaseException as error:
             self._failure = error
+
+    def pass_one(self, timeout_s: float) -> None:
+        """Pass one message of the robot's side on, waiting for it at most so long [s]."""
+        with contextlib.suppress(TransportTimeoutError):
+            self._send(self._network, self._heard(self._robot.receive(timeout_s)))
 
     def _heard(self, message: Message) -> Message:
         """Take note of a message of the robot's side; return it as clients get it."""
@@ -230,6 +234,8 @@ class Go2Bridge:
         self._services = Services(self._to_robot, self._pump, self._clock)
         switcher = MotionSwitcher(self._services, self._clock)
         try:
+            # A request that goes out before discovery has ended is lost, and repeated half a second later.
+            self._listen(_ASK_S, lambda: self._frame is not None)
             mode = switcher.active(_ASK_S)
         except DealHwError as error:
             self._tell(f"who moves the robot is not known, so it is not damped yet: {error}")
@@ -239,15 +245,18 @@ class Go2Bridge:
         if mode:
             self._tell(f"idle: the robot's own controller {mode!r} has it")
             return
-        until_ns = self._clock.now_ns() + round(self._config.listen_s * 1e9)
-        while not self._foreign and (left_ns := until_ns - self._clock.now_ns()) > 0:
-            with contextlib.suppress(TransportTimeoutError):
-                self._pump(left_ns * 1e-9)
+        self._listen(self._config.listen_s, lambda: self._foreign > 0)
         if self._foreign:
             self._tell("idle: another program on the robot's side commands the motors")
             return
         self.admission.take_charge("the bridge started, and the robot's own controller is released")
         self._damp()
+
+    def _listen(self, timeout_s: float, until: Callable[[], bool]) -> None:
+        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while not until() and (left_ns := until_ns - self._clock.now_ns()) > 0:
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump(left_ns * 1e-9)
 
     def _pump(self, timeout_s: float) -> None:
         self._heard(self._robot.receive(timeout_s))

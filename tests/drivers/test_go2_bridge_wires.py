@@ -1,0 +1,249 @@
+"""What the bridge passes, and what it does at its start and end: a fake Go2 in virtual time on one side."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection
+
+import numpy as np
+import pytest
+
+from deal_hw.clock import VirtualClock
+from deal_hw.drivers.go2.bridge.admission import Control
+from deal_hw.drivers.go2.bridge.bridge import Go2Bridge
+from deal_hw.drivers.go2.bridge.config import BridgeConfig
+from deal_hw.drivers.go2.bridge.status import read_status
+from deal_hw.drivers.go2.fake import STIFF, FakeGo2, FakeTopics
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
+from deal_hw.drivers.go2.messages.rpc import Request, encode_request
+from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
+from deal_hw.drivers.transports.zenoh_stamps import Echo, read_stamp
+from deal_hw.errors import TransportError, TransportLostError, TransportTimeoutError
+from deal_hw.transport import Message, TopicTransport
+
+ZERO = np.zeros(12)
+DAMPING = LowCommandEncoder().encode(LowCommand(ZERO, ZERO, ZERO, np.full(12, 5.0), ZERO))
+
+
+class Network(TopicTransport):
+    """The clients' side: what they say is a list, and so is what they hear."""
+
+    port = "network"
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self._clock = clock
+        self.arriving: deque[Message] = deque()
+        self.sent: list[Message] = []
+        self.is_open = self.broken = False
+
+    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
+        self.published = set(publish)
+
+    def open(self) -> None:
+        if self.broken:
+            raise TransportError("in use")
+        self.is_open = True
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def send(self, message: Message) -> None:
+        assert message.channel in self.published
+        if self.broken:
+            raise TransportLostError("cut")
+        self.sent.append(message)
+
+    def receive(self, timeout_s: float) -> Message:
+        if self.arriving:
+            return self.arriving.popleft()
+        self._clock.advance_ns(round(timeout_s * 1e9))
+        raise TransportTimeoutError("nothing")
+
+    def writers(self, topic: str) -> tuple[str, ...]:
+        return ()
+
+
+class Bench:
+    """A bridge between a fake Go2 and the network; the test is its second thread."""
+
+    def __init__(self, mode: str = "") -> None:
+        self.clock = VirtualClock(1_000_000_000)
+        self.go2 = FakeGo2(mode)
+        self.wire = FakeTopics(self.go2, self.clock)
+        self.network = Network(self.clock)
+        self.told: list[str] = []
+        self.bridge = Go2Bridge(
+            self.wire, self.network, self.clock, BridgeConfig(leave_s=0.02), tell=self.told.append
+        )
+
+    def run(self, milliseconds: int) -> None:
+        """Let the bridge look every 2 ms and pass on what the robot said."""
+        for _ in range(milliseconds // 2):
+            self.bridge.step()
+            self.bridge.pass_one(0.0)
+
+    def heard(self, topic: str) -> list[Message]:
+        """Return what clients heard of a topic."""
+        return [message for message in self.network.sent if message.channel == topic]
+
+    def say(self, topic: str, payload: bytes, sequence: int) -> None:
+        """Send as a client does that has heard the newest state."""
+        stamp = read_stamp(self.heard(topics.LOW_STATE)[-1].attachment)
+        assert stamp is not None
+        self.network.arriving.append(Message(topic, payload, 0, Echo(7, sequence, stamp).encode()))
+
+
+@pytest.fixture
+def make_bench(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Bench]:
+    """Return what makes a bench, from the active mode of the robot."""
+    monkeypatch.setattr(Go2Bridge, "_pass_states", lambda self: None)
+    return Bench
+
+
+def kinds(go2: FakeGo2) -> list[bool]:
+    """Return whether each command that the robot was told is stiff."""
+    return [bool(command.stiffness.any()) for _, command in go2.heard]
+
+
+def test_it_leaves_a_robot_alone_that_sport_mode_has(make_bench: Callable[[str], Bench]) -> None:
+    """From its start to its end no motor command goes out; what sport mode commands is passed on."""
+    bench = make_bench("normal")
+    bench.bridge.open()
+    assert bench.told == ["idle: the robot's own controller 'normal' has it"]
+    bench.run(500)
+    bench.bridge.close()
+    assert bench.go2.heard == []
+    assert bench.heard(topics.LOW_COMMAND)
+
+
+def test_it_damps_a_robot_that_nobody_has_before_it_listens(make_bench: Callable[[str], Bench]) -> None:
+    """Also where the network cannot be opened: the robot may hold anything."""
+    bench = make_bench("")
+    bench.network.broken = True
+    with pytest.raises(TransportError, match="in use"):
+        bench.bridge.open()
+    assert kinds(bench.go2) == [False]
+    assert bench.bridge.admission.control is Control.DAMPING
+
+
+def test_it_yields_at_its_start_to_another_program(make_bench: Callable[[str], Bench]) -> None:
+    """Sport mode is off, and somebody on the robot's side commands the motors."""
+    bench = make_bench("")
+    bench.wire.say(topics.LOW_COMMAND, STIFF, after_s=0.05)
+    bench.bridge.open()
+    assert bench.told == ["idle: another program on the robot's side commands the motors"]
+    assert kinds(bench.go2) == [True], "the other program's command alone"
+
+
+def test_it_yields_later_too_and_says_so(make_bench: Callable[[str], Bench]) -> None:
+    """Damping stops at the next look."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    bench.wire.say(topics.LOW_COMMAND, STIFF)
+    bench.run(20)
+    count = len(bench.go2.heard)
+    bench.run(100)
+    assert len(bench.go2.heard) == count
+    assert bench.told[-1] == "idle: another program on the robot's side commands the motors"
+
+
+def test_a_robot_that_does_not_answer_is_not_damped(make_bench: Callable[[str], Bench]) -> None:
+    """Sport mode may hold it, and then damping would throw it down; the operator is told."""
+    bench = make_bench("")
+    bench.go2.deaf.add("motion_switcher")
+    bench.bridge.open()
+    assert bench.go2.heard == []
+    assert "is not known, so it is not damped yet" in bench.told[0]
+
+
+def test_clients_hear_states_with_stamps_and_who_has_the_robot(make_bench: Callable[[str], Bench]) -> None:
+    """Five times a second, and at once when it changes."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(1000)
+    states = bench.heard(topics.LOW_STATE)
+    stamps = [read_stamp(message.attachment) for message in states]
+    assert [stamp.time_ns for stamp in stamps if stamp] == [message.stamp_ns for message in states]
+    assert len({stamp.session for stamp in stamps if stamp}) == 1
+    told = [read_status(message.payload) for message in bench.heard(topics.BRIDGE)]
+    assert 5 <= len(told) <= 7
+    before = len(told)
+    bench.say(topics.LOW_COMMAND, DAMPING, 0)
+    bench.run(4)
+    status = read_status(bench.heard(topics.BRIDGE)[before].payload)
+    assert status == {"control": "controlled", "reason": "a controller took the robot over"}
+
+
+def test_only_the_joints_numbers_pass(make_bench: Callable[[str], Bench]) -> None:
+    """A switched-off battery in the command stays here: the message is made anew."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    received: list[bytes] = []
+    receive = bench.go2.receive
+    bench.go2.receive = lambda topic, payload, stamp_ns=0: (  # type: ignore[method-assign]
+        received.append(payload) if topic == topics.LOW_COMMAND else None,
+        receive(topic, payload, stamp_ns),
+    )[1]
+    evil = bytearray(DAMPING)
+    evil[744] = evil[788] = 1
+    evil[808:] = words_crc(low_command_image(bytes(evil))).to_bytes(4, "little")
+    bench.say(topics.LOW_COMMAND, bytes(evil), 0)
+    bench.run(10)
+    assert bench.bridge.admission.admitted == 1
+    assert received
+    assert set(received) == {DAMPING}
+
+
+def test_requests_and_claims_pass_and_rubbish_does_not(make_bench: Callable[[str], Bench]) -> None:
+    """A claim is heard on both sides; other text on its topic is dropped."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    asked = len(bench.go2.requests)
+    bench.say(topics.request("sport"), encode_request(Request(5, 1005)), 0)
+    claim = encode_request(Request(0, 0, '{"id": "a", "who": "b", "state": "asking"}', no_reply=True))
+    bench.say(topics.CLAIM, claim, 1)
+    bench.say(topics.CLAIM, encode_request(Request(0, 0, "[]")), 2)
+    bench.wire.say(topics.CLAIM, claim)
+    bench.run(20)
+    assert [request.identity for _, request in bench.go2.requests[asked:]] == [5]
+    assert [message.payload for message in bench.heard(topics.response("sport"))] != []
+    assert bench.bridge.counts[topics.CLAIM] == 2
+
+
+def test_a_network_that_takes_nothing_is_counted(make_bench: Callable[[str], Bench]) -> None:
+    """The robot's side goes on."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.network.broken = True
+    bench.run(20)
+    assert bench.bridge.unsent > 5
+    assert len(bench.go2.heard) >= 10
+
+
+def test_it_damps_when_it_ends_and_when_its_thread_fails(make_bench: Callable[[str], Bench]) -> None:
+    """A controller's last command is not the robot's last one."""
+    bench = make_bench("")
+    bench.bridge.open()
+    bench.run(20)
+    bench.say(topics.LOW_COMMAND, DAMPING, 0)
+    bench.run(4)
+    bench.bridge._failure = TransportLostError("the cable is out")
+    with pytest.raises(TransportLostError):
+        bench.bridge.step()
+    count = len(bench.go2.heard)
+    bench.bridge.close()
+    assert len(bench.go2.heard) >= count + 10
+    assert not bench.network.is_open
+    last = read_status(bench.heard(topics.BRIDGE)[-1].payload)
+    assert last == {"control": "damping", "reason": "the bridge ends"}
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"control": 1, "reason": "x"}', "rubbish"])
+def test_what_is_no_status_is_passed_over(text: str) -> None:
+    """Whatever stands on the topic."""
+    assert read_status(encode_request(Request(0, 0, text))) is None
+    assert read_status(text.encode()) is None
