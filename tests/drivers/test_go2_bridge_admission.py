@@ -143,7 +143,9 @@ def test_a_controller_that_went_passive_keeps_the_robot_for_a_while(bench: Bench
     assert bench.judge.control is Control.CONTROLLED
     assert bench.send(HOLD) is not None
     assert bench.send(DAMPING) is not None
-    bench.wait(1002)
+    bench.wait(1000)
+    assert bench.judge.control is Control.CONTROLLED
+    bench.wait(2)
     assert bench.judge.control is Control.DAMPING
     assert bench.judge.reason == "the controller went passive and left"
     bench.walk(stream=2)
