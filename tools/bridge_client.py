@@ -129,9 +129,15 @@ class BridgeClient:
     def take_over(self) -> None:
         """Take the robot over by damping, and go on holding the pose that it is in."""
         self.hear(lambda: self.frame is not None and bool(self.status))
+        self._begin()
+        while not self.in_charge:
+            # A busy machine may hold this process up for longer than the bridge waits: then it begins again.
+            self._begin()
+
+    def _begin(self) -> None:
         self.repeat(self.damping(), lambda: self.in_charge)
         admitted = self.status["admitted"]
-        self.repeat(self.pose(), lambda: self.in_charge and self.status["admitted"] > admitted + 50)
+        self.repeat(self.pose(), lambda: not self.in_charge or self.status["admitted"] > admitted + 50)
 
     def repeat(self, payload: bytes, until: Callable[[], bool]) -> None:
         """Send a command every 2 ms from now on, b"" for none; return once something is so.

@@ -29,6 +29,7 @@ from deal_hw.transport import WireOptions
 
 ROBOTS = ("go2",)
 LOOPBACK_PORT = 7447
+SWITCH_S = 0.0005
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +109,8 @@ def bridge(config: Bridge) -> int:
                 DdsTransport(config.port, clock, options), _network(config, port), clock, config.rules,
                 state_check=config.state_check, tell=_tell,
             )  # fmt: skip
+            # Two threads share the interpreter; neither may keep the other waiting for the usual 5 ms.
+            sys.setswitchinterval(SWITCH_S)
             # The transports' threads inherit the priority that holds when they are opened.
             for warning in become_realtime().warnings:
                 print(f"warning: {warning}", file=sys.stderr)

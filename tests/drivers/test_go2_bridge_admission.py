@@ -44,7 +44,7 @@ class Bench:
     """A judge, and controllers that write to it; each message is heard 5 ms after the state it answers."""
 
     def __init__(self, frame: LowStateFrame, **settings: float) -> None:
-        config = BridgeConfig(**settings)
+        config = BridgeConfig(**{"margin_s": 0.006, **settings})
         self.judge = Admission(config, CommandLimits(DESCRIPTION, config.effort_margin), SESSION)
         self.frame, self.now_ns = frame, 10_000 * MS
         self.sequence: dict[int, int] = {}

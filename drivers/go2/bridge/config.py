@@ -17,9 +17,9 @@ class BridgeConfig:
     command_age_s: float = LEG_LIMITS.command_age_s
     """A command is refused where the state that its sender acted on is older than this, and the robot is
     damped after so long without an admitted command [s]. Both ways over the network are part of the age."""
-    margin_s: float = 0.006
+    margin_s: float = 0.008
     """Silence counts so long before the limit, so that the robot is damped within it: looks are 2 ms apart
-    and may be late, and the way takes time [s]. With 4 ms, 1 of 20 cut links was damped 0.2 ms after it."""
+    and may be late, and the way takes time [s]. With 6 ms, 1 of 100 cut links was damped 1.2 ms after it."""
     effort_margin: float = 2.0
     """Largest torque that a command may ask for now, kp (q* - q) + kd (dq* - dq) + tau, in multiples of what
     the driver's own filter allows at 50 Hz (23.5 N·m): joints move on between two of its cycles."""
