@@ -161,6 +161,23 @@ def test_a_second_controller_is_refused_and_the_first_goes_on(bench: Bench) -> N
     assert bench.judge.refused == {"holder": 3}
 
 
+def test_why_commands_stayed_away_is_said(bench: Bench) -> None:
+    """The refusals of the stream that had the robot, and not what another one was told."""
+    bench.walk()
+    for _ in range(30):
+        bench.send(HOLD, stream=2)
+        bench.judge.tick(bench.now_ns)
+    assert bench.judge.reason.endswith("the limit is 50 ms")
+    bench.walk()
+    for _ in range(30):
+        bench.send(HOLD, age_ms=80)
+        bench.judge.tick(bench.now_ns)
+    assert (
+        "the limit is 50 ms; the last refusal: its sender's newest state was 80.0 ms old"
+        in bench.judge.reason
+    )
+
+
 def test_after_silence_another_one_may_take_over(bench: Bench) -> None:
     """The supervisor of a run whose control process died is such a one."""
     bench.walk()

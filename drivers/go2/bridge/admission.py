@@ -79,7 +79,7 @@ class Admission:
         self.control, self.reason = Control.IDLE, "nobody has taken the robot over yet"
         self.admitted = 0
         self.refused: Counter[str] = Counter()
-        self.last_refusal = self._refusal = ""
+        self.last_refusal = self._refusal = ""  # Of all; since the last command that passed.
         self._holder: int | None = None
         self._stiff = False
         self._last_ns = 0
@@ -165,7 +165,10 @@ class Admission:
 
     def _count(self, refusal: RefusedMessageError) -> None:
         self.refused[refusal.kind] += 1
-        self.last_refusal = self._refusal = str(refusal)
+        self.last_refusal = str(refusal)
+        if refusal.kind != "holder":
+            # What another controller was told is no reason for the silence of this one.
+            self._refusal = self.last_refusal
 
     def _link(self, message: Message, now_ns: int) -> Echo:
         """Return the sender's stream and number, where the message is new and young."""
