@@ -6,8 +6,9 @@ monotonic clock is the same.
 ``latency``: a controller and a robot that only measure, 500 commands and states a second, over TLS; through
 the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge stand in a
 network namespace, and its interface goes down in a command stream; time from there to the first damping at
-the robot, beside a stall monitor. ``restart``: the bridge is killed with SIGKILL in a command stream and
-started again. ``refuse``: replayed commands and a second controller beside one that commands.
+the robot, beside a stall monitor of the bridge's priority. ``restart``: the bridge is killed with SIGKILL in
+a command stream and started again. ``refuse``: replayed commands and a second controller beside one that
+commands.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.cli.emulator_process import VerbProcess
 from deal_hw.cli.options import Checked, Range
 from deal_hw.clock import MonotonicClock
+from deal_hw.control.realtime import FIFO_PRIORITY
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.errors import DealHwError, TransportError
 from deal_hw.transport import WireOptions
@@ -177,7 +179,7 @@ def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
     name = f"go2-{os.getpid()}"
     times: list[tuple[int, int]] = []
     with (
-        watch_stalls(_PAUSE_NS) as seen,
+        watch_stalls(_PAUSE_NS, priority=FIFO_PRIORITY) as seen,
         _namespace(name) as (prefix, switch),
         BridgeRig(folder, config.domain, address=HOSTS[1], prefix=prefix) as rig,
     ):
@@ -190,11 +192,17 @@ def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
                 rig.await_commands([*told, "damping"])
                 times.append((cut_ns, rig.told()[-1][0]))
                 switch(True)
+        _, said = rig.bridge.stop()
+    delays = sorted((damped - cut) * 1e-6 for cut, damped in times)
     return {
         "how": "interface of a network namespace set down (SIOCSIFFLAGS)",
         "limit_ms": 1e3 * BridgeConfig().command_age_s,
-        **_spread([(damped - cut) * 1e-6 for cut, damped in times]),
-        "longest_while_the_machine_ran_ms": round(max(seen.awake_ns(*each) for each in times) * 1e-6, 2),
+        **_spread(delays),
+        "longest_five_ms": [round(delay, 2) for delay in delays[-5:]],
+        "longest_without_the_machines_pauses_ms": round(
+            max(seen.awake_ns(*each) for each in times) * 1e-6, 2
+        ),
+        "bridge_said": said.splitlines()[-1][:300],
     }
 
 

@@ -72,12 +72,15 @@ class Account:
 
 
 @contextlib.contextmanager
-def watch_stalls(least_ns: int, processors: Sequence[int] | None = None) -> Iterator[Account]:
+def watch_stalls(
+    least_ns: int, processors: Sequence[int] | None = None, priority: int = TOP_PRIORITY
+) -> Iterator[Account]:
     """Watch processors while the block runs.
 
     Args:
         least_ns: Shorter pauses are not noted [ns].
         processors: Which; by default all that this process may use.
+        priority: Of the monitor; that of the watched program counts what other real-time programs take, too.
 
     Raises:
         ConfigurationError: SCHED_FIFO was refused.
@@ -88,6 +91,7 @@ def watch_stalls(least_ns: int, processors: Sequence[int] | None = None) -> Iter
         running = []
         for number in numbers:
             command = [sys.executable, __file__, f"--watch={number}", f"--least-ms={least_ns * 1e-6}"]
+            command.append(f"--priority={priority}")
             process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             stack.callback(process.kill)
             if process.stdout is None or process.stdout.readline() != "ready\n":
@@ -104,12 +108,12 @@ def watch_stalls(least_ns: int, processors: Sequence[int] | None = None) -> Iter
             ]
 
 
-def watch(number: int, least_ns: int) -> None:
+def watch(number: int, least_ns: int, priority: int) -> None:
     """Print each pause of a processor, for ever: number, when the monitor was due and when it woke [ns]."""
     os.sched_setaffinity(0, {number})
     become_realtime()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(TOP_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
         sys.exit(str(error))
     print("ready", flush=True)
@@ -130,11 +134,12 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0, help="how long to watch [s]")
     parser.add_argument("--least-ms", type=float, default=1.0, help="shorter pauses are not noted [ms]")
     parser.add_argument("--watch", type=int, help="be the monitor of this processor, until killed")
+    parser.add_argument("--priority", type=int, default=TOP_PRIORITY, help="of the monitor, 1 to 99")
     given = parser.parse_args()
     if given.watch is not None:
-        watch(given.watch, round(given.least_ms * 1e6))
+        watch(given.watch, round(given.least_ms * 1e6), given.priority)
     try:
-        with watch_stalls(round(given.least_ms * 1e6)) as seen:
+        with watch_stalls(round(given.least_ms * 1e6), priority=given.priority) as seen:
             time.sleep(given.seconds)
     except ConfigurationError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -156,6 +156,6 @@ def summary(made: Go2Bridge) -> list[str]:
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(judge.refused.items()))
     return [
         f"bridge: {made.counts['rt/lowstate']} states and {judge.admitted} commands passed, {made.unsent} "
-        f"messages not sent; refused: {kinds or 'none'}"
-        + (f" (the last: {judge.last_refusal})" if kinds else "")
+        f"messages not sent; the latest look for silence {made.latest_ns / 1e6:.1f} ms late; "
+        f"refused: {kinds or 'none'}" + (f" (the last: {judge.last_refusal})" if kinds else "")
     ]

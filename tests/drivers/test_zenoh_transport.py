@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deal_hw.clock import MonotonicClock
+from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.transports import zenoh_session
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import (
@@ -146,6 +146,27 @@ def test_a_lost_link_is_opened_again_as_soon_as_the_end_point_answers(endpoint: 
         far.open()
         near.reopen()
         meet(make_pair(near, far))
+
+
+def test_a_link_that_is_silent_is_made_anew_when_asked(endpoint: str) -> None:
+    """Zenoh tells nothing of some dead links; one that was heard a moment ago is left alone."""
+    clock = VirtualClock(1)
+    far = ZenohTransport(endpoint, MonotonicClock(), LISTEN)
+    near = ZenohTransport(endpoint, clock)
+    with opened(far, STATE, COMMAND), opened(near, COMMAND, STATE):
+        first = near.stream
+        clock.advance_ns(1_900_000_000)
+        near.reopen()
+        assert near.stream == first
+        clock.advance_ns(200_000_000)
+        near.reopen()
+        second = near.stream
+        assert second != first
+        clock.advance_ns(1_900_000_000)
+        send_until_heard(far, near)
+        clock.advance_ns(200_000_000)
+        near.reopen()
+        assert near.stream == second
 
 
 def test_a_reader_that_stays_away_finds_the_newest(endpoint: str) -> None:

@@ -50,6 +50,7 @@ class Go2Bridge:
         admission: The judge; only the thread that steps changes it.
         counts: Messages that passed, by topic.
         unsent: Messages that a transport did not take.
+        latest_ns: How late the latest look for silence was [ns].
 
     Args:
         robot: Topics of the robot (DDS); not open.
@@ -78,14 +79,14 @@ class Go2Bridge:
             self._config, CommandLimits(DESCRIPTION, self._config.effort_margin), self._session
         )
         self.counts: Counter[str] = Counter()
-        self.unsent = 0
+        self.unsent = self.latest_ns = 0
         self._encoder = LowCommandEncoder()
         self._damping = np.array(DESCRIPTION.passive_damping)
         self._frame: LowStateFrame | None = None
         self._services: Services | None = None
         self._foreign = 0
         self._told = self.admission.control
-        self._status_ns = self._due_ns = clock.now_ns()
+        self._status_ns = self._due_ns = 0
         self._end = threading.Event()
         self._failure: BaseException | None = None
         self._thread: threading.Thread | None = None
@@ -105,6 +106,7 @@ class Go2Bridge:
         except BaseException:
             self._robot.close()
             raise
+        self._status_ns = self._due_ns = self._clock.now_ns()
         self._thread = threading.Thread(target=self._pass_states, name="bridge states", daemon=True)
         self._thread.start()
 
@@ -140,6 +142,7 @@ class Go2Bridge:
             for _ in range(_MOST_MESSAGES):
                 self._take(self._network.receive(0.0))
         now_ns = self._clock.now_ns()
+        self.latest_ns = max(self.latest_ns, now_ns - self._due_ns)
         self._tick(now_ns)
         self._due_ns = max(self._due_ns + self._period_ns, now_ns)
 
