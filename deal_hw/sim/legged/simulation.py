@@ -119,11 +119,28 @@ class LeggedSimulation:
             self._model.dof_frictionloss[self._v] = frictionloss
         if armature is not None:
             self._model.dof_armature[self._v] = armature
-            # Constraint regularisation depends on inverse weights that only mj_setConst derives; it
-            # overwrites qpos.
-            before = np.array(self._data.qpos)
-            mujoco.mj_setConst(self._model, self._data)
-            self._data.qpos[:] = before
+            self._derive()
+
+    def add_payload(self, mass_kg: float) -> None:
+        """Make the base heavier; its inertia grows along, as for the same shape and more density."""
+        mass = self._model.body_mass[self._body]
+        self._model.body_inertia[self._body] *= 1.0 + mass_kg / mass
+        self._model.body_mass[self._body] = mass + mass_kg
+        self._derive()
+
+    def set_floor_friction(self, friction: float, floor: str = "floor") -> None:
+        """Set the sliding friction of the geom that is the floor; a model may have none."""
+        index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_GEOM, floor)
+        if index >= 0:
+            self._model.geom_friction[index, 0] = friction
+
+    def _derive(self) -> None:
+        """Derive what depends on masses and armatures; positions stay."""
+        # Constraint regularisation depends on inverse weights that only mj_setConst derives; it overwrites
+        # qpos.
+        before = np.array(self._data.qpos)
+        mujoco.mj_setConst(self._model, self._data)
+        self._data.qpos[:] = before
 
     def set_frictionloss(self, frictionloss: FloatArray) -> None:
         """Set the joints' friction, (J,) [N·m]; cheap enough for every step."""

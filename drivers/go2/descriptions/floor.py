@@ -128,5 +128,29 @@ def paper_space() -> ParameterSpace:
     return parameter_space(PAPER_STIFFNESS_NM_RAD, PAPER_DAMPING_NMS_RAD)
 
 
-SPACES: Final = {"default": parameter_space, "paper": paper_space}
+FRICTIONLOSS_NM: Final = 0.2
+TRUNK_KG: Final = 6.921
+FLOOR_FRICTION: Final = 0.8
+
+
+def walk_space() -> ParameterSpace:
+    """Return what a walk tells of: the 24 gains, the trunk and its load, friction of joints and floor.
+
+    The joints' dry friction is one number for the hips, the thighs and the calves each.
+    """
+    more = [
+        Parameter.around("base.mass", "body_mass", ("base",), "kg", TRUNK_KG, ratio=1.5),
+        Parameter.around("floor.friction", "geom_friction", ("floor",), "-", FLOOR_FRICTION, ratio=2.0),
+        *(
+            Parameter.around(
+                f"{part}s.frictionloss", "dof_frictionloss", tuple(f"{leg}_{part}_joint" for leg in LEGS),
+                "N·m", FRICTIONLOSS_NM,
+            )
+            for part in PARTS
+        ),
+    ]  # fmt: skip
+    return ParameterSpace([*parameter_space().parameters, *more])
+
+
+SPACES: Final = {"default": parameter_space, "walk": walk_space, "paper": paper_space}
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

@@ -96,6 +96,8 @@ class Go2Device:
         self._sim.set_dofs(
             damping=self._joint_damping, frictionloss=self._friction, armature=np.array(truth.armature)
         )
+        self._sim.add_payload(truth.payload_kg)
+        self._sim.set_floor_friction(truth.floor_friction)
         self._bias = np.array(truth.encoder_bias)
         self._motors = Motors(truth, profile)
         self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng)
@@ -207,6 +209,7 @@ class Go2Device:
         return {
             **self._truth.to_json(),
             "parameters_at_kp20_kd1.5": self._truth.parameters(20.0, 1.5),
+            "walk_parameters": self._truth.walk_parameters(),
             "device_ms": self._tick,
             "sent": dict(self._sent),
             "wire_faults": dict(self._state_faults.counts),

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from deal_hw.drivers.go2.descriptions.floor import FLOOR_FRICTION
 from deal_hw.errors import UnknownNameError
 
 
@@ -25,6 +26,8 @@ class Profile:
         gyro_noise: Of angular velocities [rad/s].
         specific_force_noise: Of the accelerometer [m/s²].
         encoder_bias_rad: Hidden zero errors of the joints lie within plus and minus this [rad].
+        payload_kg: Lowest and highest hidden mass that is strapped to the trunk [kg].
+        floor_friction: Lowest and highest hidden sliding friction of the floor.
         latency_ms: Lowest and highest hidden time between a command's reception and its use [ms].
         jitter_ms: A command acts up to this much later, uniformly [ms].
         stribeck_ratio: Gear friction at standstill over friction in motion, less 1.
@@ -44,6 +47,8 @@ class Profile:
     gyro_noise: float = 0.0
     specific_force_noise: float = 0.0
     encoder_bias_rad: float = 0.0
+    payload_kg: tuple[float, float] = (0.0, 0.0)
+    floor_friction: tuple[float, float] = (FLOOR_FRICTION, FLOOR_FRICTION)
     latency_ms: tuple[int, int] = (0, 0)
     jitter_ms: int = 0
     stribeck_ratio: float = 0.0
@@ -70,6 +75,8 @@ PROFILES: Final = {
         latency_ms=(2, 10),
         jitter_ms=2,
         encoder_bias_rad=0.02,
+        payload_kg=(0.0, 2.0),
+        floor_friction=(0.5, 1.1),
         stribeck_ratio=0.4,
         knee=0.6,
         drop=0.002,

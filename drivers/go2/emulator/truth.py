@@ -9,13 +9,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.descriptions.floor import JOINTS
+from deal_hw.drivers.go2.descriptions.floor import (
+    DAMPING_NMS_RAD,
+    FLOOR_FRICTION,
+    FRICTIONLOSS_NM,
+    JOINTS,
+    PARTS,
+    STIFFNESS_NM_RAD,
+    TRUNK_KG,
+)
 from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, reading
 
 JOINT_DAMPING_NMS_RAD: Final = 0.6
-FRICTIONLOSS_NM: Final = 0.2
 ARMATURE_KGM2: Final = 0.01
 DEFAULT_XI: Final = 2.0
 """Hidden quantities lie within this ratio of the nominal ones, unless told otherwise."""
@@ -34,6 +41,8 @@ class Truth:
         frictionloss: Coulomb friction of the gears [N·m].
         armature: Inertia of the rotors at the joint [kg·m²].
         encoder_bias: Reported minus true position [rad]; a motor closes its loop on the reported one.
+        payload_kg: Mass that is strapped to the trunk [kg]; the trunk's inertia grows in proportion.
+        floor_friction: Sliding friction between feet and floor.
         latency_ms: A command acts that long after it was received, jitter aside [ms].
     """
 
@@ -45,6 +54,8 @@ class Truth:
     frictionloss: tuple[float, ...] = (FRICTIONLOSS_NM,) * 12
     armature: tuple[float, ...] = (ARMATURE_KGM2,) * 12
     encoder_bias: tuple[float, ...] = (0.0,) * 12
+    payload_kg: float = 0.0
+    floor_friction: float = FLOOR_FRICTION
     latency_ms: int = 0
 
     def __post_init__(self) -> None:
@@ -75,6 +86,26 @@ class Truth:
             for joint, value in zip(JOINTS, values, strict=True)
         }
 
+    def walk_parameters(self) -> dict[str, float]:
+        """Return the true values under the names in the parameter sets of the robot on the floor.
+
+        There a joint's damping is the motor's alone beside the model's own viscous friction; friction that
+        joints share is their mean.
+        """
+        gains = self.parameters(STIFFNESS_NM_RAD, DAMPING_NMS_RAD)
+        friction = np.array(self.frictionloss).reshape(-1, len(PARTS)).mean(axis=0)
+        return {
+            **{name: value for name, value in gains.items() if name.endswith(".stiffness")},
+            **{
+                name: value - JOINT_DAMPING_NMS_RAD
+                for name, value in gains.items()
+                if name.endswith(".damping")
+            },
+            "base.mass": TRUNK_KG + self.payload_kg,
+            "floor.friction": self.floor_friction,
+            **{f"{part}s.frictionloss": float(friction[i]) for i, part in enumerate(PARTS)},
+        }
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; joints by name."""
         values: dict[str, Any] = {"robot": "go2"}
@@ -99,6 +130,8 @@ class Truth:
                 profile=find_profile(values["profile"]).name,
                 seed=int(number(values["seed"], "seed", 0)),
                 latency_ms=int(number(values["latency_ms"], "latency_ms", 0, 1000)),
+                payload_kg=number(values["payload_kg"], "payload_kg", 0, 100),
+                floor_friction=number(values["floor_friction"], "floor_friction", 0, 10),
                 **arrays,
             )
 
@@ -146,4 +179,6 @@ def draw_truth(profile: str, seed: int, *, xi: float = DEFAULT_XI) -> Truth:
         armature=around(ARMATURE_KGM2),
         encoder_bias=tuple(float(v) for v in rng.uniform(-bias, bias, len(JOINTS))),
         latency_ms=int(rng.integers(low, high + 1)),
+        payload_kg=float(rng.uniform(*found.payload_kg)),
+        floor_friction=float(rng.uniform(*found.floor_friction)),
     )
