@@ -17,8 +17,10 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
 from deal_hw.transport import TopicTransport, Transport, WireOptions
+from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.control.velocity_error import Track
     from deal_hw.drivers.go2.claim import WireClaim
 
 ROBOTS: Final = {
@@ -42,6 +44,8 @@ SPACES: Final = {
     "so101": "deal_hw.drivers.so101.description:SPACES",
 }
 """Tables of parameter sets, name -> function; the first of each is the default."""
+ODOMETRY: Final = {"go2": "deal_hw.drivers.go2.odometry:walked"}
+"""Robots that tell where they walked: a function of a recording."""
 TRANSPORTS: Final = {
     "serial": "deal_hw.drivers.transports.serial_transport:SerialTransport",
     "dds": "deal_hw.drivers.transports.dds_transport:DdsTransport",
@@ -75,6 +79,7 @@ __all__ = [
     "CAN_BUSES",
     "DESCRIPTIONS",
     "MAKERS",
+    "ODOMETRY",
     "REACHED_BY",
     "ROBOTS",
     "SPACES",
@@ -91,6 +96,7 @@ __all__ = [
     "parameter_spaces",
     "recorded_description",
     "robot_description",
+    "walked",
     "wire_claim",
 ]
 
@@ -153,6 +159,14 @@ def claim_name(transport_name: str, port: str, options: WireOptions) -> str:
         prefix, colon, path = port.partition("?")[0].rpartition(":")
         port = prefix + colon + (os.path.realpath(path) if "/" in path else path)
     return f"{transport_name} on {port}"
+
+
+def walked(name: str, trajectory: Trajectory) -> Track | None:
+    """Return where a robot walked by its own sensors; None where it has none for that, or does not walk."""
+    if name not in ODOMETRY:
+        return None
+    found: Track | None = _find("odometry", ODOMETRY, name)(trajectory)
+    return found
 
 
 def wire_claim(

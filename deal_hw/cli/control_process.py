@@ -95,7 +95,8 @@ def _run(
     from deal_hw.control.loop import ControlLoop, LoopConfig
     from deal_hw.control.passive import PassiveConfig
     from deal_hw.control.safety import Safety
-    from deal_hw.control.velocity import KeyboardVelocity
+    from deal_hw.control.velocity import KeyboardVelocity, NotedVelocity
+    from deal_hw.control.velocity_error import VELOCITY_EVENT, velocity_data
     from deal_hw.drivers import adopt_robot, make_robot
 
     plan = RunPlan.from_json(orders)
@@ -109,7 +110,10 @@ def _run(
             plan.robot, plan.transport, orders["port_fd"], clock, port=plan.port, can_send=can_send
         )
     source = plan.velocity_source()
-    behaviour = make_behaviour(plan, robot.description, source)
+    noted = NotedVelocity(
+        source, lambda wanted: loop.note(VELOCITY_EVENT, "wanted velocity", **velocity_data(wanted))
+    )
+    behaviour = make_behaviour(plan, robot.description, noted)
     sink = RecordSender(socket.socket(fileno=orders["record_fd"])) if "record_fd" in orders else _discard
 
     main = threading.get_ident()

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import re
 import socket
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from deal_hw.cli.emulate_common import (
     happenings,
@@ -18,14 +23,18 @@ from deal_hw.cli.emulate_common import (
     run_until,
 )
 from deal_hw.cli.emulate_settings import DEFAULT_PORTS, Emulate
+from deal_hw.control.velocity_error import Track
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError, shown
+from deal_hw.reading import reading
 from deal_hw.transport import TopicTransport, WireOptions
 
 if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.truth import Truth
 
+TRACK_COLUMNS = ("time_s", "x", "y", "heading")
+TRACK_NS = 10_000_000
 _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
 
 
@@ -75,7 +84,10 @@ def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) ->
             print(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends", flush=True)
 
             log = device.log
-            with happenings(config.events_to, log.requests, log.changes) as tell:
+            with (
+                happenings(config.events_to, log.requests, log.changes) as tell,
+                tracking(config.go2.track_to, device, config.go2.tick_start_ms) as track,
+            ):
 
                 def step() -> bool:
                     if cut.is_set():
@@ -83,6 +95,7 @@ def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) ->
                         device.begin_fault("cut")
                     emulator.step()
                     tell()
+                    track()
                     return True
 
                 run_until(step, stop, config.duration_s, config.parent)
@@ -93,6 +106,48 @@ def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) ->
     for line in summary(report):
         print(line, file=sys.stderr)
     return 0
+
+
+@contextlib.contextmanager
+def tracking(path: Path | None, device: Go2Device, tick_start_ms: int) -> Iterator[Callable[[], None]]:
+    """Yield a function that appends to a file where the robot's base is, every so often.
+
+    Args:
+        path: The file; None for none.
+        device: The robot.
+        tick_start_ms: Its clock at device time 0 [ms].
+    """
+    if path is None:
+        yield lambda: None
+        return
+    due_ns = device.device_ns
+    with path.open("w", encoding="utf-8", buffering=1) as file:
+        file.write(",".join(TRACK_COLUMNS) + "\n")
+
+        def track() -> None:
+            nonlocal due_ns
+            if device.device_ns >= due_ns:
+                due_ns = device.device_ns + TRACK_NS
+                x, y, _ = device.base_position
+                time_s = device.device_ns * 1e-9 + tick_start_ms * 1e-3
+                file.write(f"{time_s:.3f},{x:.5f},{y:.5f},{device.heading:.5f}\n")
+
+        yield track
+
+
+def read_track(path: Path) -> Track:
+    """Return what :func:`tracking` wrote, on the robot's clock.
+
+    Raises:
+        ConfigurationError: The file holds something else.
+    """
+    with reading(path, "an emulated base's track", "--track-to writes one", error=ConfigurationError):
+        head, *lines = path.read_text(encoding="utf-8").splitlines()
+        if head != ",".join(TRACK_COLUMNS):
+            raise ConfigurationError(f"the first line is {shown(head)}, expected {','.join(TRACK_COLUMNS)}")
+        # The emulator may be writing the last one.
+        rows = np.array([[float(part) for part in line.split(",")] for line in lines[:-1]])
+        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
 
 
 def summary(report: dict[str, Any]) -> list[str]:

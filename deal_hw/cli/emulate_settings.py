@@ -42,6 +42,10 @@ class Go2Options:
     tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
     """The robot's clock at the start [ms]; it wraps at 2**32."""
 
+    track_to: Path | None = None
+    """Write to this CSV file where the base really is, 100 times a second: time_s (the robot's clock), x, y
+    [m], heading [rad]."""
+
     domain: Annotated[int, Range(0, 232)] = 0
     """DDS domain."""
 

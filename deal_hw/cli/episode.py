@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw import __version__
@@ -16,8 +17,11 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.handover import CONNECTING, HANDING_BACK, HOMING, LOADING, MAKING_PASSIVE, STARTING, Beat
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.supervisor import OPERATOR, Supervisor
+from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.recording.excitation import Excitation
+from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
+from deal_hw.drivers import ODOMETRY, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
 
@@ -102,10 +106,19 @@ class Episode:
                 moved = self._store.note_episode(self._path, facts).excitation
                 if moved is not None:
                     report = dataclasses.replace(report, motion=Excitation(**moved))
+                report = dataclasses.replace(report, walk=self._walk(self._path))
             except (DealHwError, OSError) as err:
                 # As on a full disk. The report matters more, and the next open takes the recording in.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
         return report
+
+    def _walk(self, path: Path) -> VelocityError | None:
+        """Return how well the robot followed what it was told, by its own sensors."""
+        if self._plan.robot not in ODOMETRY:
+            return None
+        trajectory = read_trajectory(path)
+        wanted, track = wanted_velocity(trajectory), walked(self._plan.robot, trajectory)
+        return None if wanted is None or track is None else velocity_error(track, wanted)
 
     def _make_passive(
         self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]

@@ -14,6 +14,7 @@ from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.control.cadence import CadenceReport
 from deal_hw.control.handover import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.control.loop import Outcome
+from deal_hw.control.velocity_error import VelocityError
 from deal_hw.data.recording.excitation import Excitation
 
 _EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
@@ -35,6 +36,8 @@ class EpisodeReport:
         warnings: What the operator should know.
         error: Name of the error's class where it failed.
         motion: How much the recording moves; None where nothing was recorded.
+        walk: How well a walking robot followed what it was told, by its own sensors; None where it did not
+            walk or nothing was recorded.
     """
 
     path: Path | None
@@ -48,6 +51,7 @@ class EpisodeReport:
     warnings: tuple[str, ...]
     error: str = ""
     motion: Excitation | None = None
+    walk: VelocityError | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -103,6 +107,11 @@ def print_report(report: EpisodeReport) -> None:
         print(f"  clipped by the safety filter: {limit} in {cycles} cycles")
     if report.path is not None:
         print(f"  recorded {report.states_recorded} states in {report.path}")
+    if report.walk is not None and report.walk.seconds:
+        print(
+            f"  velocity error, by leg odometry and IMU: {report.walk.velocity_m_s:.2f} m/s, "
+            f"{report.walk.yaw_rad_s:.2f} rad/s over {report.walk.seconds:.0f} s of walking"
+        )
     for warning in report.warnings:
         print(f"warning: {warning}", file=sys.stderr)
 

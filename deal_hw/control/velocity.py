@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -131,6 +131,27 @@ class KeyboardVelocity:
         """Return the ends of what the keys ask for, (2, 3)."""
         keys = np.array(list(KEYS.values()))
         return np.stack([keys.min(axis=0), keys.max(axis=0)])
+
+
+class NotedVelocity:
+    """A source whose changes are told.
+
+    Args:
+        source: It.
+        note: Called with each velocity that differs from the one before, (3,).
+    """
+
+    def __init__(self, source: VelocitySource, note: Callable[[FloatArray], None]) -> None:
+        self._source, self._note = source, note
+        self._last: FloatArray | None = None
+
+    def velocity(self, state: RobotState, time_s: float) -> FloatArray:
+        """Return the source's velocity."""
+        wanted = self._source.velocity(state, time_s)
+        if self._last is None or not np.array_equal(wanted, self._last):
+            self._last = wanted
+            self._note(wanted)
+        return wanted
 
 
 def limited_axes(source: BoundedSource, command_range: Sequence[tuple[float, float]]) -> list[str]:

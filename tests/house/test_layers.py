@@ -41,7 +41,7 @@ ROOMS = {
     "drivers.go2": (
         {"descriptions"},
         {"messages"},
-        {"emulator", "claim", "motion_switcher", "motions", "state_stream", "support"},
+        {"emulator", "claim", "motion_switcher", "motions", "odometry", "state_stream", "support"},
         {"bridge", "command_sender", "connect", "doctor", "takeover"},
         {"robot"},
         {"fake"},

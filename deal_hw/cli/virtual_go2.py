@@ -1,0 +1,124 @@
+"""The emulated Go2 in virtual time: same bytes, driver, loop and recorder, and where it really was."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.clock import VirtualClock
+from deal_hw.control.behaviours import PolicyBehaviour
+from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.posture import PostureBehaviour, PostureConfig
+from deal_hw.control.safety import Safety
+from deal_hw.control.velocity import NotedVelocity, VelocitySource
+from deal_hw.control.velocity_error import VELOCITY_EVENT, Track, Wanted, velocity_data, wanted_in
+from deal_hw.data.recording.reader import read_episode
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.robot import Go2Robot
+from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.policy import Policy
+from deal_hw.types import Event, FloatArray, Trajectory
+
+_START_NS = 10**9
+
+
+class _Watched:
+    """The emulated robot, with a note of where its base is at each tick."""
+
+    def __init__(self, device: Go2Device) -> None:
+        self._device = device
+        self.rows: list[tuple[float, ...]] = []
+
+    @property
+    def device_ns(self) -> int:
+        return self._device.device_ns
+
+    def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
+        self._device.receive(topic, payload, stamp_ns)
+
+    def tick(self) -> list[tuple[str, bytes]]:
+        x, y, _ = self._device.base_position
+        self.rows.append((self._device.device_ns * 1e-9, float(x), float(y), self._device.heading))
+        return self._device.tick()
+
+    def track(self) -> Track:
+        rows = np.array(self.rows)
+        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualWalk:
+    """One walk.
+
+    Attributes:
+        report: How the run went.
+        trajectory: The recording, as read back from its file; None where nothing was recorded.
+        wanted: What was wanted, on the robot's clock; None where the policy never began.
+        track: Where the base really was, on the robot's clock.
+    """
+
+    report: LoopReport
+    trajectory: Trajectory | None
+    wanted: Wanted | None
+    track: Track
+
+
+def walk(
+    truth: Truth,
+    policy: Policy,
+    source: VelocitySource,
+    seconds: float,
+    path: Path | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    *,
+    record: bool = True,
+) -> VirtualWalk:
+    """Let a new robot stand up, walk and lie down.
+
+    Args:
+        truth: Its hidden parameters, profile and seed.
+        policy: What walks.
+        source: What it is told.
+        seconds: For how long it walks [s].
+        path: File to write; a temporary one by default.
+        metadata: For the recording.
+        record: Whether to record at all; it takes a third of the time.
+    """
+    clock = VirtualClock(_START_NS)
+    watched = _Watched(Go2Device(truth))
+    robot = Go2Robot(VirtualTopics(watched, clock), clock)
+    told: list[Event] = []
+
+    def note(velocity: FloatArray) -> None:
+        loop.note(VELOCITY_EVENT, "wanted velocity", **velocity_data(velocity))
+        told.append(Event(watched.device_ns, VELOCITY_EVENT, "", velocity_data(velocity)))
+
+    inner = PolicyBehaviour(policy, DRIVER, NotedVelocity(source, note))
+    whole = PostureBehaviour(inner, DRIVER, seconds, PostureConfig())
+    config = LoopConfig(duration_s=whole.duration_s)
+    trajectory = None
+    with tempfile.TemporaryDirectory() as folder:
+        file = path or Path(folder) / "episode.mcap"
+        if record:
+            with EpisodeRecorder(file, DRIVER.to_json(), metadata or {}, clock) as recorder:
+
+                def sink(one: CycleRecord) -> bool:
+                    recorder.write(one)
+                    return True
+
+                loop = ControlLoop(robot, whole, Safety(DRIVER), clock, sink, config)
+                report = loop.run()
+            trajectory = read_episode(file).trajectory
+        else:
+            loop = ControlLoop(robot, whole, Safety(DRIVER), clock, lambda one: True, config)
+            report = loop.run()
+    return VirtualWalk(report, trajectory, wanted_in(told, 0, seconds), watched.track())
