@@ -22,6 +22,7 @@ METHODS: dict[str, str] = {
     "deal-paper-flat": "deal_hw.calib.deal_paper.algorithm1:flat",
     "output-error": "deal_hw.calib.output_error_fits:output_error_method",
     "local": "deal_hw.calib.output_error_fits:local",
+    "gait": "deal_hw.calib.output_error_fits:gait",
     "easi": "deal_hw.calib.baselines.easi:Easi",
     "bo": "deal_hw.calib.baselines.bayesian:BayesianOptimisation",
     "cma": "deal_hw.calib.baselines.cma_es:Cma",
@@ -39,7 +40,7 @@ METHODS: dict[str, str] = {
 NO_DATA_METHODS = frozenset({"midpoint", "nominal", "deal-paper-flat"})
 """Rows that must not read the data, so they are never refined."""
 
-WHOLE_METHODS = frozenset({"output-error", "local", "mujoco-sysid"})
+WHOLE_METHODS = frozenset({"output-error", "local", "gait", "mujoco-sysid"})
 """Methods that decide themselves what follows their search, or stand for somebody else: never refined."""
 
 

@@ -70,7 +70,10 @@ class OutputErrorSettings:
         compared_s: Starts are compared in windows of this length: even a far one does not diverge [s].
         half_iterations: Most steps of the fit of each half.
         mismatch_s: Windows in which the model is held against the sensors' noise: start states are fitted, so
-            even a residual that needs longer to build up shows as far as it matters to a controller [s].
+            even a residual that needs longer to build up shows as far as it matters to a controller [s]. 0:
+            the fit's own residual, from smoothed start states.
+        first: The fit from the model's own values that says what residuals to expect.
+        robust: Large residuals weigh less (Huber) in all fits.
     """
 
     horizons_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
@@ -81,6 +84,8 @@ class OutputErrorSettings:
     compared_s: float = 0.4
     half_iterations: int = 5
     mismatch_s: float = 0.4
+    first: Recipe = SHORT
+    robust: bool = False
 
     @property
     def long_s(self) -> float:
@@ -97,7 +102,8 @@ class OutputErrorSettings:
 
     def recipe(self, name: str) -> Recipe:
         """Return how a candidate's residuals are weighed, for intervals and the split-half check."""
-        long = Recipe(seconds=self.long_s, prior_std=self.priors[self.prior_of(name)])
+        prior_std = self.priors[self.prior_of(name)]
+        long = Recipe(seconds=self.long_s, prior_std=prior_std, robust=self.robust)
         return self.variants.get(name, long)
 
     def prior_of(self, name: str) -> str:
@@ -121,7 +127,7 @@ class OutputErrorFits(Fits):
         if run.settings.cross_validation:
             problem = _whole(problem)
         run.say("residual", "fits short windows from the model's own values")
-        first = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, SHORT)
+        first = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
         run.offer("search", searched)
         # Drawn after the search, so that a resumed run draws the same.
@@ -143,9 +149,11 @@ class OutputErrorFits(Fits):
             # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
             local = with_rows(run.local)
             known, facts["physics_step"] = with_step(run.problem, local, known, theta)
-        left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
-        chi2 = left.normal.cost / max(left.normal.count, 1)
-        if run.local is not None:
+        chi2, left = float(np.mean((fit.scale / problem.noise.position_std) ** 2)), None
+        if settings.mismatch_s:
+            left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
+            chi2 = left.normal.cost / max(left.normal.count, 1)
+        if run.local is not None and left is not None:
             # Where the local fit lost its way it has seen a part of the recordings alone.
             lost = run.local.chi2 >= REFINEMENT.local_hopeless
             judged = (problem, with_rows(left)) if lost else (run.problem, local)
@@ -197,7 +205,7 @@ class OutputErrorFits(Fits):
         def fits(train: Problem, fold: int) -> dict[str, Member]:
             question = f"{fold + 1} of {len(masks)}: which fit predicts what it has not seen?"
             run.say("cross-validation", question)
-            first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, SHORT)
+            first = fit_output_error(train, problem.space.nominal, problem.first_latency_s, settings.first)
             rng = np.random.default_rng([seed, fold])
             searched = run.search.run(self._reduced(train, first), run.budget, rng)
             return self._members(run, train, _member(first), searched)
@@ -236,7 +244,7 @@ class OutputErrorFits(Fits):
                 continue
             horizons = [start]
             for seconds in horizons_s:
-                recipe = Recipe(seconds=seconds, prior_std=prior_std)
+                recipe = Recipe(seconds=seconds, prior_std=prior_std, robust=settings.robust)
                 horizons.append(_member(fit_output_error(problem, *horizons[-1], recipe)))
             for seconds, member in zip(horizons_s[:-1], horizons[1:], strict=False):
                 found[f"{seconds:g} s{words}"] = member
@@ -272,9 +280,14 @@ class OutputErrorFits(Fits):
         return agreement(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)
 
     def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
+        settings = self.settings
         if chi2 <= MISMATCH.chi2:
             return ()
-        return (mismatch(chi2, f" over {self.settings.mismatch_s:g} s from fitted start states"),)
+        seconds, kind = (
+            settings.mismatch_s or settings.long_s,
+            "fitted" if settings.mismatch_s else "smoothed",
+        )
+        return (mismatch(chi2, f" over {seconds:g} s from {kind} start states"),)
 
 
 def output_error_method(search: CalibrationMethod[Problem] | None = None) -> Calibration:
@@ -293,6 +306,22 @@ def local() -> Calibration:
     twentieth of a search. What its residual does not explain it says like `output-error`.
     """
     return Calibration(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
+
+
+GAIT = OutputErrorSettings(
+    horizons_s=(0.2,), compared_s=0.1, mismatch_s=0.0, first=Recipe(seconds=0.1, robust=True), robust=True
+)
+"""Half a step of the gait. Shorter windows are ruled by the errors of their start states: of an emulated Go2
+the gains came out 8 % too low with 0.1 s and 4 % with 0.2 s. In longer ones most feet land or slide."""
+
+
+def gait() -> Calibration:
+    """Return `gait`: short, robust fits of a robot that walks, from the model's own values.
+
+    Smoothed start states, and none that are fitted: each landing of a foot would be explained by them.
+    """
+    settings = Validation(local_first=False, cross_validation=False)
+    return Calibration(Nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
 
 def _whole(problem: Problem) -> Problem:

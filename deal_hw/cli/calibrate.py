@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from deal_hw.cli.calibrate_run import (
 )
 from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
 from deal_hw.cli.run_plan import balancer
+from deal_hw.control.velocity_error import wanted_velocity
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
@@ -44,7 +46,10 @@ __all__ = [
 
 HELDOUT_PROFILE = "chirp"
 DEFAULT = "default"
-XI = 5.0
+GAIT_SMOOTHING_S = 0.04
+"""Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
+WEIGHING_S = 0.35
+"""A robot that is about to walk has stood still for so long [s]."""
 SAMPLES_A_PERIOD = 4
 """States of a control period that are fitted to."""
 
@@ -80,8 +85,9 @@ class Calibrate(Checked):
 
     method: str = DEFAULT
     """How to search: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
-    default is eki and its refinement; with --model, for a robot that servos hold on a fixed base, it is
-    output-error unless --residual-std or --no-refine say how to treat what no model explains."""
+    default is eki and its refinement; of a walk it is gait; with --model, for a robot that servos hold on a
+    fixed base, it is output-error unless --residual-std or --no-refine say how to treat what no model
+    explains."""
 
     space: str = ""
     """Which parameters of a robot of ours, such as k9 or k11 (docs/parameters.md); the first by default."""
@@ -96,8 +102,9 @@ class Calibrate(Checked):
     """Other search ranges, as NAME LOW HIGH (SI)."""
 
     xi: Annotated[float | None, Ratio] = None
-    """Search each parameter within a factor XI to either side of its nominal value. By default 5; with
-    --model 20 for dry friction (docs/parameters.md), and with --parameters the ranges of that file."""
+    """Search each parameter within a factor XI to either side of its nominal value. By default as its
+    parameter set says, mostly 5; with --model 20 for dry friction (docs/parameters.md), and with --parameters
+    the ranges of that file."""
 
     latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
@@ -195,7 +202,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     budget = Budget(population=config.population, generations=config.generations, refine=config.refine)
     work = prepare(config)
     known_std = residual_std(config.residual_std, work.robot)
-    method = usual_method(config, work.robot)
+    method = usual_method(config, work.robot, walks=work.walks)
     with (
         saying_how_to_resume(checkpoint),
         watching(
@@ -220,6 +227,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             keep=folder / SO_FAR,
             known_std=known_std,
             heldout_window_s=config.heldout_window,
+            smoothing_s=GAIT_SMOOTHING_S if work.walks else None,
         )
     settings: dict[str, Any] = {
         "seed": config.seed,
@@ -251,20 +259,22 @@ def prepare(config: Calibrate) -> CalibrationInputs:
     return prepare_dataset(config) if config.recordings.model is None else _prepare_model(config)
 
 
-def usual_method(config: Calibrate, robot: RobotModel) -> str:
+def usual_method(config: Calibrate, robot: RobotModel, *, walks: bool = False) -> str:
     """Return the method, where none is named that which suits the recordings."""
-    if config.method != DEFAULT or config.recordings.model is None:
-        return config.method
-    if config.residual_std or not config.refine:
+    if config.method != DEFAULT or config.residual_std or not config.refine:
         return config.method
     facts = robot.description
     held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
-    if robot.base is not None or not held:
+    if walks:
+        usual = "gait"
+    elif config.recordings.model is not None and robot.base is None and held:
+        usual = "output-error"
+    else:
         # Predictions of seconds, which output-error compares, mean nothing for a robot that falls.
         return config.method
     if not config.quiet:
-        print("method: output-error (--method eki to search and refine to the sensor noise)", file=sys.stderr)
-    return "output-error"
+        print(f"method: {usual} (--method eki to search and refine to the sensor noise)", file=sys.stderr)
+    return usual
 
 
 def _run_folder(config: Calibrate) -> Path:
@@ -333,6 +343,11 @@ def prepare_dataset(config: Calibrate) -> CalibrationInputs:
             print(f"episode {index}: {jumps[0]}", file=sys.stderr)
     recordings = {index: without_spikes(trajectory, spikes) for index, trajectory in recordings.items()}
     robot, episodes = _simulation(dataset, recordings, config.sample_hz)
+    walks = robot.base is not None and all(
+        wanted_velocity(recordings[i]) is not None for i in (*fit, *holdout)
+    )
+    if walks:
+        space = _weighed(space, robot, recordings[fit[0]], quiet=config.quiet)
     return CalibrationInputs(
         robot=robot,
         space=space,
@@ -349,6 +364,7 @@ def prepare_dataset(config: Calibrate) -> CalibrationInputs:
         advice="`deal-hw collect --profile chirp` records one",
         balance=balancer(robot.description, None),
         name="" if robot.base is not None else robot.description.name,
+        walks=walks,
     )
 
 
@@ -401,8 +417,7 @@ def make_space(robot: str, config: Calibrate) -> ParameterSpace:
     name = config.space or next(iter(table))
     if name not in table:
         raise UnknownNameError("parameter set", name, table)
-    xi = XI if config.xi is None else config.xi
-    return _overrides(config, xi).apply(table[name]())
+    return _overrides(config, config.xi).apply(table[name]())
 
 
 def _simulation(
@@ -420,6 +435,46 @@ def _simulation(
     for i, trajectory in recordings.items():
         episodes[i] = align(trajectory, robot.description)
         if robot.base is not None and trajectory.body is not None:
-            episodes[i] = with_sensed_base(episodes[i], robot, trajectory.body)
+            episodes[i] = _while_walking(with_sensed_base(episodes[i], robot, trajectory), trajectory)
         episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)
     return robot, episodes
+
+
+def _while_walking(episode: Episode, trajectory: Trajectory) -> Episode:
+    """Return the episode without standing up and lying down where it is of a walk."""
+    wanted = wanted_velocity(trajectory)
+    if wanted is None:
+        return episode
+    rows = slice(episode.first_row, episode.first_row + len(episode.sample))
+    host_s = trajectory.device_s[rows] + np.median(trajectory.receive_s - trajectory.device_s)
+    walks = (host_s >= wanted.time_s[0]) & (host_s <= wanted.end_s)
+    return dataclasses.replace(episode, usable=episode.usable & walks)
+
+
+def _weighed(
+    space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, *, quiet: bool
+) -> ParameterSpace:
+    """Return the space with the trunk's mass as the robot weighs itself, where that is searched.
+
+    No motion on feet tells masses and gains apart: all forces scale together. The motors' efforts do, in the
+    last moments before the robot walks.
+    """
+    from deal_hw.sim.legged.weighing import standing_mass
+
+    trunk, wanted, body = robot.description.floating_base, wanted_velocity(trajectory), trajectory.body
+    names = [p.name for p in space if p.kind == "body_mass" and p.elements == (trunk,)]
+    if not names or wanted is None or body is None:
+        return space
+    since_s = trajectory.receive_s - wanted.time_s[0]
+    rows = (since_s > -WEIGHING_S) & (since_s < 0) & np.isfinite(trajectory.effort).all(axis=1)
+    if not rows.any():
+        return space
+    whole = standing_mass(robot, body.orientation[rows], trajectory.position[rows], trajectory.effort[rows])
+    mass = whole - float(robot.model.body_mass.sum() - robot.model.body(trunk).mass[0])
+    if not quiet:
+        print(
+            f"{names[0]}: {mass:.2f} kg, by the motors' efforts while the robot stands (the whole robot "
+            f"{whole:.2f} kg); not fitted, --known {names[0]} KG gives another",
+            file=sys.stderr,
+        )
+    return space.with_known({names[0]: mass})

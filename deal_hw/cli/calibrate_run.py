@@ -55,6 +55,7 @@ class CalibrationInputs:
         advice: How to get a held-out recording where there is none.
         balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
         name: Name under which `deal-hw collect` records this robot; "" where it does not.
+        walks: Whether all recordings are of a policy that walks.
     """
 
     robot: RobotModel
@@ -67,6 +68,7 @@ class CalibrationInputs:
     advice: str
     balance: Callable[[], Behaviour] | None = None
     name: str = ""
+    walks: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,6 +138,7 @@ def calibrate_episodes(
     keep: Path | None = None,
     known_std: FloatArray | None = None,
     heldout_window_s: float = HELDOUT_WINDOW_S,
+    smoothing_s: float | None = None,
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid; the heart of the verb, without files.
 
@@ -158,11 +161,13 @@ def calibrate_episodes(
         known_std: What a prediction may be off, positions then velocities, (2 C,); None: the sensor noise, as
             the recordings show it.
         heldout_window_s: Held-out predictions restart this often [s].
+        smoothing_s: Start states are smoothed over so long [s]; None for the usual time.
     """
     try:
         from threadpoolctl import threadpool_limits
 
         from deal_hw.calib.data.checks import check_delays
+        from deal_hw.calib.data.noise import SETTINGS as DATA
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.methods import make_method
         from deal_hw.calib.validation.metrics import HeldOut
@@ -179,6 +184,7 @@ def calibrate_episodes(
         latency_range_s=latency_range_s,
         fixed_latency_s=latency_s,
         known_std=known_std,
+        settings=DATA if smoothing_s is None else dataclasses.replace(DATA, smoothing_s=smoothing_s),
     )
     check_delays(problem)
 

@@ -10,6 +10,7 @@ import numpy as np
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
+from deal_hw.sim.legged.velocity_filter import filtered_velocity, rotated, standing_feet
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
@@ -21,6 +22,21 @@ VELOCITY_STD = 0.04
 
 HEIGHT_STD = 0.004
 """Standard deviation of a base height from the legs [m]: how far contacts give way."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Felt:
+    """What tells more of a base that walks: which feet bear it, and how it is pushed.
+
+    Attributes:
+        time_s: Of each sample, (T,) [s].
+        acceleration: Specific force in the base's frame, (T, 3) [m/s²].
+        effort: Of the joints, (T, J) [N·m].
+    """
+
+    time_s: FloatArray
+    acceleration: FloatArray
+    effort: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +59,13 @@ def leg_odometry(
     angular_velocity: FloatArray,
     joint_position: FloatArray,
     joint_velocity: FloatArray,
+    felt: Felt | None = None,
 ) -> Odometry:
     """Estimate base velocity and height on a level floor at height 0.
 
-    A foot that stands rolls about its contact point: the velocity of the sphere's lowest point is zero. The
-    standing feet's answers are combined by their median.
+    A foot that stands rolls about its contact point: the velocity of the sphere's lowest point is zero. Where
+    the lowest feet are all that says which feet stand, their answers are combined by their median; a walking
+    robot's joint efforts and accelerometer say more, see :mod:`deal_hw.sim.legged.velocity_filter`.
 
     Args:
         robot: A robot with a floating base.
@@ -56,6 +74,7 @@ def leg_odometry(
         angular_velocity: In the base's frame, (T, 3) [rad/s].
         joint_position: (T, J).
         joint_velocity: (T, J).
+        felt: Accelerometer and efforts; None where nothing reports them.
 
     Raises:
         ConfigurationError: The robot's base is fixed.
@@ -66,26 +85,34 @@ def leg_odometry(
     at, dof = robot.base
     geoms = [element_id(model, "geom", name) for name in feet]
     radius = np.array([model.geom_size[g, 0] for g in geoms])
-    T = len(orientation)
-    velocity, height = np.empty((T, 3)), np.empty(T)
-    both = np.empty(6)
+    T, F = len(orientation), len(feet)
+    answers, lowest, load = np.empty((T, F, 3)), np.empty((T, F)), np.zeros((T, F))
+    both, jacobian, dofs = np.empty(6), np.empty((3, model.nv)), list(robot.qvel)
     for t in range(T):
         data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = 0.0, orientation[t]
         data.qpos[list(robot.qpos)] = joint_position[t]
         data.qvel[dof : dof + 3], data.qvel[dof + 3 : dof + 6] = 0.0, angular_velocity[t]
-        data.qvel[list(robot.qvel)] = joint_velocity[t]
+        data.qvel[dofs] = joint_velocity[t]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
-        lowest = np.array([data.geom_xpos[g, 2] for g in geoms]) - radius
-        stands = lowest < lowest.min() + STANCE_M
-        found = []
         for i, g in enumerate(geoms):
-            if stands[i]:
-                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, g, both, 0)
-                found.append(both[3:] + np.cross(both[:3], (0.0, 0.0, -radius[i])))
-        velocity[t], height[t] = -np.median(found, axis=0), -np.median(lowest[stands])
-    return Odometry(velocity, height)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_GEOM, g, both, 0)
+            answers[t, i] = -both[3:] - np.cross(both[:3], (0.0, 0.0, -radius[i]))
+            lowest[t, i] = data.geom_xpos[g, 2] - radius[i]
+            if felt is not None:
+                mujoco.mj_jacGeom(model, data, jacobian, None, g)
+                pushed = np.linalg.lstsq(jacobian[:, dofs].T, -felt.effort[t], rcond=None)[0]
+                load[t, i] = pushed[2]
+    if felt is None:
+        stands = lowest < lowest.min(axis=1, keepdims=True) + STANCE_M
+        velocity = np.nanmedian(np.where(stands[..., None], answers, np.nan), axis=1)
+    else:
+        weight = float(np.sum(model.body_mass) * np.linalg.norm(model.opt.gravity))
+        stands = standing_feet(load, weight)
+        velocity = filtered_velocity(felt.time_s, rotated(orientation, felt.acceleration), answers, stands)
+    bears = np.where(stands.any(axis=1, keepdims=True), stands, lowest == lowest.min(axis=1, keepdims=True))
+    return Odometry(velocity, -np.nanmedian(np.where(bears, lowest, np.nan), axis=1))
 
 
 def smooth_orientation(orientation: FloatArray, weights: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from scipy.signal import savgol_coeffs
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_vector
-from deal_hw.sim.legged.leg_odometry import HEIGHT_STD, VELOCITY_STD, leg_odometry, smooth_orientation
+from deal_hw.sim.legged.leg_odometry import HEIGHT_STD, VELOCITY_STD, Felt, leg_odometry, smooth_orientation
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
 
@@ -48,6 +48,7 @@ def base_states(
     joints: FloatArray,
     joint_velocity: FloatArray,
     period_s: float,
+    felt: Felt | None = None,
 ) -> BaseStates:
     """Put joints, IMU and leg odometry together.
 
@@ -59,6 +60,7 @@ def base_states(
         joints: Reported joint positions, (T, J).
         joint_velocity: What is reported of joint velocities, (T, J); NaN for nothing.
         period_s: From sample to sample [s].
+        felt: Accelerometer and efforts; None where nothing reports them.
 
     Raises:
         InsufficientDataError: There are fewer samples than the smoother needs.
@@ -74,7 +76,7 @@ def base_states(
     slope = savgol_coeffs(length, order, deriv=1, delta=period_s, use="dot")
     for j in range(J):
         speed[length // 2 : T - length // 2, j] = np.convolve(joints[:, j], slope[::-1], mode="valid")
-    legs = leg_odometry(robot, feet, reference, gyro, joints, speed)
+    legs = leg_odometry(robot, feet, reference, gyro, joints, speed, felt)
     C = 6 + J
     position, velocity = np.zeros((T, C)), np.zeros((T, C))
     position[:, 2], position[:, robot.joints] = legs.height, joints
@@ -87,7 +89,12 @@ def base_states(
 
 
 def with_base(
-    episode: Episode, robot: RobotModel, feet: tuple[str, ...], orientation: FloatArray, gyro: FloatArray
+    episode: Episode,
+    robot: RobotModel,
+    feet: tuple[str, ...],
+    orientation: FloatArray,
+    gyro: FloatArray,
+    felt: Felt | None = None,
 ) -> Episode:
     """Return an episode of joints as one of the whole floating robot: joints, orientation and gyro measured.
 
@@ -97,11 +104,14 @@ def with_base(
         feet: Sphere geoms of the feet.
         orientation: Reported orientations of the base at all samples of the recording, (>= T, 4).
         gyro: Reported angular velocities there, (>= T, 3) [rad/s].
+        felt: Accelerometer and efforts there; None where nothing reports them.
     """
     rows = slice(episode.first_row, episode.first_row + len(episode.sample))
     unknown = np.full_like(episode.velocity, np.nan)
+    if felt is not None:
+        felt = Felt(felt.time_s[rows], felt.acceleration[rows], felt.effort[rows])
     states = base_states(
-        robot, feet, orientation[rows], gyro[rows], episode.position, unknown, episode.period_s
+        robot, feet, orientation[rows], gyro[rows], episode.position, unknown, episode.period_s, felt
     )
     C = states.position.shape[1]
     measured = np.zeros(2 * C, dtype=bool)

@@ -140,7 +140,7 @@ def compute_overlay(
             raise InsufficientDataError(
                 "the recording says nothing of the floating base; predictions need its IMU and names of feet"
             )
-        episode = with_sensed_base(episode, robot, trajectory.body)
+        episode = with_sensed_base(episode, robot, trajectory)
     windows = cut_windows(episode, length)
     row = _first_row(trajectory) + np.concatenate([windows.start[:, None], windows.samples()], axis=1)
     smooth = _smoothed_starts(trajectory, row[:, 0], smoothing_s)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion
+from deal_hw.sim.legged.leg_odometry import Felt
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.sim.recordings.imu_base import with_base
-from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
+from deal_hw.types import FloatArray, Trajectory
 
 
 def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
@@ -35,9 +37,20 @@ def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
     return poses
 
 
-def with_sensed_base(episode: Episode, robot: RobotModel, body: BodyTrajectory) -> Episode:
-    """Return an episode of joints with the base from the body's sensors, as ``imu_base`` finds it."""
-    return with_base(episode, robot, robot.description.feet, body.orientation, body.angular_velocity)
+def with_sensed_base(episode: Episode, robot: RobotModel, trajectory: Trajectory) -> Episode:
+    """Return an episode of joints with the base from the body's sensors, as ``imu_base`` finds it.
+
+    Args:
+        episode: What :func:`deal_hw.sim.recordings.episode.align` made of the recording.
+        robot: The robot.
+        trajectory: The recording; it has a body.
+    """
+    body, feet = trajectory.body, robot.description.feet
+    if body is None:
+        raise ConfigurationError("the recording has no body's sensors")
+    felt = Felt(trajectory.device_s, body.acceleration, trajectory.effort)
+    whole = all(np.isfinite(values).all() for values in (felt.acceleration, felt.effort))
+    return with_base(episode, robot, feet, body.orientation, body.angular_velocity, felt if whole else None)
 
 
 def chart_base(position: FloatArray, reference: FloatArray) -> FloatArray:
