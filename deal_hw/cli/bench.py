@@ -26,9 +26,12 @@ class Bench:
     """Measure how well calibration and the loop do; a bench that was stopped goes on where it was."""
 
     bench: tyro.conf.Positional[
-        Literal["loop", "honest", "mismatch", "paper", "real", "verdict", "first-answer", "go2-codec"]
+        Literal[
+            "loop", "go2-loop", "honest", "mismatch", "paper", "real", "verdict", "first-answer", "go2-codec"
+        ]
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
+    go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned.
     honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
     simulator here does. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings
     of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
@@ -92,6 +95,9 @@ class Bench:
     train: bool = True
     """Train and deploy policies with the default method."""
 
+    steps: Annotated[int, Range(1, 10**9)] = 500_000
+    """go2-loop: steps of each fine-tune."""
+
     out: Path | None = None
     """File of the rows, by default BENCH.json; the CSV and the figure lie beside it."""
 
@@ -114,6 +120,8 @@ class Bench:
             refuse(given(self, Bench, ("real",)), "only `bench first-answer` takes that")
         if self.bench not in ("first-answer", "verdict"):
             refuse(given(self, Bench, ("problems",)), "only `bench first-answer` and `verdict` take that")
+        if self.bench != "go2-loop":
+            refuse(given(self, Bench, ("steps",)), "only `bench go2-loop` takes that")
         if self.bench != "verdict":
             refuse(given(self, Bench, ("faults",)), "only `bench verdict` takes that")
 
@@ -243,6 +251,18 @@ def _loop(config: Bench, out: Path) -> _Table:
     return _Table(cells=cells, line=tables.line, summary=tables.print_summary, draw=_draw)
 
 
+def _go2_loop(config: Bench, out: Path) -> _Table:
+    from deal_hw.bench import go2_loop
+
+    cells = go2_loop.cells(
+        config.profile, parse_seeds(config.seeds), config.steps, train=config.train,
+        folder=out.parent / f"{out.stem}_runs", threads=config.threads,
+    )  # fmt: skip
+    return _Table(
+        cells=cells, line=go2_loop.line, summary=lambda rows: print("\n".join(go2_loop.summary(rows)))
+    )
+
+
 def _calibration(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import calibration, tables
 
@@ -291,6 +311,7 @@ def _verdict(config: Bench, out: Path) -> _Table:
 
 _TABLES: dict[str, Callable[[Bench, Path], _Table]] = {
     "loop": _loop,
+    "go2-loop": _go2_loop,
     "real": _real,
     "verdict": _verdict,
     "first-answer": _first_answer,

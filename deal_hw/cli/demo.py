@@ -1,28 +1,28 @@
-"""``deal-hw demo``: all five jobs on an emulated cart-pole whose physics the calibrator cannot see."""
+"""``deal-hw demo``: all five jobs on an emulated robot whose physics the calibrator cannot see.
+
+What each robot does is a module of its own, :mod:`deal_hw.cli.demo_cartpole` and
+:mod:`deal_hw.cli.demo_go2`; stages, summary and tables are here.
+"""
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol, cast
 
-import numpy as np
+import tyro
 
 from deal_hw.calibration import CalibrationResult
-from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
-from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.calibrate import CalibrateReport
 from deal_hw.cli.episode_report import RunReport
-from deal_hw.cli.link import LinkOptions
-from deal_hw.cli.options import Checked, Range, Seed
-from deal_hw.cli.run_plan import shipped_policy
-from deal_hw.control.cadence import CadenceReport
+from deal_hw.cli.options import Checked, Range, Seed, given, refuse
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.types import FloatArray
@@ -30,13 +30,17 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Checked):
-    """Record, calibrate, retrain, deploy and compare on an emulated cart-pole over its wire."""
+    """Record, calibrate, retrain, deploy and compare on an emulated robot over its wire."""
 
-    out: Path = Path("runs/demo")
-    """Run folder; a former demo in it is replaced."""
+    robot: tyro.conf.Positional[Literal["cartpole", "go2"]] = "cartpole"
+    """cartpole balances its pole, go2 walks."""
 
-    transport: str = "serial"
-    """The wire: serial, can, odrive or dynamixel."""
+    out: Path | None = None
+    """Run folder, by default runs/demo (go2: runs/demo_go2); a former demo in it is replaced."""
+
+    transport: str = ""
+    """The wire. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the default) or
+    zenoh."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """What stands between the emulated mechanics and the wire."""
@@ -44,14 +48,30 @@ class Demo(Checked):
     seed: Seed = 0
     """Draws the hidden truth, the demonstration, the search and the training."""
 
-    episodes: Annotated[int, Range(1, 1000)] = 3
-    """Deployments of each policy, 10 s each."""
+    episodes: Annotated[int | None, Range(1, 1000)] = None
+    """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s."""
 
     firmware: Literal["python", "host", "avr"] = "python"
     """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
 
+    hung: bool = False
+    """Go2: calibrate from a recording with its body on a stand instead of from its walk."""
+
     steps: Annotated[int | None, Range(1, 10**9)] = None
-    """Training steps; by default those of the shipped UDR policy."""
+    """Training steps. Cart-pole: by default those of the shipped UDR policy. Go2: 500,000, from the shipped
+    policy on."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        own = {"cartpole": ("firmware",), "go2": ("hung",)}
+        for robot, options in own.items():
+            if robot != self.robot:
+                refuse(given(self, Demo, options), f"only the demo of {robot} takes that")
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self.out or Path("runs") / ("demo" if self.robot == "cartpole" else f"demo_{self.robot}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,20 +87,81 @@ class DemoReport:
     folder: Path
 
 
-class _Stages:
-    """Announces stages and keeps their times."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measure:
+    """One number of each policy's deployments.
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+    Attributes:
+        name: Key in the summary; ends with the unit.
+        unit: As names write it.
+        heading: Of its column.
+        values: By policy, one a deployment, (E,).
+    """
+
+    name: str
+    heading: str
+    values: Mapping[str, FloatArray]
+    unit: str = ""
+
+    @property
+    def std_name(self) -> str:
+        """Key of its standard deviation."""
+        quantity = self.name.removesuffix(self.unit)
+        return f"{quantity}std_{self.unit}" if self.unit else f"{quantity}_std"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demonstrated:
+    """What a robot's part of the demo hands back.
+
+    Attributes:
+        found: The calibration.
+        truth: True values of its parameters, by name.
+        latency_s: The true latency [s].
+        measures: What is compared of the policies.
+        comparison: Title of that table.
+        run: The last deployment of the retrained policy.
+        paths: Files to look at.
+        beside: Estimates of another calibration, by parameter; its name is ``beside_name``.
+        beside_name: See there.
+    """
+
+    found: CalibrateReport
+    truth: Mapping[str, float]
+    latency_s: float
+    measures: Sequence[Measure]
+    comparison: str
+    run: RunReport
+    paths: Mapping[str, str]
+    beside: CalibrationResult | None = None
+    beside_name: str = ""
+
+
+@dataclass
+class Stages:
+    """Announces stages and keeps their times: elapsed, and of processors in this process and its children."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str, words: str) -> Iterator[None]:
+        """Run a stage."""
         print(f"\n== {name}: {words}", flush=True)
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), _cpu_seconds()
         try:
             yield
         finally:
             self.seconds[name] = round(time.perf_counter() - start, 2)
+            self.cpu_seconds[name] = round(_cpu_seconds() - cpu, 2)
+
+
+class Part(Protocol):
+    """A robot's part."""
+
+    def run(self, config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+        """Do all five jobs."""
+        ...
 
 
 def demo(config: Demo) -> DemoReport:
@@ -90,93 +171,33 @@ def demo(config: Demo) -> DemoReport:
         DealHwError: A stage failed; the robot is passive, and what was recorded is whole.
     """
     try:
-        from deal_hw.cli.inspect_ import Inspect, inspect
-        from deal_hw.cli.train import Train, train
+        # What any stage will need is missed now, not after minutes.
+        importlib.import_module("deal_hw.cli.inspect_")
+        importlib.import_module("deal_hw.policies.trainers")
+        part = cast("Part", importlib.import_module(f"deal_hw.cli.demo_{config.robot}"))
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "all") from err
-    udr = shipped_policy("cartpole")
-    if udr is None:
-        raise ConfigurationError(
-            "no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it"
-        )
-    _clear(config.out)
-    folder = RunFolder(config.out)
-    stages = _Stages()
-    truth_file = config.out / "truth.json"
+    clear(config.folder)
+    folder, stages = RunFolder(config.folder), Stages()
     with folder:
+        settings = ("robot", "transport", "profile", "episodes", "steps", "hung")
         folder.start(
-            {
-                "kind": "demo",
-                "transport": config.transport,
-                "profile": config.profile,
-                "episodes": config.episodes,
-                "steps": config.steps,
-            },
-            {"demo": config.seed},
+            {"kind": "demo", **{name: getattr(config, name) for name in settings}}, {"demo": config.seed}
         )
-        options = (
-            "--transport", config.transport, "--profile", config.profile, "--seed", str(config.seed),
-            "--firmware", config.firmware, "--reveal-to", str(truth_file),
-        )  # fmt: skip
-        link = LinkOptions(transport=config.transport)
-        with EmulatorProcess("cartpole", *options) as emulator:
-            port = emulator.port
-            print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
-            with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
-                for kind in ("rich", "chirp"):
-                    collect(
-                        Collect(
-                            robot="cartpole", port=port, link=link, out=config.out, profile=kind,
-                            seed=config.seed,
-                        )
-                    )  # fmt: skip
-            with stages.stage("calibrate", "search, refinement, latency, intervals"):
-                found = calibrate(Calibrate(dataset=folder.dataset, out=config.out, seed=config.seed))
-            with stages.stage("calibrate deal", "the adversarial search alone, to compare with"):
-                beside = calibrate(
-                    Calibrate(
-                        dataset=folder.dataset, out=config.out / "deal", method="deal", refine=False,
-                        seed=config.seed, quiet=True,
-                    )
-                )  # fmt: skip
-            policy = folder.policies / "calibrated.onnx"
-            with stages.stage("train", "a policy under what is now known of the robot"):
-                train(
-                    Train(
-                        robot="cartpole", distribution=found.files["distribution.json"], out=policy,
-                        steps=config.steps, seed=config.seed,
-                    )
-                )  # fmt: skip
-            runs: dict[str, RunReport] = {}
-            for name, file in (("udr", udr), ("retrained", policy)):
-                with stages.stage(f"deploy {name}", f"{config.episodes} times 10 s over the port"):
-                    runs[name] = deploy(
-                        Deploy(
-                            robot="cartpole", port=port, link=link, policy=file,
-                            dataset=config.out / f"deploy_{name}", episodes=config.episodes, task="balance",
-                        )
-                    )  # fmt: skip
-        with stages.stage("inspect", "real, nominal and calibrated on one screen"):
-            rrd = config.out / "inspect.rrd"
-            inspect(
-                Inspect(
-                    episode=folder.dataset / "episodes" / "000000.mcap",
-                    calibration=folder.calibration,
-                    save=rrd,
-                )
-            )
-        truth = json.loads(truth_file.read_text(encoding="utf-8"))
-        scores = {name: task_scores(config.out / f"deploy_{name}", config.episodes) for name in runs}
-        paths = {"rrd": str(rrd), "mjcf": str(found.files["calibrated.xml"]), "policy": str(policy)}
-        summary = _summary(found, beside.result, truth, scores, runs, stages.seconds, paths)
+        done = part.run(config, folder, stages)
+        summary = _summary(done, stages)
         folder.write("summary.json", summary)
         folder.finish(seconds=stages.seconds)
-    _print(summary, found.result, config.out)
-    return DemoReport(summary=summary, folder=config.out)
+    _print(summary, done, config.folder)
+    return DemoReport(summary=summary, folder=config.folder)
 
 
-def _clear(folder: Path) -> None:
-    """Remove a former demo; refuse to touch anything else."""
+def clear(folder: Path) -> None:
+    """Remove a former demo; refuse to touch anything else.
+
+    Raises:
+        ConfigurationError: The folder holds something else.
+    """
     if not folder.exists() or not any(folder.iterdir()):
         return
     try:
@@ -190,105 +211,91 @@ def _clear(folder: Path) -> None:
     shutil.rmtree(folder)
 
 
-def task_scores(dataset: Path, episodes: int) -> FloatArray:
-    """Return mean |pole angle| [rad] and mean |cart speed| [m/s] of each deployment, (E, 2).
-
-    What is missing of a run that the safety filter ended early counts as fallen: pi rad, and a cart at rest.
-    """
-    from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.policies.evaluate import TASK_SECONDS, balance_result
-
-    store = Dataset.open(dataset)
-    scores = []
-    for index in range(len(store.episodes)):
-        recorded = store.read(index).trajectory
-        period_s = float(np.median(np.diff(recorded.device_s)))
-        result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
-        scores.append((result.angle_error_rad, result.cart_speed_m_s))
-    # Episodes that were not run any more, because an earlier one was tripped, count like that one's worst.
-    scores += [(np.pi, 0.0)] * (episodes - len(scores))
-    return np.array(scores)
+def read_truth(path: Path) -> dict[str, Any]:
+    """Return what an emulator revealed when it ended."""
+    return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
 
 
-def _summary(
-    found: CalibrateReport,
-    deal: CalibrationResult,
-    truth: dict[str, Any],
-    scores: dict[str, FloatArray],
-    runs: dict[str, RunReport],
-    seconds: dict[str, float],
-    paths: dict[str, str],
-) -> dict[str, Any]:
-    result = found.result
-    cadence = runs["retrained"].episodes[-1].cadence
+def show_first_episode(folder: RunFolder) -> Path:
+    """Write the first recording with what nominal and calibrated model predict of it; return the file."""
+    from deal_hw.cli.inspect_ import Inspect, inspect
+
+    rrd = folder.path / "inspect.rrd"
+    episode = folder.dataset / "episodes" / "000000.mcap"
+    inspect(Inspect(episode=episode, calibration=folder.calibration, save=rrd))
+    return rrd
+
+
+def _cpu_seconds() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
+    result, beside = done.found.result, done.beside
+    cadence = done.run.episodes[-1].cadence
+    values = cadence.to_json() if cadence is not None else {}
+    periods = {f"period_{key}": values["period"][f"{key}_s"] for key in ("p50", "p99", "max") if values}
     return {
         "parameters": {
             p.name: {
                 "estimate": float(result.estimate[k]),
                 "low": float(result.interval[k, 0]),
                 "high": float(result.interval[k, 1]),
-                "truth": truth["parameters"][p.name],
+                "truth": done.truth[p.name],
                 "nominal": p.nominal,
                 "unit": p.unit,
-                "deal": float(deal.estimate[k]),
+                **({} if beside is None else {done.beside_name: float(beside.estimate[k])}),
             }
             for k, p in enumerate(result.space)
         },
         "heldout_nrmse": dict(result.heldout_nrmse),
-        "latency_s": {"true": truth["latency_s"], "found": result.latency_s},
-        "angle_error_rad": {name: float(score[:, 0].mean()) for name, score in scores.items()},
-        "angle_error_std_rad": {name: float(score[:, 0].std()) for name, score in scores.items()},
-        "cart_speed_m_s": {name: float(score[:, 1].mean()) for name, score in scores.items()},
-        "cart_speed_std_m_s": {name: float(score[:, 1].std()) for name, score in scores.items()},
-        "cadence": _cadence(cadence),
+        "latency_s": {"true": done.latency_s, "found": result.latency_s},
+        **{m.name: {policy: float(v.mean()) for policy, v in m.values.items()} for m in done.measures},
+        **{m.std_name: {policy: float(v.std()) for policy, v in m.values.items()} for m in done.measures},
+        "cadence": periods | values,
         "alarms": [str(alarm) for alarm in result.alarms],
-        "seconds": seconds,
-        "paths": paths,
+        "seconds": stages.seconds,
+        "cpu_seconds": stages.cpu_seconds,
+        "paths": dict(done.paths),
     }
 
 
-def _cadence(cadence: CadenceReport | None) -> dict[str, Any]:
-    if cadence is None:
-        return {}
-    values = cadence.to_json()
-    return {f"period_{key}": values["period"][f"{key}_s"] for key in ("p50", "p99", "max")} | values
-
-
-def _print(summary: dict[str, Any], result: CalibrationResult, folder: Path) -> None:
+def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console(width=110)
     table = Table(title="what the calibrator found of a robot it could not look inside")
-    for name in ("parameter", "unit", "nominal", "deal alone", "estimate", "90 % interval", "truth"):
+    beside = [f"{done.beside_name} alone"] if done.beside is not None else []
+    for name in ("parameter", "unit", "nominal", *beside, "estimate", "90 % interval", "truth"):
         table.add_column(name, justify="left" if name in ("parameter", "unit") else "right")
     for name, row in summary["parameters"].items():
         inside = row["low"] <= row["truth"] <= row["high"]
         table.add_row(
-            name, row["unit"], f"{row['nominal']:.4g}", f"{row['deal']:.4g}", f"{row['estimate']:.4g}",
-            f"{row['low']:.4g} .. {row['high']:.4g}",
+            name, row["unit"], f"{row['nominal']:.4g}", *(f"{row[done.beside_name]:.4g}" for _ in beside),
+            f"{row['estimate']:.4g}", f"{row['low']:.4g} .. {row['high']:.4g}",
             f"{row['truth']:.4g}" + ("" if inside else " (outside)"),
         )  # fmt: skip
     latency = summary["latency_s"]
     table.add_row(
-        "latency", "ms", "0", "", f"{1e3 * latency['found']:.1f}", "", f"{1e3 * latency['true']:.1f}"
-    )
+        "latency", "ms", "0", *("" for _ in beside), f"{1e3 * latency['found']:.1f}", "",
+        f"{1e3 * latency['true']:.1f}",
+    )  # fmt: skip
     console.print(table)
+    result = done.found.result
+    for words in result.null_directions:
+        console.print(f"the data cannot tell: {words}")
     for alarm in result.alarms:
         console.print(f"alarm: {alarm}")
 
-    table = Table(title="policies on the robot, mean ± std over deployments (the paper's Table 2)")
-    for name in ("policy", "pole-angle error [rad]", "cart speed [m/s]"):
-        table.add_column(name, justify="left" if name == "policy" else "right")
-    for name in ("udr", "retrained"):
-        cells = (
-            f"{summary[key][name]:.4f} ± {summary[std][name]:.4f}"
-            for key, std in (
-                ("angle_error_rad", "angle_error_std_rad"),
-                ("cart_speed_m_s", "cart_speed_std_m_s"),
-            )
-        )
-        table.add_row(name, *cells)
+    table = Table(title=done.comparison)
+    table.add_column("policy")
+    for measure in done.measures:
+        table.add_column(measure.heading, justify="right")
+    for policy in done.measures[0].values:
+        cells = (f"{summary[m.name][policy]:.4f} ± {summary[m.std_name][policy]:.4f}" for m in done.measures)
+        table.add_row(policy, *cells)
     console.print(table)
     errors = summary["heldout_nrmse"]
     console.print(f"held-out error: nominal {errors['nominal']:.4f}, calibrated {errors['calibrated']:.4f}")

@@ -1,0 +1,211 @@
+"""The Go2's loop bench: walk, calibrate from the walk, fine-tune, walk again; only it knows the truths.
+
+One row a seed, in virtual time: driver, bytes, safety filter, control loop and recorder are those of the
+wire. Four policies walk the same profile with the same robot: the shipped one, that one after more training
+under uniform randomisation, under the calibrated distribution, and under the truth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from deal_hw.bench.rows import Cells, Row
+from deal_hw.calibration import CalibrationResult
+from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.demo_go2 import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
+from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.cli.train import train_policy, udr_distribution
+from deal_hw.cli.virtual_go2 import walk
+from deal_hw.control.loop import Outcome
+from deal_hw.control.velocity import ScriptVelocity
+from deal_hw.control.velocity_error import velocity_error
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.floor import walk_space
+from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth
+from deal_hw.errors import DealHwError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.training import TrainingFiles
+
+POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
+KINDS: Final = ("stiffness", "damping")
+
+
+def cells(
+    profile: str, seeds: Sequence[int], steps: int, *, train: bool, folder: Path, threads: int | None
+) -> Cells:
+    """Return the cells of the bench, one a seed; see :func:`loop_row`."""
+
+    def make(seed: int) -> Callable[[], Row]:
+        return lambda: loop_row(profile, seed, steps, train=train, folder=folder, threads=threads)
+
+    runs = [((profile, seed, steps if train else 0), make(seed)) for seed in seeds]
+    return Cells(names=("profile", "seed", "steps"), runs=runs)
+
+
+def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, threads: int | None) -> Row:
+    """Run one cell; an error is kept in the row, so that the other cells still run.
+
+    Args:
+        profile: Profile of the emulated robot.
+        seed: Seed of its truth, of the search and of the training.
+        steps: Of each fine-tune.
+        train: Whether to fine-tune at all.
+        folder: Where recordings and policies go.
+        threads: Simulation threads.
+    """
+    row: Row = {
+        "bench": "go2-loop", "profile": profile, "seed": seed, "steps": steps if train else 0, "error": "",
+    }  # fmt: skip
+    try:
+        truth, out = draw_truth(profile, seed), folder / f"{profile}_{seed}"
+        out.mkdir(parents=True, exist_ok=True)
+        began = time.process_time()
+        dataset = recorded(truth, out)
+        found = calibrate(
+            Calibrate(
+                dataset=dataset, out=out, space="walk", holdout=(1,), seed=seed, threads=threads,
+                report=False, advise=False, quiet=True,
+            )
+        )  # fmt: skip
+        row |= calibration_part(found.result, truth)
+        row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
+        row |= policies_part(found.result, truth, steps, out, train=train)
+    except DealHwError as err:
+        row["error"] = f"{type(err).__name__}: {err}"
+    return row
+
+
+def recorded(truth: Truth, out: Path) -> Path:
+    """Let the shipped policy walk the profile and another one, and record both; return the dataset."""
+    folder, policy = out / "dataset", _shipped()
+    with Dataset.create_or_open(folder, DRIVER) as store:
+        for name, script, seconds in (("profile", PROFILE, PROFILE_S), ("heldout", HELDOUT, HELDOUT_S))[
+            len(store.episodes) :
+        ]:
+            source = ScriptVelocity(write_script(out / f"{name}.csv", script))
+            path = store.next_episode_path()
+            done = walk(truth, policy, source, seconds, path, {"robot": "go2", "seconds": seconds})
+            store.note_episode(path, {"outcome": done.report.outcome.value, "task": "walk"})
+    return folder
+
+
+def calibration_part(result: CalibrationResult, truth: Truth) -> Row:
+    """Return the row's part that concerns calibration."""
+    true = truth.walk_parameters()
+    names = result.space.names
+    values = np.array([true[name] for name in names])
+    inside = (result.interval[:, 0] <= values) & (values <= result.interval[:, 1])
+    known = result.space.known
+    row: Row = {
+        "heldout_nrmse_nominal": result.heldout_nrmse["nominal"],
+        "heldout_nrmse_calibrated": result.heldout_nrmse["calibrated"],
+        "heldout_ratio": result.heldout_nrmse["calibrated"] / result.heldout_nrmse["nominal"],
+        "payload_kg_true": truth.payload_kg,
+        "payload_error_kg": known.get("base.mass", np.nan) - true["base.mass"],
+        "latency_ms_true": truth.latency_ms,
+        "latency_ms_found": 1e3 * result.latency_s,
+        "alarms": [alarm.seen for alarm in result.alarms],
+        "per_parameter": {
+            name: {
+                "truth": float(values[k]),
+                "estimate": float(result.estimate[k]),
+                "low": float(result.interval[k, 0]),
+                "high": float(result.interval[k, 1]),
+            }
+            for k, name in enumerate(names)
+        },
+    }
+    nominal = {p.name: p.nominal for p in walk_space()}
+    for kind in (*KINDS, "frictionloss", "friction"):
+        of_kind = [k for k, name in enumerate(names) if name.endswith(f".{kind}")]
+        before = np.array([nominal[names[k]] for k in of_kind])
+        row[f"{kind}_inside"] = float(inside[of_kind].mean())
+        row[f"{kind}_log_error"] = float(
+            np.median(np.abs(np.log(result.estimate[of_kind] / values[of_kind])))
+        )
+        row[f"{kind}_log_error_nominal"] = float(np.median(np.abs(np.log(before / values[of_kind]))))
+    return row
+
+
+def policies_part(result: CalibrationResult, truth: Truth, steps: int, out: Path, *, train: bool) -> Row:
+    """Fine-tune the shipped policy in three ways, and let all four walk."""
+    space = walk_space()
+    values = np.array([truth.walk_parameters()[name] for name in space.names])
+    shipped = _shipped()
+    start = Path(str(shipped_policy("go2"))).with_suffix(".safetensors")
+    under: Mapping[str, ParameterDistribution] = {
+        "udr_more": udr_distribution("go2"),
+        "calibrated": result.distribution(),
+        "oracle": ParameterDistribution.point(space, values, 1e-3 * truth.latency_ms),
+    }
+    row: Row = {}
+    for name in POLICIES if train else POLICIES[:1]:
+        policy = shipped
+        if name != "udr":
+            began, file = time.process_time(), out / f"{name}.onnx"
+            files = TrainingFiles(checkpoint=file.with_suffix(".safetensors"), start=start)
+            policy = train_policy("go2", under[name], file, seed=truth.seed, steps=steps, files=files)
+            row[f"cpu_seconds_train_{name}"] = round(time.process_time() - began, 1)
+        row |= {f"{key}_{name}": value for key, value in score(truth, policy, out).items()}
+    return row
+
+
+def score(truth: Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
+    """Let a policy walk the profile; return its errors by the truth [m/s, rad/s] and whether it fell."""
+    source = ScriptVelocity(write_script(out / "profile.csv", PROFILE))
+    done = walk(truth, policy, source, PROFILE_S, record=False)
+    error = None if done.wanted is None else velocity_error(done.track, done.wanted)
+    return {
+        "velocity_error": np.nan if error is None else error.velocity_m_s,
+        "yaw_error": np.nan if error is None else error.yaw_rad_s,
+        "fell": done.report.outcome is not Outcome.FINISHED,
+    }
+
+
+def line(row: Row) -> str:
+    """Return a row in words."""
+    head = f"go2-loop {row['profile']} seed {row['seed']}"
+    if row["error"]:
+        return f"{head}: {row['error']}"
+    walked = [n for n in POLICIES if f"velocity_error_{n}" in row]
+    errors = ", ".join(f"{n} {row[f'velocity_error_{n}']:.3f}" for n in walked)
+    return f"{head}: held-out ratio {row['heldout_ratio']:.2f}; velocity error [m/s]: {errors}"
+
+
+def summary(rows: Sequence[Row]) -> list[str]:
+    """Return what the rows say together: medians, falls, and the paired comparison with as long under UDR."""
+    if not rows:
+        return []
+    lines = [f"held-out ratio: median {np.median([row['heldout_ratio'] for row in rows]):.2f}"]
+    for kind in KINDS:
+        lines.append(
+            f"{kind}: median log error {np.median([row[f'{kind}_log_error'] for row in rows]):.3f} "
+            f"(nominal {np.median([row[f'{kind}_log_error_nominal'] for row in rows]):.3f}), "
+            f"{np.mean([row[f'{kind}_inside'] for row in rows]):.0%} in their 90 % intervals"
+        )
+    whole = [row for row in rows if "velocity_error_oracle" in row]
+    for name in POLICIES if whole else ():
+        found = [row[f"velocity_error_{name}"] for row in whole]
+        falls = sum(row[f"fell_{name}"] for row in whole)
+        lines.append(f"{name}: velocity error {np.mean(found):.3f} m/s, {falls} falls in {len(whole)} walks")
+    if whole:
+        gains = np.array([row["velocity_error_udr_more"] - row["velocity_error_calibrated"] for row in whole])
+        lines.append(
+            f"calibrated against as many steps more under UDR, paired: {gains.mean():.4f} m/s better on "
+            f"average, better for {int((gains > 0).sum())} of {len(gains)}"
+        )
+    return lines
+
+
+def _shipped() -> OnnxPolicy:
+    found = shipped_policy("go2")
+    if found is None:
+        raise DealHwError("no walking policy is shipped for the Go2; tools/train_demo_policy.py makes it")
+    return OnnxPolicy(found)

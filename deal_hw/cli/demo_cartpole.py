@@ -1,0 +1,116 @@
+"""The cart-pole's part of ``deal-hw demo``: balance the pole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.collect import Collect, collect
+from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
+from deal_hw.cli.deploy import Deploy, deploy
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.episode_report import RunReport
+from deal_hw.cli.link import LinkOptions
+from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.cli.train import Train, train
+from deal_hw.data.run_folder import RunFolder
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray
+
+EPISODES = 3
+
+
+def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+    """Collect, calibrate, train, deploy, inspect. See :class:`deal_hw.cli.demo.Part`."""
+    udr = shipped_policy("cartpole")
+    if udr is None:
+        raise ConfigurationError(
+            "no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it"
+        )
+    out, transport, episodes = config.folder, config.transport or "serial", config.episodes or EPISODES
+    truth_file = out / "truth.json"
+    options = (
+        "--transport", transport, "--profile", config.profile, "--seed", str(config.seed),
+        "--firmware", config.firmware, "--reveal-to", str(truth_file),
+    )  # fmt: skip
+    link = LinkOptions(transport=transport)
+    with EmulatorProcess("cartpole", *options) as emulator:
+        port = emulator.port
+        print(f"an emulated cart-pole ({config.profile}) with hidden physics is on {port}")
+        with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
+            for kind in ("rich", "chirp"):
+                collect(
+                    Collect(
+                        robot="cartpole", port=port, link=link, out=out, profile=kind, seed=config.seed
+                    )
+                )  # fmt: skip
+        with stages.stage("calibrate", "search, refinement, latency, intervals"):
+            found = calibrate(Calibrate(dataset=folder.dataset, out=out, seed=config.seed))
+        with stages.stage("calibrate deal", "the adversarial search alone, to compare with"):
+            beside = calibrate(
+                Calibrate(
+                    dataset=folder.dataset, out=out / "deal", method="deal", refine=False, seed=config.seed,
+                    quiet=True,
+                )
+            )  # fmt: skip
+        policy = folder.policies / "calibrated.onnx"
+        with stages.stage("train", "a policy under what is now known of the robot"):
+            train(
+                Train(
+                    robot="cartpole", distribution=found.files["distribution.json"], out=policy,
+                    steps=config.steps, seed=config.seed,
+                )
+            )  # fmt: skip
+        runs: dict[str, RunReport] = {}
+        for name, file in (("udr", udr), ("retrained", policy)):
+            with stages.stage(f"deploy {name}", f"{episodes} times 10 s over the port"):
+                runs[name] = deploy(
+                    Deploy(
+                        robot="cartpole", port=port, link=link, policy=file, dataset=out / f"deploy_{name}",
+                        episodes=episodes, task="balance",
+                    )
+                )  # fmt: skip
+    with stages.stage("inspect", "real, nominal and calibrated on one screen"):
+        rrd = show_first_episode(folder)
+    truth = read_truth(truth_file)
+    scores = {name: task_scores(out / f"deploy_{name}", episodes) for name in runs}
+    return Demonstrated(
+        found=found, truth=truth["parameters"], latency_s=truth["latency_s"],
+        measures=[
+            Measure(
+                name=name, unit=unit, heading=heading, values={p: score[:, i] for p, score in scores.items()}
+            )
+            for i, (name, unit, heading) in enumerate(
+                (
+                    ("angle_error_rad", "rad", "pole-angle error [rad]"),
+                    ("cart_speed_m_s", "m_s", "cart speed [m/s]"),
+                )
+            )
+        ],
+        comparison="policies on the robot, mean ± std over deployments (the paper's Table 2)",
+        run=runs["retrained"],
+        paths={"rrd": str(rrd), "mjcf": str(found.files["calibrated.xml"]), "policy": str(policy)},
+        beside=beside.result, beside_name="deal",
+    )  # fmt: skip
+
+
+def task_scores(dataset: Path, episodes: int) -> FloatArray:
+    """Return mean |pole angle| [rad] and mean |cart speed| [m/s] of each deployment, (E, 2).
+
+    What is missing of a run that the safety filter ended early counts as fallen: pi rad, and a cart at rest.
+    """
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.policies.evaluate import TASK_SECONDS, balance_result
+
+    store = Dataset.open(dataset)
+    scores = []
+    for index in range(len(store.episodes)):
+        recorded = store.read(index).trajectory
+        period_s = float(np.median(np.diff(recorded.device_s)))
+        result = balance_result(recorded.position, recorded.velocity, period_s, TASK_SECONDS)
+        scores.append((result.angle_error_rad, result.cart_speed_m_s))
+    # Episodes that were not run any more, because an earlier one was tripped, count like that one's worst.
+    scores += [(np.pi, 0.0)] * (episodes - len(scores))
+    return np.array(scores)

@@ -1,0 +1,199 @@
+"""The Go2's part of ``deal-hw demo``: walk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
+from deal_hw.cli.deploy import Deploy, deploy
+from deal_hw.cli.emulate_go2 import read_track
+from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.episode_report import EpisodeReport, RunReport
+from deal_hw.cli.link import LegOptions, LinkOptions
+from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.cli.train import Train, train
+from deal_hw.control.loop import Outcome
+from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
+from deal_hw.data.recording.reader import read_episode
+from deal_hw.data.run_folder import RunFolder
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import FloatArray
+
+STEPS: Final = 500_000
+"""Of the fine-tune: 100 s of a processor."""
+PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
+PROFILE: Final = (
+    (0.0, (0.0, 0.0, 0.0)),
+    (2.0, (1.0, 0.0, 0.0)),
+    (7.0, (0.0, 0.5, 0.0)),
+    (12.0, (0.0, 0.0, 1.0)),
+)
+"""What every policy walks: time [s], velocity ahead and to the left [m/s], turn [rad/s]."""
+PROFILE_S: Final = 17.0
+HELDOUT: Final = ((0.0, (0.6, 0.0, 0.5)), (3.0, (0.3, -0.3, 0.0)), (5.5, (0.8, 0.2, -0.4)))
+"""What only judges the calibration."""
+HELDOUT_S: Final = 8.0
+Script = tuple[tuple[float, tuple[float, float, float]], ...]
+
+
+def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+    """Walk, calibrate, fine-tune, walk again, inspect. See :class:`deal_hw.cli.demo.Part`."""
+    udr = shipped_policy("go2")
+    if udr is None:
+        raise ConfigurationError(
+            "no walking policy is shipped for the Go2; tools/train_demo_policy.py makes it"
+        )
+    out, episodes = config.folder, config.episodes or 1
+    profile, heldout = write_script(out / "profile.csv", PROFILE), write_script(out / "heldout.csv", HELDOUT)
+    walks: dict[str, _Walked] = {}
+    # The emulator runs only while the robot is needed: it takes a third of a processor.
+    with _emulated(config, "before") as robot:
+        with stages.stage("walk udr", f"stand up, walk {PROFILE_S:g} s, lie down; {episodes} times"):
+            walks["udr"] = robot.walk(udr, profile, PROFILE_S, folder.dataset, episodes)
+        with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities, to judge by"):
+            robot.walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
+    with stages.stage("calibrate", "gains and friction from joints, feet and IMU; payload from efforts"):
+        found = calibrate(
+            Calibrate(dataset=folder.dataset, out=out, space="walk", holdout=(episodes,), seed=config.seed)
+        )
+    policies = _fine_tuned(config, folder, stages, found, udr)
+    with _emulated(config, "after") as robot:
+        for name, policy in policies.items():
+            with stages.stage(f"walk {name}", "the same velocities again"):
+                walks[name] = robot.walk(policy, profile, PROFILE_S, out / f"walk_{name}", episodes)
+    with stages.stage("inspect", "real, nominal and calibrated on one screen"):
+        rrd = show_first_episode(folder)
+    truth = read_truth(out / "truth_after.json")
+    return Demonstrated(
+        found=found, truth=truth["walk_parameters"], latency_s=1e-3 * truth["latency_ms"],
+        measures=_measures(walks),
+        comparison="policies on the robot, mean ± std over walks, by the emulator's truth",
+        run=walks["calibrated"].report,
+        paths={
+            "rrd": str(rrd), "mjcf": str(found.files["calibrated.xml"]),
+            "policy": str(policies["calibrated"]),
+        },
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Walked:
+    """Walks of one policy: the report, and the file of where the base really was."""
+
+    report: RunReport
+    track: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Emulated:
+    """An emulated Go2 on its wire."""
+
+    port: str
+    link: LinkOptions
+    track: Path
+
+    def walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
+        """Let it walk."""
+        report = deploy(
+            Deploy(
+                robot="go2", port=self.port, link=self.link, legs=LegOptions(velocity=str(script)),
+                policy=policy, seconds=seconds, dataset=dataset, episodes=times, task="walk",
+            )
+        )  # fmt: skip
+        return _Walked(report=report, track=self.track)
+
+
+@contextmanager
+def _emulated(config: Demo, name: str) -> Iterator[_Emulated]:
+    """Yield the robot of the demo's seed; its truth and its track are in files of this name."""
+    out, transport = config.folder, config.transport or "dds"
+    if transport not in PORTS:
+        raise ConfigurationError(f"--transport {transport}: the Go2 is reached by {' or '.join(PORTS)}")
+    track = out / f"truth_track_{name}.csv"
+    with EmulatorProcess(
+        "go2", "--transport", transport, "--port", PORTS[transport], "--profile", config.profile,
+        "--seed", str(config.seed), "--reveal-to", str(out / f"truth_{name}.json"), "--track-to", str(track),
+    ) as emulator:  # fmt: skip
+        print(f"an emulated Go2 ({config.profile}) with hidden physics is on {emulator.port}")
+        yield _Emulated(port=emulator.port, link=LinkOptions(transport=transport), track=track)
+
+
+def write_script(path: Path, script: Script) -> Path:
+    """Write velocities as ``deploy --velocity`` reads them; return the file."""
+    rows = [",".join(f"{value:g}" for value in (time_s, *velocity)) for time_s, velocity in script]
+    path.write_text("\n".join(("time_s,x,y,yaw", *rows)) + "\n", encoding="utf-8")
+    return path
+
+
+def _fine_tuned(
+    config: Demo, folder: RunFolder, stages: Stages, found: CalibrateReport, udr: Path
+) -> Mapping[str, Path]:
+    """Fine-tune the shipped policy under what was found, and as long under UDR to compare with."""
+    policies = {name: folder.policies / f"{name}.onnx" for name in ("udr more", "calibrated")}
+    for name, policy in policies.items():
+        distribution = found.files["distribution.json"] if name == "calibrated" else None
+        with stages.stage(f"train {name}", "the shipped policy, some steps more"):
+            train(
+                Train(
+                    robot="go2", distribution=distribution, udr=distribution is None,
+                    start=udr.with_suffix(".safetensors"), out=policy, steps=config.steps or STEPS,
+                    seed=config.seed,
+                )
+            )  # fmt: skip
+    return policies
+
+
+def _errors(report: EpisodeReport, track: Track) -> tuple[VelocityError | None, bool]:
+    """Return the errors of a walk by the truth, and whether the robot fell or was stopped."""
+    fell = report.outcome is not Outcome.FINISHED
+    if report.path is None:
+        return None, fell
+    episode = read_episode(report.path)
+    wanted = wanted_velocity(episode.trajectory)
+    if wanted is None:
+        return None, fell
+    # The track is on the robot's clock, what is wanted on the host's.
+    late = float(np.median(episode.trajectory.receive_s - episode.trajectory.device_s))
+    shifted = Track(track.time_s - episode.device_start_ns * 1e-9 + late, track.place, track.heading)
+    return velocity_error(shifted, wanted), fell
+
+
+def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
+    """Return errors by the truth, by the robot's own sensors, and falls."""
+    tracks = {name: read_track(walk.track) for name, walk in walks.items()}
+    true = {
+        name: [_errors(report, tracks[name]) for report in walk.report.episodes]
+        for name, walk in walks.items()
+    }
+    own = {name: [report.walk for report in walk.report.episodes] for name, walk in walks.items()}
+
+    def each(errors: Mapping[str, Sequence[VelocityError | None]], name: str) -> dict[str, FloatArray]:
+        return {
+            policy: np.array([np.nan if one is None else getattr(one, name) for one in found])
+            for policy, found in errors.items()
+        }
+
+    judged = {name: [error for error, _ in found] for name, found in true.items()}
+    falls = {name: np.array([float(fell) for _, fell in found]) for name, found in true.items()}
+    return [
+        Measure(
+            name="velocity_error_m_s", unit="m_s", heading="velocity error [m/s]",
+            values=each(judged, "velocity_m_s"),
+        ),
+        Measure(
+            name="yaw_error_rad_s", unit="rad_s", heading="yaw rate error [rad/s]",
+            values=each(judged, "yaw_rad_s"),
+        ),
+        Measure(
+            name="estimated_velocity_error_m_s", unit="m_s", heading="its own estimate [m/s]",
+            values=each(own, "velocity_m_s"),
+        ),
+        Measure(name="falls", heading="falls", values=falls),
+    ]  # fmt: skip
