@@ -37,6 +37,8 @@ BASE_QUANTITIES = ("gravity", "heading", "angular_velocity", "linear_velocity", 
 vectors), angular [rad/s] and linear velocity [m/s]; and the base's height [m], whose axis is z."""
 BASE_SIZE = 6
 
+VERDICT: Final = "calibration_verdict"
+"""Key in a policy's training record: the colour of the calibration that it was trained under."""
 MAX_DELAY: Final = 100
 """Most control periods that an observation may look back: 2 s at 50 Hz."""
 MAX_TERMS: Final = 4096

@@ -236,7 +236,8 @@ def write_result(
         with published_together(folder) as waiting:
             names = [RESULT_FILE, DISTRIBUTION, TRACE]
             write_json(waiting / RESULT_FILE, result.to_json())
-            write_json(waiting / DISTRIBUTION, result.distribution().to_json())
+            judged = {"verdict": trust(result).colour}
+            write_json(waiting / DISTRIBUTION, result.distribution().to_json() | judged)
             np.savez(waiting / TRACE, **_trace(result))
             if report is not None:
                 write_report(waiting / REPORT, report)

@@ -37,6 +37,9 @@ class Deploy(RunOptions):
     task: str = ""
     """What the policy is to do, in words, for the recording."""
 
+    trust_calibration: bool = False
+    """Run a policy that was trained under a calibration whose verdict is red, without asking."""
+
     dry_run: bool = False
     """Compute everything and send nothing: the robot is neither homed nor armed."""
 
@@ -56,6 +59,7 @@ def deploy(config: Deploy) -> RunReport:
         seconds=config.seconds,
         seed=config.seed,
         dry_run=config.dry_run,
+        trust_calibration=config.trust_calibration,
         home=not config.dry_run,
     )
     return run_episodes(

@@ -29,7 +29,7 @@ from deal_hw.control.velocity import BoundedSource, VelocitySource, limited_axes
 from deal_hw.control.vigor import with_vigor
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
-from deal_hw.policy import Policy
+from deal_hw.policy import VERDICT, Policy
 from deal_hw.schema import OPEN, from_values
 from deal_hw.transport import WireOptions
 
@@ -46,6 +46,7 @@ class RunPlan:
         transport: Name of the transport.
         profile: What it does.
         policy: Policy file; "" for none.
+        trust_calibration: Whether to run a policy that was trained under a calibration whose verdict is red.
         policy_digest: SHA-256 of the policy file that was checked, the only one that will be opened; "" where
             none was.
         recording: Episode to replay; "" for none.
@@ -75,6 +76,7 @@ class RunPlan:
     transport: str = "serial"
     profile: Profile = "balance"
     policy: str = ""
+    trust_calibration: bool = False
     policy_digest: str = ""
     recording: str = ""
     seconds: float = 4.0
@@ -158,6 +160,8 @@ def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
             policy = stack.enter_context(TrialPolicy(Path(plan.policy)))
             try_policy(policy, description)
             digests.append(policy.digest)
+            if policy.spec.training.get(VERDICT) == "red" and not plan.trust_calibration:
+                _ask(Path(plan.policy))
             walks = plan.profile not in ("excite", "rich")
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
             if limited:
@@ -170,6 +174,23 @@ def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
 
         make_behaviour(plan, description, load=load)
     return dataclasses.replace(plan, policy_digest=digests[-1])
+
+
+def _ask(policy: Path) -> None:
+    """Ask whether to run a policy that was trained under a calibration that is not to be used.
+
+    Raises:
+        PolicyError: The answer is no, or nobody is there to ask.
+    """
+    seen = (
+        f"{policy.name} was trained under a calibration whose verdict is red: it explains the robot worse "
+        "than the model did, or nothing says otherwise"
+    )
+    if not sys.stdin.isatty():
+        raise PolicyError(f"{seen}; calibrate again and retrain, or run it with --trust-calibration")
+    print(f"warning: {seen}", file=sys.stderr)
+    if input("run it all the same? [y/N] ").strip().lower() not in ("y", "yes"):
+        raise PolicyError("not run; calibrate again and retrain")
 
 
 def _open_policy(plan: RunPlan) -> Policy:

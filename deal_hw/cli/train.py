@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.policy import VERDICT
 from deal_hw.reading import read_json, reading
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def train(config: Train) -> OnnxPolicy:
         )  # fmt: skip
         policy = train_policy(
             config.robot, distribution, path, trainer=config.trainer, seed=config.seed, steps=config.steps,
-            members=config.members, progress=_follow(bar), files=files,
+            members=config.members, progress=_follow(bar), files=files, verdict=_verdict(config),
         )  # fmt: skip
     print(f"policy: {path}")
     print(f"record: {path.with_suffix('.json')}")
@@ -123,6 +124,7 @@ def train_policy(
     members: int | None = None,
     progress: TrainingProgress | None = None,
     files: TrainingFiles | None = None,
+    verdict: str = "",
 ) -> OnnxPolicy:
     """Train a policy and write it with its training record.
 
@@ -136,6 +138,7 @@ def train_policy(
         members: Robots simulated at once; None for the default.
         progress: Called as the training goes on.
         files: Checkpoint, TensorBoard files, and the word to stop.
+        verdict: Colour of the calibration that the distribution is of; "" where it is of none.
 
     Returns:
         The policy, read back from its file.
@@ -178,7 +181,9 @@ def train_policy(
         "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
         "resumed": bool(spent),
     }
-    return export_network(policy.network, policy.spec, path, record)
+    # Who deploys the policy is told what the calibration's verdict was.
+    training = {**policy.spec.training, **({VERDICT: verdict} if verdict else {})}
+    return export_network(policy.network, dataclasses.replace(policy.spec, training=training), path, record)
 
 
 def _spent(record: Path) -> dict[str, float]:
@@ -244,6 +249,15 @@ def read_distribution(path: Path) -> ParameterDistribution:
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
     with reading(path, what, advice, error=ConfigurationError):
         return ParameterDistribution.from_json(values)
+
+
+def _verdict(config: Train) -> str:
+    """Return the colour that the calibration noted beside its distribution; "" where there is none."""
+    if config.distribution is None:
+        return ""
+    what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
+    values = read_json(config.distribution, dict[str, Any], what, advice, error=ConfigurationError)
+    return str(values.get("verdict", ""))
 
 
 def _space(robot: str) -> ParameterSpace:

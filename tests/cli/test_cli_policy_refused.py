@@ -11,10 +11,12 @@ import onnx
 import pytest
 
 from deal_hw.cli.main import main
-from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.cli.run_plan import RunPlan, check_plan, shipped_policy
 from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import SPEC_KEY
+from deal_hw.policy import VERDICT
 from deal_hw.testing.faulty_policy import faulty_policy
 
 REFUSED = 2
@@ -93,3 +95,29 @@ def test_a_policy_that_would_not_run_is_refused(tmp_path: Path, deploy: Callable
     assert "--policy would have no effect: --profile hold runs no policy" in deploy(
         tmp_path / "nothing.onnx", *verb
     )
+
+
+def test_a_policy_of_a_red_calibration_is_asked_about(
+    tmp_path: Path, deploy: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a terminal it is refused; with one the answer decides, and so does the option."""
+    path = edited(tmp_path / "p.onnx", lambda spec: spec["training"].update({VERDICT: "red"}))
+    said = deploy(path)
+    assert "verdict is red" in said and "--trust-calibration" in said and "no-port" not in said
+    assert "no-port" in deploy(path, "deploy", "cartpole", "--trust-calibration")
+    amber = edited(tmp_path / "a.onnx", lambda spec: spec["training"].update({VERDICT: "amber"}))
+    assert "no-port" in deploy(amber)
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    asked: list[str] = []
+
+    def answer(words: str) -> str:
+        asked.append(words)
+        return "no" if len(asked) == 1 else "y"
+
+    monkeypatch.setattr("builtins.input", answer)
+    plan = RunPlan(robot="cartpole", policy=str(path))
+    with pytest.raises(PolicyError, match="not run; calibrate again"):
+        check_plan(plan, DESCRIPTION)
+    assert check_plan(plan, DESCRIPTION).policy_digest
+    assert len(asked) == 2

@@ -17,6 +17,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policy import VERDICT
 from deal_hw.training import TrainingProgress, TrainingStatus
 
 STEPS = 1_200
@@ -30,11 +31,12 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(tmp_path: Path)
         space=space, mean=space.nominal, covariance=0.01 * np.eye(len(space)), latency_s=(0.01, 0.012)
     )
     file = tmp_path / "distribution.json"
-    file.write_text(json.dumps(distribution.to_json()), encoding="utf-8")
+    file.write_text(json.dumps(distribution.to_json() | {"verdict": "amber"}), encoding="utf-8")
     train(Train(distribution=file, out=tmp_path, steps=STEPS, members=8, seed=4, quiet=True))
     policy = OnnxPolicy(tmp_path / "policies" / "policy.onnx")
     policy.spec.check_fits(DESCRIPTION)
     assert policy.spec.trained_under == distribution.digest()
+    assert policy.spec.training[VERDICT] == "amber"
     record = json.loads((tmp_path / "policies" / "policy.json").read_text(encoding="utf-8"))
     assert ParameterDistribution.from_json(record["distribution"]).digest() == distribution.digest()
     assert record["training"]["config"]["steps"] == STEPS
