@@ -48,7 +48,7 @@ from deal_hw.calib.validation.cross_validation import (
 )
 from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_halves
 from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
-from deal_hw.calibration import Alarm, CalibrationMethod, CalibrationResult
+from deal_hw.calibration import Z90, Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.types import FloatArray
@@ -74,6 +74,11 @@ class OutputErrorSettings:
             the fit's own residual, from smoothed start states.
         first: The fit from the model's own values that says what residuals to expect.
         robust: Large residuals weigh less (Huber) in all fits.
+        fitted_s: So much of the recordings, evenly spread in stretches, is fitted [s]; infinite for all.
+        hold_first: Intervals hold the first fit's estimate, too, and the covariance its distance: what the
+            model lacks pulls each length of windows elsewhere.
+        force_std: All forces may be off together by this share: no motion on feet tells them from the mass,
+            which is known by other means.
     """
 
     horizons_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
@@ -86,6 +91,9 @@ class OutputErrorSettings:
     mismatch_s: float = 0.4
     first: Recipe = SHORT
     robust: bool = False
+    fitted_s: float = np.inf
+    hold_first: bool = False
+    force_std: float = 0.0
 
     @property
     def long_s(self) -> float:
@@ -126,6 +134,9 @@ class OutputErrorFits(Fits):
         settings, problem = self.settings, run.problem
         if run.settings.cross_validation:
             problem = _whole(problem)
+        if np.isfinite(settings.fitted_s):
+            parts = [p for e in problem.episodes for p in stretches(e, settings.stretch_s) if p.usable.any()]
+            problem = problem.on(spread(parts, settings.fitted_s), problem.known_std)
         run.say("residual", "fits short windows from the model's own values")
         first = fit_output_error(problem, problem.space.nominal, problem.first_latency_s, settings.first)
         searched = run.attempts.run(self._reduced(problem, first), 0, run.budget, run.progress)
@@ -144,6 +155,10 @@ class OutputErrorFits(Fits):
         known = _known(problem, fit)
         halves = self._halves(problem, fit, recipe, known)
         known = widened_by_halves(problem, known, theta, halves)
+        if settings.hold_first:
+            known = _holding(problem, known, theta, first.theta)
+        if settings.force_std:
+            known = _scaled_together(problem, known, theta, settings.force_std)
         facts: dict[str, Any] = {}
         if run.local is not None:
             # Windows whose start states are fitted show what the model lacks, not what smoothing lacks.
@@ -309,10 +324,15 @@ def local() -> Calibration:
 
 
 GAIT = OutputErrorSettings(
-    horizons_s=(0.2,), compared_s=0.1, mismatch_s=0.0, first=Recipe(seconds=0.1, robust=True), robust=True
-)
-"""Half a step of the gait. Shorter windows are ruled by the errors of their start states: of an emulated Go2
-the gains came out 8 % too low with 0.1 s and 4 % with 0.2 s. In longer ones most feet land or slide."""
+    horizons_s=(0.2,), compared_s=0.1, mismatch_s=0.0, first=Recipe(seconds=0.1, robust=True, iterations=12),
+    robust=True, fitted_s=9.0, stretch_s=1.5, half_iterations=2, hold_first=True,
+    force_std=0.05,
+)  # fmt: skip
+"""Half a step of the gait, and a quarter: shorter windows are ruled by the errors of their start states, in
+longer ones most feet land or slide. A robot that weighs itself by its motors' efforts is taken to be right to
+5 %."""
+FORCES = ("servo_stiffness", "servo_damping", "dof_frictionloss")
+"""Kinds of parameters that scale with all forces."""
 
 
 def gait() -> Calibration:
@@ -322,6 +342,30 @@ def gait() -> Calibration:
     """
     settings = Validation(local_first=False, cross_validation=False)
     return Calibration(Nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
+
+
+def _scaled_together(problem: Problem, known: Uncertainty, theta: FloatArray, std: float) -> Uncertainty:
+    """Return what is known where all forces may be off together by a share, one standard deviation."""
+    space = problem.space
+    factor = np.array([1.0 + std * (p.kind in FORCES) for p in space])
+    moved = space.to_scale(theta * factor)
+    along = moved - space.to_scale(theta)
+    covariance = known.covariance.copy()
+    covariance[: len(along), : len(along)] += np.outer(along, along)
+    at, ends = space.to_scale(theta), space.to_scale(known.interval.T)
+    sides = np.sign(ends - at) * np.hypot(ends - at, Z90 * along)
+    interval = np.stack(list(space.from_scale(at + sides)), axis=1)
+    return dataclasses.replace(known, interval=interval, covariance=covariance)
+
+
+def _holding(problem: Problem, known: Uncertainty, theta: FloatArray, other: FloatArray) -> Uncertainty:
+    """Return what is known, with another estimate, (K,), inside of the intervals."""
+    apart = problem.space.to_scale(other) - problem.space.to_scale(theta)
+    low, high = known.interval.T
+    covariance = known.covariance.copy()
+    covariance[: len(apart), : len(apart)] += np.outer(apart, apart)
+    interval = np.stack([np.minimum(low, other), np.maximum(high, other)], axis=1)
+    return dataclasses.replace(known, interval=interval, covariance=covariance)
 
 
 def _whole(problem: Problem) -> Problem:

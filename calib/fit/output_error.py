@@ -180,7 +180,7 @@ def expected_residual(problem: Problem) -> FloatArray:
 
 def _errors(data: WindowData, residual: FloatArray) -> FloatArray:
     """Return prediction minus measurement, (W, H, M), of whitened residuals; 0 where nothing was reported."""
-    return np.asarray(np.where(np.isfinite(data.std), np.nan_to_num(residual) * data.std, 0.0))
+    return np.asarray(np.nan_to_num(residual) * np.where(np.isfinite(data.std), data.std, 0.0))
 
 
 def _weighed(
