@@ -7,6 +7,7 @@ under uniform randomisation, under the calibrated distribution, and under the tr
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -34,6 +35,9 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingFiles
 
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
+WALKS: Final = 3
+NEXT_NOISE: Final = 100_000
+"""From the seed of one walk's noise to the next one's."""
 KINDS: Final = ("stiffness", "damping")
 
 
@@ -158,15 +162,20 @@ def policies_part(result: CalibrationResult, truth: Truth, steps: int, out: Path
 
 
 def score(truth: Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
-    """Let a policy walk the profile; return its errors by the truth [m/s, rad/s] and whether it fell."""
-    source = ScriptVelocity(write_script(out / "profile.csv", PROFILE))
-    done = walk(truth, policy, source, PROFILE_S, record=False)
-    error = None if done.wanted is None else velocity_error(done.track, done.wanted)
-    return {
-        "velocity_error": np.nan if error is None else error.velocity_m_s,
-        "yaw_error": np.nan if error is None else error.yaw_rad_s,
-        "fell": done.report.outcome is not Outcome.FINISHED,
-    }
+    """Let a policy walk the profile some times, with other noise each; return its errors by the truth.
+
+    Mean errors [m/s, rad/s] of the walks that lasted long enough to be judged, and how often it fell.
+    """
+    source, errors, falls = ScriptVelocity(write_script(out / "profile.csv", PROFILE)), [], 0
+    for number in range(WALKS):
+        noisy = dataclasses.replace(truth, seed=truth.seed + number * NEXT_NOISE)
+        done = walk(noisy, policy, source, PROFILE_S, record=False)
+        falls += done.report.outcome is not Outcome.FINISHED
+        error = None if done.wanted is None else velocity_error(done.track, done.wanted)
+        if error is not None:
+            errors.append((error.velocity_m_s, error.yaw_rad_s))
+    velocity, yaw = np.mean(errors, axis=0) if errors else (np.nan, np.nan)
+    return {"velocity_error": float(velocity), "yaw_error": float(yaw), "falls": falls}
 
 
 def line(row: Row) -> str:
@@ -193,8 +202,10 @@ def summary(rows: Sequence[Row]) -> list[str]:
     whole = [row for row in rows if "velocity_error_oracle" in row]
     for name in POLICIES if whole else ():
         found = [row[f"velocity_error_{name}"] for row in whole]
-        falls = sum(row[f"fell_{name}"] for row in whole)
-        lines.append(f"{name}: velocity error {np.mean(found):.3f} m/s, {falls} falls in {len(whole)} walks")
+        falls = sum(row[f"falls_{name}"] for row in whole)
+        lines.append(
+            f"{name}: velocity error {np.mean(found):.3f} m/s, {falls} falls in {WALKS * len(whole)} walks"
+        )
     if whole:
         gains = np.array([row["velocity_error_udr_more"] - row["velocity_error_calibrated"] for row in whole])
         lines.append(

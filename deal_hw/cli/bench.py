@@ -95,7 +95,7 @@ class Bench:
     train: bool = True
     """Train and deploy policies with the default method."""
 
-    steps: Annotated[int, Range(1, 10**9)] = 500_000
+    steps: Annotated[int, Range(1, 10**9)] = 300_000
     """go2-loop: steps of each fine-tune."""
 
     out: Path | None = None

@@ -58,7 +58,7 @@ class Demo(Checked):
     """Go2: calibrate from a recording with its body on a stand instead of from its walk."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
-    """Training steps. Cart-pole: by default those of the shipped UDR policy. Go2: 500,000, from the shipped
+    """Training steps. Cart-pole: by default those of the shipped UDR policy. Go2: 300,000, from the shipped
     policy on."""
 
     def __post_init__(self) -> None:
@@ -216,12 +216,12 @@ def read_truth(path: Path) -> dict[str, Any]:
     return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
 
 
-def show_first_episode(folder: RunFolder) -> Path:
-    """Write the first recording with what nominal and calibrated model predict of it; return the file."""
+def show_first_episode(folder: RunFolder, dataset: Path | None = None) -> Path:
+    """Write a first recording, of this run by default, beside what both models predict; return the file."""
     from deal_hw.cli.inspect_ import Inspect, inspect
 
     rrd = folder.path / "inspect.rrd"
-    episode = folder.dataset / "episodes" / "000000.mcap"
+    episode = (dataset or folder.dataset) / "episodes" / "000000.mcap"
     inspect(Inspect(episode=episode, calibration=folder.calibration, save=rrd))
     return rrd
 

@@ -10,7 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from deal_hw.calib.validation.verdict import trust
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
+from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.emulate_go2 import read_track
@@ -18,16 +20,18 @@ from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.episode_report import EpisodeReport, RunReport
 from deal_hw.cli.link import LegOptions, LinkOptions
 from deal_hw.cli.run_plan import shipped_policy
-from deal_hw.cli.train import Train, train
+from deal_hw.cli.train import Train, read_distribution, train
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
+from deal_hw.data.files import write_json
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.run_folder import RunFolder
+from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
-STEPS: Final = 500_000
-"""Of the fine-tune: 100 s of a processor."""
+STEPS: Final = 300_000
+"""Of the fine-tune: a minute of a processor."""
 PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
 PROFILE: Final = (
     (0.0, (0.0, 0.0, 0.0)),
@@ -59,20 +63,27 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
             walks["udr"] = robot.walk(udr, profile, PROFILE_S, folder.dataset, episodes)
         with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities, to judge by"):
             robot.walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
-    with stages.stage("calibrate", "gains and friction from joints, feet and IMU; payload from efforts"):
-        found = calibrate(
-            Calibrate(dataset=folder.dataset, out=out, space="walk", holdout=(episodes,), seed=config.seed)
-        )
-    policies = _fine_tuned(config, folder, stages, found, udr)
+    if config.hung:
+        found, distribution = _on_stand(config, folder, stages)
+    else:
+        with stages.stage("calibrate", "gains and friction from joints, feet and IMU; payload from efforts"):
+            found = calibrate(
+                Calibrate(
+                    dataset=folder.dataset, out=out, space="walk", holdout=(episodes,), seed=config.seed
+                )
+            )  # fmt: skip
+        distribution = found.files["distribution.json"]
+    policies = _fine_tuned(config, folder, stages, distribution, udr)
     with _emulated(config, "after") as robot:
         for name, policy in policies.items():
             with stages.stage(f"walk {name}", "the same velocities again"):
                 walks[name] = robot.walk(policy, profile, PROFILE_S, out / f"walk_{name}", episodes)
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
-        rrd = show_first_episode(folder)
+        rrd = show_first_episode(folder, out / "dataset_hung" if config.hung else None)
     truth = read_truth(out / "truth_after.json")
+    true = truth["parameters_at_kp20_kd1.5" if config.hung else "walk_parameters"]
     return Demonstrated(
-        found=found, truth=truth["walk_parameters"], latency_s=1e-3 * truth["latency_ms"],
+        found=found, truth=true, latency_s=1e-3 * truth["latency_ms"],
         measures=_measures(walks),
         comparison="policies on the robot, mean ± std over walks, by the emulator's truth",
         run=walks["calibrated"].report,
@@ -111,7 +122,7 @@ class _Emulated:
 
 
 @contextmanager
-def _emulated(config: Demo, name: str) -> Iterator[_Emulated]:
+def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
     """Yield the robot of the demo's seed; its truth and its track are in files of this name."""
     out, transport = config.folder, config.transport or "dds"
     if transport not in PORTS:
@@ -120,6 +131,7 @@ def _emulated(config: Demo, name: str) -> Iterator[_Emulated]:
     with EmulatorProcess(
         "go2", "--transport", transport, "--port", PORTS[transport], "--profile", config.profile,
         "--seed", str(config.seed), "--reveal-to", str(out / f"truth_{name}.json"), "--track-to", str(track),
+        *options,
     ) as emulator:  # fmt: skip
         print(f"an emulated Go2 ({config.profile}) with hidden physics is on {emulator.port}")
         yield _Emulated(port=emulator.port, link=LinkOptions(transport=transport), track=track)
@@ -132,13 +144,41 @@ def write_script(path: Path, script: Script) -> Path:
     return path
 
 
+def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path]:
+    """Record the same robot on a stand and calibrate from that.
+
+    Returns:
+        The calibration, and the file of what it says of the robot on the floor.
+    """
+    out, dataset = config.folder, config.folder / "dataset_hung"
+    with _emulated(config, "hung", "--suspended") as robot:
+        with stages.stage("collect on a stand", "10 s of a multisine, and 8 s of a sweep to judge by"):
+            for excite, seconds in (("multisine", 10.0), ("chirp", 8.0)):
+                collect(
+                    Collect(
+                        robot="go2_hung", port=robot.port, link=robot.link, dataset=dataset, excite=excite,
+                        seconds=seconds, seed=config.seed,
+                    )
+                )  # fmt: skip
+    with stages.stage("calibrate", "gains, friction and armature of each joint"):
+        found = calibrate(
+            Calibrate(
+                dataset=dataset, out=out, holdout=(1,), method="local", sample_hz=100.0, seed=config.seed
+            )
+        )
+    file = out / "distribution_floor.json"
+    values = on_floor(read_distribution(found.files["distribution.json"])).to_json()
+    write_json(file, values | {"verdict": trust(found.result).colour})
+    return found, file
+
+
 def _fine_tuned(
-    config: Demo, folder: RunFolder, stages: Stages, found: CalibrateReport, udr: Path
+    config: Demo, folder: RunFolder, stages: Stages, found: Path, udr: Path
 ) -> Mapping[str, Path]:
     """Fine-tune the shipped policy under what was found, and as long under UDR to compare with."""
     policies = {name: folder.policies / f"{name}.onnx" for name in ("udr more", "calibrated")}
     for name, policy in policies.items():
-        distribution = found.files["distribution.json"] if name == "calibrated" else None
+        distribution = found if name == "calibrated" else None
         with stages.stage(f"train {name}", "the shipped policy, some steps more"):
             train(
                 Train(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
 
+from deal_hw.cli import demo_go2
 from deal_hw.cli.demo import Demo, demo
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
@@ -38,6 +40,51 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     assert json.loads((folder / "run.json").read_text())["status"] == "finished"
     printed = capsys.readouterr().out
     assert "cart.mass" in printed and "retrained" in printed and "held-out error" in printed
+
+
+@pytest.mark.slow
+def test_demo_of_the_go2_walks_calibrates_and_walks_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short walk over Zenoh, a few steps of training: all stages leave files, the truth stays apart."""
+    monkeypatch.setattr(demo_go2, "PROFILE", ((0.0, (0.8, 0.0, 0.0)), (3.0, (0.0, 0.4, 0.8))))
+    monkeypatch.setattr(demo_go2, "PROFILE_S", 6.0)
+    folder = tmp_path / "demo"
+    report = demo(Demo(robot="go2", transport="zenoh", out=folder, profile="sensor", seed=2, steps=4800))
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary == json.loads(json.dumps(report.summary))
+    assert sum(name.endswith((".stiffness", ".damping")) for name in summary["parameters"]) == 24
+    assert summary["heldout_nrmse"]["calibrated"] < 0.6 * summary["heldout_nrmse"]["nominal"]
+    assert set(summary["velocity_error_m_s"]) == {"udr", "udr more", "calibrated"}
+    for name in ("udr", "udr more", "calibrated"):
+        assert summary["falls"][name] == 0.0
+        true, own = (summary[key][name] for key in ("velocity_error_m_s", "estimated_velocity_error_m_s"))
+        assert own == pytest.approx(true, abs=0.06)
+    assert OnnxPolicy(summary["paths"]["policy"]).spec.training["calibration_verdict"] in ("green", "amber")
+    # No recording that a calibrator reads holds where the base really was.
+    assert (folder / "truth_track_before.csv").exists()
+    assert not list((folder / "dataset").rglob("*truth*"))
+    printed = capsys.readouterr().out
+    assert "FL_hip_joint.stiffness" in printed and "its own estimate" in printed
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"robot": "go2", "firmware": "host"}, "--firmware would have no effect: only the demo of cartpole"),
+        ({"hung": True}, "--hung would have no effect: only the demo of go2"),
+    ],
+)
+def test_what_is_another_robots_is_refused(config: dict[str, Any], words: str) -> None:
+    """An option that would be ignored is refused, before anything is started."""
+    with pytest.raises(ConfigurationError, match=words):
+        Demo(**config)
+
+
+def test_a_demo_of_the_go2_over_a_wire_that_it_has_not(tmp_path: Path) -> None:
+    """The message names the wires that it has."""
+    with pytest.raises(ConfigurationError, match="reached by dds or zenoh"):
+        demo(Demo(robot="go2", transport="serial", out=tmp_path / "demo"))
 
 
 def test_demo_does_not_touch_a_folder_that_is_not_its_own(tmp_path: Path) -> None:

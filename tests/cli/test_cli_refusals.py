@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
-from deal_hw.cli import demo as demo_module
+from deal_hw.cli import demo_cartpole as demo_module
 from deal_hw.cli.main import EXIT_ERROR, VERBS, main
 from deal_hw.cli.train import udr_distribution
 from deal_hw.cli.virtual import VirtualCartpole

@@ -26,10 +26,10 @@ def test_the_shipped_policy_walks_where_it_is_told(
     policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A hidden robot of the profile `realistic`: no trip, ahead at 1 m/s within 0.2 m/s and 0.2 rad/s."""
-    monkeypatch.setattr(
-        measure_go2_walk, "ROUND", (("stand", 1.5, (0.0, 0.0, 0.0)), ("ahead", 3.0, (1.0, 0.0, 0.0)))
-    )
-    row = measure_go2_walk.walk(policy, "realistic", 0, 1)
+    monkeypatch.setattr(measure_go2_walk, "PROFILE", ((0.0, (0.0, 0.0, 0.0)), (1.5, (1.0, 0.0, 0.0))))
+    monkeypatch.setattr(measure_go2_walk, "PROFILE_S", 4.5)
+    monkeypatch.setattr(measure_go2_walk, "NAMES", ("stand", "ahead"))
+    row = measure_go2_walk.measure(policy, "realistic", 0, 1)
     assert (row["outcome"], row["reason"]) == ("finished", "the run is over")
     assert row["parts"]["ahead"]["ahead"] == pytest.approx(1.0, abs=0.2)
     assert row["velocity_error_m_s"] < 0.2 and row["yaw_error_rad_s"] < 0.2

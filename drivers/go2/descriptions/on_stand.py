@@ -10,13 +10,20 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Final
 
+import numpy as np
+
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.go2.descriptions import on_stand_recording
+from deal_hw.drivers.go2.descriptions import floor, on_stand_recording
 from deal_hw.drivers.go2.descriptions.driver import DRIVER, driver_limits, legs_on_stand
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as FLOOR
 from deal_hw.drivers.go2.descriptions.floor import STANDING_RAD, per_joint
+from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 
 MOTOR_HZ: Final = 1000.0
+LEAST_SHARE: Final = 0.1
+"""Of the damping that acts on the stand, so much at least is the motor's."""
+WIDEST: Final = 10.0
+"""Draws of what was found on the stand are not cut off within this factor of the model's own values."""
 REACH_RAD: Final[Mapping[str, float]] = {"hip": 0.3, "thigh": 0.4, "calf": 0.5}
 """Excitations keep so near the standing pose; the legs then stay 3 cm apart whatever the others do."""
 
@@ -52,3 +59,34 @@ DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
 
 SPACES: Final = on_stand_recording.SPACES
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""
+
+
+def on_floor(found: ParameterDistribution) -> ParameterDistribution:
+    """Return what a recording on the stand says of the robot on the floor, whose policies send other gains.
+
+    What a motor makes of a gain is a factor on it. On the stand the damping that acts is the motor's and the
+    joint's together; the joint's own is taken to be the model's, as no motion tells the two apart.
+
+    Args:
+        found: Over the parameter set ``default`` of this robot.
+    """
+    gains = {
+        "stiffness": (floor.STIFFNESS_NM_RAD / on_stand_recording.STIFFNESS_NM_RAD, 0.0),
+        "damping": (
+            floor.DAMPING_NMS_RAD / on_stand_recording.DAMPING_NMS_RAD,
+            on_stand_recording.JOINT_DAMPING_NMS_RAD,
+        ),
+    }
+    parameters, mean, spread = [], found.mean.copy(), np.ones(len(found.space))
+    for k, p in enumerate(found.space):
+        factor, offset = gains.get(p.name.rpartition(".")[2], (1.0, 0.0))
+        # Damping below the joint's own would leave nothing for the motor.
+        mean[k] = factor * max(found.mean[k] - offset, LEAST_SHARE * found.mean[k])
+        # On a log scale the same absolute uncertainty is a larger share of what is left.
+        spread[k] = factor * found.mean[k] / mean[k]
+        nominal = factor * (p.nominal - offset)
+        parameters.append(Parameter.around(p.name, p.kind, p.elements, p.unit, nominal, ratio=WIDEST))
+    covariance = None if found.covariance is None else found.covariance * np.outer(spread, spread)
+    return ParameterDistribution(
+        space=ParameterSpace(parameters), mean=mean, covariance=covariance, latency_s=found.latency_s
+    )
