@@ -48,6 +48,10 @@ HELDOUT_PROFILE = "chirp"
 DEFAULT = "default"
 GAIT_SMOOTHING_S = 0.04
 """Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
+WALK_TELLS = (
+    "a walk tells the gains of the joints and the floor's friction; it hardly tells their dry friction, not "
+    "their armature, and masses only where the motors' efforts weigh the robot (docs/calibration.md)"
+)
 WEIGHING_S = 0.35
 """A robot that is about to walk has stood still for so long [s]."""
 SAMPLES_A_PERIOD = 4
@@ -267,6 +271,8 @@ def usual_method(config: Calibrate, robot: RobotModel, *, walks: bool = False) -
     held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
     if walks:
         usual = "gait"
+        if not config.quiet:
+            print(WALK_TELLS, file=sys.stderr)
     elif config.recordings.model is not None and robot.base is None and held:
         usual = "output-error"
     else:

@@ -134,7 +134,9 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
         *options,
     ) as emulator:  # fmt: skip
         print(f"an emulated Go2 ({config.profile}) with hidden physics is on {emulator.port}")
-        yield _Emulated(port=emulator.port, link=LinkOptions(transport=transport), track=track)
+        # The raw bytes are nobody's need here, and half of the recorder's work.
+        link = LinkOptions(transport=transport, record_wire=False)
+        yield _Emulated(port=emulator.port, link=link, track=track)
 
 
 def write_script(path: Path, script: Script) -> Path:

@@ -1,0 +1,76 @@
+"""The Go2's loop bench: a row of a hidden robot, and what rows say together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deal_hw.bench import go2_loop
+from deal_hw.cli.bench import Bench
+from deal_hw.errors import ConfigurationError
+
+
+def row(seed: int, udr_more: float, calibrated: float, falls: int = 0) -> dict[str, Any]:
+    """Return a row with these velocity errors [m/s]."""
+    found: dict[str, Any] = {"profile": "sensor", "seed": seed, "error": "", "heldout_ratio": 0.3}
+    for kind in go2_loop.KINDS:
+        found |= {f"{kind}_log_error": 0.05, f"{kind}_log_error_nominal": 0.2, f"{kind}_inside": 0.75}
+    errors = {"udr": 0.1, "udr_more": udr_more, "calibrated": calibrated, "oracle": 0.05}
+    for name, error in errors.items():
+        found |= {f"velocity_error_{name}": error, f"yaw_error_{name}": 0.1, f"falls_{name}": 0}
+    return found | {"falls_calibrated": falls}
+
+
+def test_rows_are_compared_in_pairs_and_falls_are_counted() -> None:
+    """Robots differ more than policies: what counts is the difference on the same robot."""
+    lines = go2_loop.summary([row(0, 0.10, 0.08), row(1, 0.20, 0.19, falls=2), row(2, 0.10, 0.11)])
+    assert lines[-1].endswith("0.0067 m/s better on average, better for 2 of 3")
+    assert "calibrated: velocity error 0.127 m/s, 2 falls in 9 walks" in lines
+    assert lines[0] == "held-out ratio: median 0.30"
+    assert go2_loop.summary([]) == []
+
+
+def test_a_row_in_words_names_its_error_or_its_policies() -> None:
+    """An error alone, or the ratio and each policy that walked."""
+    assert go2_loop.line({**row(4, 0.1, 0.1), "error": "TrainingError: no"}).endswith("TrainingError: no")
+    assert go2_loop.line(row(4, 0.1, 0.1)).endswith(
+        "udr 0.100, udr_more 0.100, calibrated 0.100, oracle 0.050"
+    )
+
+
+def test_cells_are_told_apart_by_what_they_measure(tmp_path: Path) -> None:
+    """A seed without training is another cell than the same with it."""
+    some = {"profile": "sensor", "seeds": [0, 1], "steps": 10, "folder": tmp_path, "threads": 1}
+    trained, plain = (go2_loop.cells(**some, train=train) for train in (True, False))
+    assert [cell for cell, _ in trained.runs] == [("sensor", 0, 10), ("sensor", 1, 10)]
+    assert [cell for cell, _ in plain.runs] == [("sensor", 0, 0), ("sensor", 1, 0)]
+
+
+def test_steps_are_of_this_bench_alone() -> None:
+    """Elsewhere the option would be ignored."""
+    with pytest.raises(ConfigurationError, match="only `bench go2-loop` takes that"):
+        Bench(bench="honest", steps=10)
+
+
+@pytest.mark.slow
+def test_a_walk_tells_gains_payload_and_what_is_to_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 6 s of walking: gains nearer than nominal ones, the payload, and other walks half as wrong."""
+    monkeypatch.setattr(go2_loop, "PROFILE", ((0.0, (0.8, 0.0, 0.0)), (3.0, (0.0, 0.4, 0.8))))
+    monkeypatch.setattr(go2_loop, "PROFILE_S", 6.0)
+    monkeypatch.setattr(go2_loop, "HELDOUT_S", 4.0)
+    monkeypatch.setattr(go2_loop, "WALKS", 1)
+    found = go2_loop.loop_row("realistic", 4, 0, train=False, folder=tmp_path, threads=1)
+    assert found["error"] == ""
+    assert found["heldout_ratio"] < 0.6
+    assert found["stiffness_log_error"] < 0.5 * found["stiffness_log_error_nominal"]
+    assert found["stiffness_inside"] >= 0.6
+    assert found["payload_error_kg"] == pytest.approx(0.0, abs=0.3)
+    assert found["velocity_error_udr"] < 0.2 and found["falls_udr"] == 0
+    # Resumed, it takes the recordings that are there.
+    assert go2_loop.recorded(go2_loop.draw_truth("realistic", 4), tmp_path / "realistic_4") == (
+        tmp_path / "realistic_4" / "dataset"
+    )
