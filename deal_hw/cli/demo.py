@@ -159,6 +159,14 @@ class Stages:
 class Part(Protocol):
     """A robot's part."""
 
+    def check(self, config: Demo) -> None:
+        """Refuse settings, and an installation, with which it would fail later.
+
+        Raises:
+            ConfigurationError: There is something.
+        """
+        ...
+
     def run(self, config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
         """Do all five jobs."""
         ...
@@ -177,6 +185,7 @@ def demo(config: Demo) -> DemoReport:
         part = cast("Part", importlib.import_module(f"deal_hw.cli.demo_{config.robot}"))
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "all") from err
+    part.check(config)
     clear(config.folder)
     folder, stages = RunFolder(config.folder), Stages()
     with folder:

@@ -22,13 +22,23 @@ from deal_hw.types import FloatArray
 EPISODES = 3
 
 
-def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
-    """Collect, calibrate, train, deploy, inspect. See :class:`deal_hw.cli.demo.Part`."""
+def check(config: Demo) -> None:
+    """Refuse what cannot work. See :class:`deal_hw.cli.demo.Part`."""
+    _shipped()
+
+
+def _shipped() -> Path:
     udr = shipped_policy("cartpole")
     if udr is None:
         raise ConfigurationError(
             "no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it"
         )
+    return udr
+
+
+def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+    """Collect, calibrate, train, deploy, inspect. See :class:`deal_hw.cli.demo.Part`."""
+    udr = _shipped()
     out, transport, episodes = config.folder, config.transport or "serial", config.episodes or EPISODES
     truth_file = out / "truth.json"
     options = (

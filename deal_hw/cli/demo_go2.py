@@ -47,13 +47,31 @@ HELDOUT_S: Final = 8.0
 Script = tuple[tuple[float, tuple[float, float, float]], ...]
 
 
-def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
-    """Walk, calibrate, fine-tune, walk again, inspect. See :class:`deal_hw.cli.demo.Part`."""
+def check(config: Demo) -> None:
+    """Refuse what cannot work. See :class:`deal_hw.cli.demo.Part`."""
+    _shipped()
+    if _transport(config) not in PORTS:
+        raise ConfigurationError(
+            f"--transport {config.transport}: the Go2 is reached by {' or '.join(PORTS)}"
+        )
+
+
+def _shipped() -> Path:
     udr = shipped_policy("go2")
     if udr is None:
         raise ConfigurationError(
             "no walking policy is shipped for the Go2; tools/train_demo_policy.py makes it"
         )
+    return udr
+
+
+def _transport(config: Demo) -> str:
+    return config.transport or next(iter(PORTS))
+
+
+def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
+    """Walk, calibrate, fine-tune, walk again, inspect. See :class:`deal_hw.cli.demo.Part`."""
+    udr = _shipped()
     out, episodes = config.folder, config.episodes or 1
     profile, heldout = write_script(out / "profile.csv", PROFILE), write_script(out / "heldout.csv", HELDOUT)
     walks: dict[str, _Walked] = {}
@@ -124,9 +142,7 @@ class _Emulated:
 @contextmanager
 def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
     """Yield the robot of the demo's seed; its truth and its track are in files of this name."""
-    out, transport = config.folder, config.transport or "dds"
-    if transport not in PORTS:
-        raise ConfigurationError(f"--transport {transport}: the Go2 is reached by {' or '.join(PORTS)}")
+    out, transport = config.folder, _transport(config)
     track = out / f"truth_track_{name}.csv"
     with EmulatorProcess(
         "go2", "--transport", transport, "--port", PORTS[transport], "--profile", config.profile,

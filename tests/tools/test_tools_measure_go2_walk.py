@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import measure_go2_walk
@@ -9,8 +10,11 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.run_plan import shipped_policy
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.errors import CheckpointError
 from deal_hw.policies.checkpoint import read_checkpoint
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policy import ObservationBuilder
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +56,39 @@ def test_policy_record_and_checkpoint_belong_together(policy: OnnxPolicy) -> Non
         if layer != layers[-1]:
             value = np.where(value > 0, value, np.expm1(value))
     np.testing.assert_allclose(np.clip(value, -1.0, 1.0), wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("field", ["clock_hz", "observation"])
+def test_a_task_of_another_clock_or_command_scale_is_not_fine_tuned(policy: OnnxPolicy, field: str) -> None:
+    """The networks would read another gait, or commands of another size: the message names what differs."""
+    spec = policy.spec
+    scaled = tuple(
+        dataclasses.replace(term, scale=2.0 * term.scale) if term.quantity == "command" else term
+        for term in spec.observation
+    )
+    other = dataclasses.replace(spec, **({"clock_hz": 2.0} if field == "clock_hz" else {field: scaled}))
+    with pytest.raises(CheckpointError, match=f"of a policy with another {field}"):
+        read_checkpoint(policy.path.with_suffix(".safetensors"), other)
+
+
+def test_a_policy_walks_by_the_clock_and_the_scale_of_its_own_spec(policy: OnnxPolicy) -> None:
+    """Deployed, a policy of another clock or command scale observes those: nothing of them is the robot's."""
+    spec = policy.spec
+    terms = [(term.quantity, term.joint) for term in spec.observation]
+    slow = dataclasses.replace(
+        spec,
+        clock_hz=1.0,
+        observation=tuple(
+            dataclasses.replace(term, scale=0.5) if term.quantity == "command" else term
+            for term in spec.observation
+        ),
+    )
+    slow.check_fits(DRIVER)
+    builder = ObservationBuilder(slow)
+    builder.command = np.array([0.8, 0.0, 0.0])
+    position = np.concatenate([np.zeros(6), DRIVER.default_position])
+    first, second = (builder.build(position, np.zeros(18)).copy() for _ in range(2))
+    assert first[terms.index(("command", "x"))] == pytest.approx(0.4)
+    sine, cosine = terms.index(("clock", "sin")), terms.index(("clock", "cos"))
+    turned = [np.arctan2(seen[sine], seen[cosine]) for seen in (first, second)]
+    assert turned[1] - turned[0] == pytest.approx(2 * np.pi * 1.0 / DRIVER.control_rate_hz, abs=1e-6)
