@@ -106,7 +106,10 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
 TOOLS: Mapping[str, Verb] = MappingProxyType(
     {
         "demo": _verb(
-            "demo", help="do all five on an emulated cart-pole", example="demo --out runs/demo", extra="all"
+            "demo",
+            help="do all five on an emulated cart-pole or Go2",
+            example="demo --out runs/demo",
+            extra="all",
         ),
         "excite": _verb(
             "excite",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -95,7 +96,6 @@ def walk(
     """
     clock = VirtualClock(_START_NS)
     watched = _Watched(Go2Device(truth))
-    robot = Go2Robot(VirtualTopics(watched, clock), clock)
     told: list[Event] = []
 
     def note(velocity: FloatArray) -> None:
@@ -104,21 +104,22 @@ def walk(
 
     inner = PolicyBehaviour(policy, DRIVER, NotedVelocity(source, note))
     whole = PostureBehaviour(inner, DRIVER, seconds, PostureConfig())
-    config = LoopConfig(duration_s=whole.duration_s)
     trajectory = None
-    with tempfile.TemporaryDirectory() as folder:
-        file = path or Path(folder) / "episode.mcap"
+    with contextlib.ExitStack() as folder, contextlib.ExitStack() as recording:
+
+        def keep(one: CycleRecord) -> bool:
+            if record:
+                recorder.write(one)
+            return True
+
         if record:
-            with EpisodeRecorder(file, DRIVER.to_json(), metadata or {}, clock) as recorder:
-
-                def sink(one: CycleRecord) -> bool:
-                    recorder.write(one)
-                    return True
-
-                loop = ControlLoop(robot, whole, Safety(DRIVER), clock, sink, config)
-                report = loop.run()
+            file = path or Path(folder.enter_context(tempfile.TemporaryDirectory())) / "episode.mcap"
+            recorder = EpisodeRecorder(file, DRIVER.to_json(), metadata or {}, clock)
+            recording.enter_context(recorder)
+        robot = Go2Robot(VirtualTopics(watched, clock), clock)
+        loop = ControlLoop(robot, whole, Safety(DRIVER), clock, keep, LoopConfig(duration_s=whole.duration_s))
+        report = loop.run()
+        recording.close()
+        if record:
             trajectory = read_episode(file).trajectory
-        else:
-            loop = ControlLoop(robot, whole, Safety(DRIVER), clock, lambda one: True, config)
-            report = loop.run()
     return VirtualWalk(report, trajectory, wanted_in(told, 0, seconds), watched.track())

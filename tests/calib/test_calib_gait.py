@@ -1,0 +1,89 @@
+"""What the fit of a walk allows for beyond its residual: other windows, and all forces together."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.methods import make_method
+from deal_hw.calib.output_error_fits import FORCES, GAIT, _holding, _scaled_together
+from deal_hw.calib.uncertainty.intervals import Shape, Uncertainty
+from deal_hw.calibration import Z90
+from deal_hw.cli.calibrate import Calibrate, usual_method
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.floor import walk_space
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.model import load_model
+
+SHARE = 0.04
+"""Standard deviation of each parameter before."""
+
+
+class _OfSpace:
+    """All that is asked of a problem here."""
+
+    def __init__(self, space: ParameterSpace) -> None:
+        self.space = space
+
+
+@pytest.fixture
+def problem() -> Problem:
+    """Return the space of a walk as a problem."""
+    return cast("Problem", _OfSpace(walk_space()))
+
+
+def known_at(theta: np.ndarray) -> Uncertainty:
+    """Return an uncertainty with independent parameters, each known to a share."""
+    half = np.exp(Z90 * SHARE)
+    K = len(theta)
+    return Uncertainty(
+        covariance=SHARE**2 * np.eye(K),
+        interval=np.stack([theta / half, theta * half], axis=1),
+        latency_interval_s=(0.0, 0.01),
+        verdicts=("identifiable",) * K,
+        null_directions=(),
+        alarms=(),
+        inflation=1.0,
+        shape=Shape(np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)),
+        clustered=None,
+        widened=np.ones(K),
+    )
+
+
+def test_forces_that_may_be_off_together_widen_what_scales_with_them(problem: Problem) -> None:
+    """Gains by the root of both squares, and they move together; the floor's friction stays."""
+    space, theta = problem.space, problem.space.nominal
+    wider = _scaled_together(problem, known_at(theta), theta, 0.05)
+    half = np.log(wider.interval[:, 1] / theta)
+    for k, p in enumerate(space):
+        wanted = np.hypot(SHARE, np.log(1.05)) if p.kind in FORCES else SHARE
+        assert half[k] == pytest.approx(Z90 * wanted, rel=1e-6), p.name
+    gains = [k for k, p in enumerate(space) if p.kind == "servo_stiffness"]
+    assert wider.covariance[gains[0], gains[1]] == pytest.approx(np.log(1.05) ** 2)
+    floor = space.names.index("floor.friction")
+    assert wider.covariance[floor, gains[0]] == 0.0
+
+
+def test_intervals_hold_what_other_windows_found(problem: Problem) -> None:
+    """An estimate far outside moves one end to it; one inside moves none."""
+    theta = problem.space.nominal
+    other = theta.copy()
+    other[0], other[1] = 1.5 * theta[0], 1.001 * theta[1]
+    before = known_at(theta)
+    after = _holding(problem, before, theta, other)
+    assert after.interval[0, 1] == pytest.approx(other[0])
+    np.testing.assert_allclose(after.interval[1:], before.interval[1:])
+    assert after.covariance[0, 0] == pytest.approx(SHARE**2 + np.log(1.5) ** 2)
+
+
+def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
+    """A method that is named stays, and so does the default of a robot that stands."""
+    robot = load_model(DRIVER)
+    assert usual_method(Calibrate(quiet=True), robot, walks=True) == "gait"
+    assert usual_method(Calibrate(quiet=True), robot) == "default"
+    assert usual_method(Calibrate(quiet=True, method="eki"), robot, walks=True) == "eki"
+    assert make_method("gait", refine=True).name == "gait"
+    assert GAIT.robust and GAIT.long_s < 0.4
