@@ -258,6 +258,11 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
             }
             for k, p in enumerate(result.space)
         },
+        "known": {
+            name: {"value": value, "truth": done.truth[name]}
+            for name, value in result.space.known.items()
+            if name in done.truth
+        },
         "heldout_nrmse": dict(result.heldout_nrmse),
         "latency_s": {"true": done.latency_s, "found": result.latency_s},
         **{m.name: {policy: float(v.mean()) for policy, v in m.values.items()} for m in done.measures},
@@ -292,6 +297,8 @@ def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
         f"{1e3 * latency['true']:.1f}",
     )  # fmt: skip
     console.print(table)
+    for name, row in summary["known"].items():
+        console.print(f"{name}, not fitted: {row['value']:.4g}, truth {row['truth']:.4g}")
     result = done.found.result
     for words in result.null_directions:
         console.print(f"the data cannot tell: {words}")
@@ -303,7 +310,10 @@ def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
     for measure in done.measures:
         table.add_column(measure.heading, justify="right")
     for policy in done.measures[0].values:
-        cells = (f"{summary[m.name][policy]:.4f} ± {summary[m.std_name][policy]:.4f}" for m in done.measures)
+        cells = []
+        for m in done.measures:
+            spread = f" ± {summary[m.std_name][policy]:.4f}" if len(m.values[policy]) > 1 else ""
+            cells.append(f"{summary[m.name][policy]:.4f}{spread}")
         table.add_row(policy, *cells)
     console.print(table)
     errors = summary["heldout_nrmse"]

@@ -54,6 +54,8 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == json.loads(json.dumps(report.summary))
     assert sum(name.endswith((".stiffness", ".damping")) for name in summary["parameters"]) == 24
+    weighed = summary["known"]["base.mass"]
+    assert weighed["value"] == pytest.approx(weighed["truth"], abs=0.3)
     assert summary["heldout_nrmse"]["calibrated"] < 0.6 * summary["heldout_nrmse"]["nominal"]
     assert set(summary["velocity_error_m_s"]) == {"udr", "udr more", "calibrated"}
     for name in ("udr", "udr more", "calibrated"):
