@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, cast
 
-from deal_hw.calibration import CalibrationMethod
+from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import UnknownNameError
 
 if TYPE_CHECKING:
@@ -20,11 +20,14 @@ METHODS: dict[str, str] = {
     "deal-paper-fn": "deal_hw.calib.deal_paper.algorithm1:without_noise_adaptation",
     "deal-paper-pn": "deal_hw.calib.deal_paper.algorithm1:without_normalisation",
     "deal-paper-flat": "deal_hw.calib.deal_paper.algorithm1:flat",
+    "deal-paper-replay": "deal_hw.calib.deal_paper.algorithm1:replayed",
     "output-error": "deal_hw.calib.output_error_fits:output_error_method",
     "local": "deal_hw.calib.output_error_fits:local",
     "gait": "deal_hw.calib.output_error_fits:gait",
     "easi": "deal_hw.calib.baselines.easi:Easi",
+    "easi-log": "deal_hw.calib.baselines.easi:logarithmic",
     "bo": "deal_hw.calib.baselines.bayesian:BayesianOptimisation",
+    "bo-critic": "deal_hw.calib.baselines.bayesian:critic_return",
     "cma": "deal_hw.calib.baselines.cma_es:Cma",
     "gauss-newton": "deal_hw.calib.baselines.gauss_newton:GaussNewton",
     "least-squares": "deal_hw.calib.baselines.least_squares:LeastSquares",
@@ -33,12 +36,21 @@ METHODS: dict[str, str] = {
     "mujoco-sysid": "deal_hw.calib.baselines.sysid:MujocoSysid",
     "random": "deal_hw.calib.baselines.simple:RandomSearch",
     "midpoint": "deal_hw.calib.baselines.simple:Midpoint",
+    "midpoint-linear": "deal_hw.calib.baselines.simple:LinearMidpoint",
     "nominal": "deal_hw.calib.baselines.simple:Nominal",
 }
 """Name -> ``module:callable`` without arguments. ``default`` is the search that won on the tuning seeds."""
 
-NO_DATA_METHODS = frozenset({"midpoint", "nominal", "deal-paper-flat"})
+NO_DATA_METHODS = frozenset({"midpoint", "midpoint-linear", "nominal", "deal-paper-flat"})
 """Rows that must not read the data, so they are never refined."""
+
+CLOSED_LOOP_METHODS = frozenset(
+    {"deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "easi", "easi-log", "bo-critic"}
+)
+"""Methods that run the recordings' policy in every simulator."""
+
+PAPER_POPULATION = 200
+"""Simulators of the DEAL paper's Table 4."""
 
 WHOLE_METHODS = frozenset({"output-error", "local", "gait", "mujoco-sysid"})
 """Methods that decide themselves what follows their search, or stand for somebody else: never refined."""
@@ -52,6 +64,12 @@ def check_method(name: str) -> None:
     """
     if name not in METHODS:
         raise UnknownNameError("calibration method", name, METHODS)
+
+
+def usual_population(name: str) -> int:
+    """Return how many members a method has where nobody says."""
+    paper = name in CLOSED_LOOP_METHODS or name.startswith("deal-paper")
+    return PAPER_POPULATION if paper else Budget().population
 
 
 def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem]:

@@ -64,12 +64,13 @@ def limited_action(
 class PopulationDemonstration:
     """A policy that drives N robots in closed loop, each from its own state.
 
-    The fields identify it in checkpoints; what it remembers of a rollout is forgotten at tick 0.
+    The fields identify it in checkpoints; what it remembers of a rollout is forgotten by :meth:`restart`.
 
     Attributes:
         policy: The policy.
         description: The robot.
-        wanted: Wanted velocity of the base: x, y [m/s] and yaw rate [rad/s]; for policies that observe it.
+        wanted: Wanted velocity of the base: x, y [m/s] and yaw rate [rad/s]; for policies that observe it,
+            and clipped to what they were trained for, as in deploying.
         spec_digest: Digest of the policy's spec, training record included.
 
     Raises:
@@ -90,20 +91,41 @@ class PopulationDemonstration:
         self._offset = np.zeros(len(spec.actuated))
         if description.actuation == "position":
             self._offset = np.array(spec.default_position)[list(description.actuated_index)]
-        self._begin(1)
 
-    def _begin(self, count: int) -> None:
-        self._builder = ObservationBuilder(self._policy.spec, (count,))
-        self._builder.command = np.repeat(np.array(self.wanted)[None], count, axis=0)
+    @property
+    def history(self) -> int:
+        """Control periods that the policy looks back."""
+        return self._policy.spec.history
+
+    def restart(
+        self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
+    ) -> None:
+        """Begin anew with N robots that share one past: states (h, C) each, commands (h, A), oldest first.
+
+        Args:
+            count: N.
+            position: What the policy saw before.
+            velocity: Likewise.
+            command: What it answered.
+            number: Its commands so far, those from before this past too.
+        """
+        spec = self._policy.spec
+        self._builder = ObservationBuilder(spec, (count,))
+        low, high = np.array(spec.command_range or ((-np.inf, np.inf),) * 3).T
+        self._builder.command = np.repeat(np.clip(self.wanted, low, high)[None], count, axis=0)
+        early = number - len(command)
+        self._builder.clock = np.full(count, early * spec.clock_hz / spec.control_rate_hz % 1.0)
         self._action = np.zeros((count, len(self._scale)))
+        for q, v, u in zip(position, velocity, (command - self._offset) / self._scale, strict=True):
+            self._builder.build(*(np.repeat(x[None], count, axis=0) for x in (q, v)))
+            self._action = np.repeat(u[None], count, axis=0)
+            self._builder.record_action(self._action)
 
-    def __call__(self, position: FloatArray, velocity: FloatArray, tick: int) -> FloatArray:
-        """Return the commands of a control period, (N, A), from states, (N, C) each; tick 0 begins anew.
+    def __call__(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the commands of a control period, (N, A), from states, (N, C) each.
 
         Members whose state is not finite (diverged ones) are sent their rest command.
         """
-        if tick == 0 or len(position) != len(self._action):
-            self._begin(len(position))
         finite = np.isfinite(np.concatenate([position, velocity], axis=1)).all(axis=1, keepdims=True)
         known = np.nan_to_num(position), np.nan_to_num(velocity)
         observation = self._builder.build(*known)
@@ -133,9 +155,12 @@ class Demonstration:
     ) -> None:
         self._population = PopulationDemonstration(policy, description, wanted)
         self._rate_hz = description.control_rate_hz
+        self._actuated = len(description.actuated)
 
     def __call__(self, position: FloatArray, velocity: FloatArray, time_s: float) -> FloatArray:
         """Return the command of the next control period; time 0 begins anew."""
-        tick = round(time_s * self._rate_hz)
-        command: FloatArray = self._population(position[None], velocity[None], tick)[0]
+        if round(time_s * self._rate_hz) == 0:
+            nothing = np.empty((0, len(position)))
+            self._population.restart(1, nothing, nothing, np.empty((0, self._actuated)), 0)
+        command: FloatArray = self._population(position[None], velocity[None])[0]
         return command

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.loop import demonstrate
+from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.methods import make_method
+from deal_hw.calib.methods import CLOSED_LOOP_METHODS, make_method, usual_population
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.sim.engine.batch import bare_steps_per_second
@@ -53,13 +53,15 @@ def machine() -> dict[str, Any]:
 
 def measure(method: str, budget: Budget, threads: int, repeats: int, seed: int) -> dict[str, Any]:
     """Time a search and, before and after each run, the bare engine with the same model and members."""
-    demonstration = demonstrate("ideal", seed, 5.0)
-    paper = method.startswith("deal-paper")
+    paper = method in CLOSED_LOOP_METHODS
+    demonstration = make_case("cartpole", "ideal", seed, 5.0, by_policy=paper)
     robot = load_model(DESCRIPTION, step_s=PAPER_STEP_S if paper else None)
     rows = []
     for _ in range(repeats):
         before = bare_steps_per_second(robot, budget.population, BARE_STEPS, threads)
-        problem = Problem(robot, demonstration.space, [demonstration.fit], threads=threads)
+        problem = Problem(
+            robot, demonstration.space, [demonstration.fit], threads=threads, policy=demonstration.policy
+        )
         start = time.perf_counter()
         result = make_method(method).run(problem, budget, np.random.default_rng(seed))
         seconds = time.perf_counter() - start
@@ -98,8 +100,7 @@ def main() -> int:
     options = parser.parse_args()
     report: dict[str, Any] = {"machine": machine(), "rows": []}
     for method in options.methods.split(","):
-        population = 200 if method.startswith("deal-paper") else 100
-        budget = Budget(population=population, generations=options.generations)
+        budget = Budget(population=usual_population(method), generations=options.generations)
         report["rows"].append(measure(method, budget, options.threads, options.repeats, options.seed))
     report["machine"]["load_after"] = os.getloadavg()
     if options.out is not None:

@@ -34,6 +34,7 @@ from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
+from deal_hw.testing.recorded_commands import RecordedCommands
 from deal_hw.testing.simulated_episode import simulated_episode
 
 Unit = Literal["generation", "run"]
@@ -43,6 +44,7 @@ REFINED = "default, refined"
 
 SEARCHES = (
     "eki", "deal", "deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "deal-paper-flat",
+    "deal-paper-replay", "easi-log", "bo-critic",
     "easi", "bo", "cma", "gauss-newton", "ekf", "random",
 )  # fmt: skip
 """Methods with generations; a generation of `ekf` is a pass along the recording."""
@@ -133,7 +135,9 @@ def make_problem(seconds: float) -> Problem:
     space = k9_space().with_ratio(5.0)
     theta = space.unnormalize(np.random.default_rng(1).uniform(0.3, 0.7, len(space)))
     made = simulated_episode(DESCRIPTION, space, theta, seconds=seconds, latency_ticks=5, sensor=True, seed=1)
-    return Problem(load_model(DESCRIPTION), space, [align(made, DESCRIPTION)], threads=1)
+    episode = align(made, DESCRIPTION)
+    policy = RecordedCommands.of(episode.target, 20)
+    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, policy=policy)
 
 
 def watch(method: str, generations: int, population: int, seconds: float) -> dict[str, Any]:

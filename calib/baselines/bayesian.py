@@ -35,8 +35,9 @@ from scipy.stats.qmc import Sobol
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
 from deal_hw.calib.data.innovations import Members
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.base import SearchLog
+from deal_hw.calib.search.base import Coordinates, SearchLog
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
@@ -62,6 +63,8 @@ class BoSettings:
         acquisition_draws: Draws that these starts are chosen from.
         process_draws: Draws of the process of which the improvement is the mean.
         scoring: How the fitness scores.
+        linear: Whether the range is linear, as in the paper; off takes equal steps of each parameter's scale.
+        latency: Whether the latency is one more coordinate where it is not given.
     """
 
     fitness: str = "trajectory"
@@ -75,6 +78,8 @@ class BoSettings:
     acquisition_draws: int = 64
     process_draws: int = 64
     scoring: FitnessSettings = field(default_factory=FitnessSettings)
+    linear: bool = False
+    latency: bool = True
 
     def __post_init__(self) -> None:
         if self.batch < 1 or self.elite < 2:
@@ -349,14 +354,18 @@ class _Bo(ScoredStepper):
 class BayesianOptimisation(ScoredSearch):
     """Bayesian optimisation of a pluggable fitness."""
 
-    name = "bo"
     stepper = _Bo
     settings: BoSettings = field(default_factory=BoSettings)
+    name: str = "bo"
+
+    def coordinates(self, problem: Problem) -> Coordinates:
+        """Return the coordinates in which this method searches."""
+        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
 
 
 def critic_return() -> BayesianOptimisation:
-    """Return the paper's row: Bayesian optimisation of the critic's return."""
-    return BayesianOptimisation(BoSettings(fitness="critic"))
+    """Return the paper's row, `bo-critic`: Bayesian optimisation of the critic's return."""
+    return BayesianOptimisation(BoSettings(fitness="critic", linear=True, latency=False), name="bo-critic")
 
 
 @functools.cache

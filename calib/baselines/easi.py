@@ -11,20 +11,18 @@ rate, weights, critic); where we deviate it is said at the place.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
 from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
 from deal_hw.calib.data.innovations import Members
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import Coordinates, SearchLog
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
-
-BoxScale = Literal["own", "linear"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,9 +32,9 @@ class EasiSettings:
     Attributes:
         fitness: Name of the fitness; EASI's is the critic.
         survive_rate: Share of members that are elites; at most a half, beyond which weights are negative.
-        scale: Box of the search: "own" takes equal steps of each parameter's own scale (log for positive
-            ones), "linear" is the box as published, in which a range of ratio xi^2 has its midpoint at half
-            its upper end.
+        linear: Whether the range is linear, as published; then one of ratio xi^2 has its midpoint at half its
+            upper end. Off takes equal steps of each parameter's own scale (log for positive ones).
+        latency: Whether the latency, which EASI does not know, is one more coordinate where it is not given.
         critic: The published critic (two layers of 128, RMSprop 3e-4, clip 0.01, 20 updates a generation).
         batch_per_member: Transitions in one of the critic's batches for each member of the population (16).
         scoring: How the fitness scores, but for the critic.
@@ -44,7 +42,8 @@ class EasiSettings:
 
     fitness: str = "critic"
     survive_rate: float = 0.5
-    scale: BoxScale = "own"
+    linear: bool = True
+    latency: bool = False
     critic: CriticSettings = field(default_factory=lambda: CriticSettings(hidden=(128, 128)))
     batch_per_member: int = 16
     scoring: FitnessSettings = field(default_factory=FitnessSettings)
@@ -52,8 +51,6 @@ class EasiSettings:
     def __post_init__(self) -> None:
         if not 0 < self.survive_rate <= 0.5:
             raise ConfigurationError(f"survive_rate must be within (0, 0.5], got {self.survive_rate:g}")
-        if self.scale not in ("own", "linear"):
-            raise ConfigurationError(f"unknown scale {self.scale!r} of the box; known: own, linear")
 
 
 def elite_weights(population: int, elites: int) -> FloatArray:
@@ -114,34 +111,12 @@ class EliteGaussian(Kept):
         self._population = np.clip(self.mean + self.std * draw, 0.0, 1.0)
 
 
-class Box:
-    """The map between the unit cube in which the Gaussian lives and physical values.
-
-    Args:
-        coordinates: The problem's coordinates.
-        scale: See `EasiSettings`.
-    """
-
-    def __init__(self, coordinates: Coordinates, scale: BoxScale) -> None:
-        self._coordinates, self._linear = coordinates, scale == "linear"
-
-    def members(self, unit: FloatArray) -> Members:
-        """Map unit coordinates, (N, C), to physical values inside the range."""
-        members = self._coordinates.members(unit)
-        if not self._linear:
-            return members
-        space = self._coordinates.space
-        theta = space.low + (space.high - space.low) * unit[:, : len(space)]
-        return Members(np.clip(theta, space.low, space.high), members.latency_s)
-
-
 class _Easi(ScoredStepper):
     settings: EasiSettings
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
         super().__init__(log, rng, search)
         settings = self.settings
-        self._box = Box(self.coordinates, settings.scale)
         # The latency's coordinate is drawn without its margin, all others uniformly.
         start = self.coordinates.sample(rng, log.budget.population)
         self._search = EliteGaussian(start, settings.survive_rate, rng)
@@ -152,7 +127,7 @@ class _Easi(ScoredStepper):
 
     def step(self) -> None:
         """Roll out, train the critic, score by the trained critic, select."""
-        members = self._box.members(self._search.ask())
+        members = self.coordinates.members(self._search.ask())
         fitness, values = self.score(members)
         self._search.tell(fitness)
         spread = float(self._search.std.mean())
@@ -160,18 +135,23 @@ class _Easi(ScoredStepper):
 
     def found(self) -> tuple[Members, Members]:
         """Return the Gaussian's mean and its last sample."""
-        return self._box.members(self._search.mean[None]), self._box.members(self._search.ask())
+        mean = self._search.mean[None]
+        return self.coordinates.members(mean), self.coordinates.members(self._search.ask())
 
 
 @dataclass(frozen=True)
 class Easi(ScoredSearch):
     """EASI: critic, elites and a diagonal Gaussian."""
 
-    name = "easi"
     stepper = _Easi
     settings: EasiSettings = field(default_factory=EasiSettings)
+    name: str = "easi"
+
+    def coordinates(self, problem: Problem) -> Coordinates:
+        """Return the coordinates in which this method searches."""
+        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
 
 
-def published() -> Easi:
-    """Return EASI in the box as published: linear, whatever the parameters' scale."""
-    return Easi(EasiSettings(scale="linear"))
+def logarithmic() -> Easi:
+    """Return `easi-log`: EASI in steps of each parameter's own scale."""
+    return Easi(EasiSettings(linear=False), name="easi-log")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members, explained
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
-from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.types import FloatArray
@@ -21,13 +20,7 @@ CHANGING = frozenset({"critic"})
 
 @dataclass(frozen=True)
 class ScoredSearch(Search):
-    """A search by a fitness.
-
-    Attributes:
-        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
-    """
-
-    policy: PopulationPolicy | None = field(default=None, kw_only=True)
+    """A search by a fitness."""
 
 
 class ScoredStepper(Stepper):
@@ -43,7 +36,7 @@ class ScoredStepper(Stepper):
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
         super().__init__(log, rng, search)
         name = self.settings.fitness
-        self._fitness = make_fitness(name, self.problem, rng, self.scoring(), search.policy)
+        self._fitness = make_fitness(name, self.problem, rng, self.scoring())
         self.stationary = name not in CHANGING
 
     def scoring(self) -> FitnessSettings:

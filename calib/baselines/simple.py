@@ -72,6 +72,16 @@ class Midpoint(Ignorant):
         return space.center
 
 
+class LinearMidpoint(Ignorant):
+    """Return the midpoint of every range on a linear scale."""
+
+    name = "midpoint-linear"
+
+    def estimate(self, space: ParameterSpace) -> FloatArray:
+        """Return the centre."""
+        return np.asarray((space.low + space.high) / 2)
+
+
 class Nominal(Ignorant):
     """Return the values of the user's own model."""
 

@@ -11,7 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -79,6 +79,33 @@ class Prediction:
     velocity: FloatArray
 
 
+class PopulationPolicy(Protocol):
+    """pi_0, the policy that moved the robot all through the recordings, for N simulators at once."""
+
+    @property
+    def history(self) -> int:
+        """Control periods that it looks back."""
+        ...
+
+    def restart(
+        self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
+    ) -> None:
+        """Begin anew with N simulators that share one past.
+
+        Args:
+            count: Their number N.
+            position: States that the policy saw before, oldest first, (h, C).
+            velocity: Likewise.
+            command: What it answered, (h, A).
+            number: Its commands so far; at least h.
+        """
+        ...
+
+    def __call__(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the commands of the next control period, (N, A), from states, (N, C) each."""
+        ...
+
+
 @dataclass(slots=True)
 class Problem:
     """Recordings, simulator and parameters.
@@ -95,6 +122,7 @@ class Problem:
         known_std: Standard deviation of every entry of (position, velocity), (2 C,), where it is known or
             chosen; None to estimate it from the recordings.
         settings: What is taken to be so of recordings.
+        policy: What moved the robot all through the recordings; None where that is not known, or no policy.
         channels: Indices of the measured channels into (position, velocity), (M,).
         noise_std: Noise of (position, velocity) over all speeds, (2 C,); only measured entries mean anything.
         noise: Noise at rest and jitter of the samples' time.
@@ -109,6 +137,7 @@ class Problem:
     fixed_latency_s: float | None = None
     known_std: FloatArray | None = None
     settings: DataSettings = SETTINGS
+    policy: PopulationPolicy | None = None
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)

@@ -1,8 +1,9 @@
-"""`deal-paper`: DEAL's Algorithm 1, with every choice that the paper leaves open noted where it is made.
+"""`deal-paper`: DEAL's Algorithm 1 as published, with every choice that the paper leaves open as a setting.
 
-Generation t: roll every member out, train the critic (eq. 5), score each member's own rollout, turn scores
-into probabilities and take one denoising step (eqs. 1, 2, 9, 10:
-:mod:`deal_hw.calib.deal_paper.diffusion_evolution`).
+Generation t: roll pi_0 out in every simulator (line 3), train the critic (eq. 5), score each member's own
+rollout, turn scores into probabilities and take one denoising step (eqs. 1, 2, 9, 10:
+:mod:`deal_hw.calib.deal_paper.diffusion_evolution`). The range is linear and no latency is searched.
+docs/deal-paper.md lists what is ours.
 """
 
 from __future__ import annotations
@@ -13,20 +14,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
-from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.base import Coordinates, Search, SearchLog, Stepper
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calibration import CalibrationResult
+from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
-
-HALF_WIDTH = 3.0**0.5
-"""The box is [-HALF_WIDTH, HALF_WIDTH]: a uniform start then has unit variance, as eq. 12 has it at t = T.
-
-In [-1, 1] the unit noise of eq. 10 puts a third of all coordinates outside the range, where they are
-simulated at its edge, and the search is drawn into the corners.
-"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +33,15 @@ class PaperSettings(FitnessSettings):
             n and batch M are not in the paper.
         diffusion: The search's choices; its number of generations is the budget's.
         normalise: Whether the search moves in the normalised range (section 3.2); off is the ablation
-            DEAL\PN, which moves in raw SI units.
+            DEAL\PN, which moves in SI units from the middle of each range.
+        box: What the range is normalised to, low and high. Centred, as with a flat fitness a box [0, 1]
+            drifts to its lower corner; as wide as gives a uniform start unit variance, as eq. 12 has it at
+            t = T. In [-1, 1] the unit noise of eq. 10 puts a third of all coordinates outside the range,
+            where they are simulated at its edge.
+        linear: Whether the range is linear ("within the search range", section 3.2); off takes equal steps of
+            each parameter's own scale.
+        latency: Whether the latency, of which the paper knows nothing, is one more coordinate where it is not
+            given.
         fitness: Name of the fitness (`deal_hw.calib.deal_paper.fitness`). "critic" is the paper's; "flat"
             scores every member 0, a search that cannot see the data. Eq. 9 reads the fitness as it is,
             whatever its scale.
@@ -47,35 +50,41 @@ class PaperSettings(FitnessSettings):
     critic: CriticSettings = field(default_factory=CriticSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     normalise: bool = True
+    box: tuple[float, float] = (-(3.0**0.5), 3.0**0.5)
+    linear: bool = True
+    latency: bool = False
     fitness: str = "critic"
+
+    def __post_init__(self) -> None:
+        # A dataclass with slots is another class than the one that `super()` sees.
+        FitnessSettings.__post_init__(self)
+        if not self.box[0] < self.box[1]:
+            raise ConfigurationError(f"box {self.box}: give the lower end first")
+        if not (self.normalise or self.linear):
+            raise ConfigurationError("without normalisation the range is linear; set linear or normalise")
 
 
 class _Box:
-    """The search's box: [-1, 1] in the normalised range, or raw SI units without normalisation."""
+    """The search's box: the normalised range, or SI units from the middle of each range."""
 
-    def __init__(self, coordinates: Coordinates, *, normalise: bool) -> None:
-        self.coordinates = coordinates
-        self._normalise = normalise
+    def __init__(self, coordinates: Coordinates, settings: PaperSettings) -> None:
+        self._coordinates = coordinates
+        low, high = np.full((2, coordinates.count), [[settings.box[0]], [settings.box[1]]])
+        if not settings.normalise:
+            ends = coordinates.members(np.repeat([[0.0], [1.0]], coordinates.count, axis=1))
+            span = np.diff(ends.theta, axis=0)[0]
+            if coordinates.count > len(span):
+                span = np.append(span, np.diff(ends.latency_s))
+            low, high = -0.5 * span, 0.5 * span
+        self._low, self._width = low, high - low
 
     def from_unit(self, unit: FloatArray) -> FloatArray:
         """Map unit coordinates, (N, C), into the box."""
-        if self._normalise:
-            return HALF_WIDTH * (2 * unit - 1)
-        members = self.coordinates.members(unit)
-        if self.coordinates.fixed_latency_s is not None:
-            return members.theta
-        return np.concatenate([members.theta, members.latency_s[:, None]], axis=1)
+        return np.asarray(self._low + self._width * unit)
 
     def members(self, x: FloatArray) -> Members:
         """Map the box to physical values; what left it is simulated at its edge (the paper does not say)."""
-        if self._normalise:
-            return self.coordinates.members(np.clip((x / HALF_WIDTH + 1) / 2, 0.0, 1.0))
-        space = self.coordinates.space
-        theta = np.clip(x[:, : len(space)], space.low, space.high)
-        unit = space.normalize(theta)
-        if self.coordinates.fixed_latency_s is None:
-            unit = np.concatenate([unit, self.coordinates.latency_unit(x[:, len(space)])[:, None]], axis=1)
-        return self.coordinates.members(unit)
+        return self._coordinates.members(np.clip((x - self._low) / self._width, 0.0, 1.0))
 
 
 class _DealPaper(Stepper):
@@ -88,14 +97,14 @@ class _DealPaper(Stepper):
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: DealPaper) -> None:
         super().__init__(log, rng, search)
         settings = self.settings
-        self._box = _Box(self.coordinates, normalise=settings.normalise)
+        self._box = _Box(self.coordinates, settings)
         self._search = DiffusionEvolution(
             # Line 1: theta^T from the search range, uniform in the normalised box.
             self._box.from_unit(self.coordinates.sample(rng, log.budget.population)),
             dataclasses.replace(settings.diffusion, generations=max(log.budget.generations, 1)),
             rng,
         )
-        self._fitness = make_fitness(settings.fitness, self.problem, rng, settings, search.policy)
+        self._fitness = make_fitness(settings.fitness, self.problem, rng, settings)
 
     @property
     def finished(self) -> bool:
@@ -137,19 +146,18 @@ class _DealPaper(Stepper):
 class DealPaper(Search):
     """DEAL as published; the budget's population is N, its generations are T.
 
-    The latency, of which the paper knows nothing, is one more searched coordinate unless the problem gives
-    it.
-
     Attributes:
         settings: How to run.
-        policy: pi_0 to run in the loop; None replays its recorded actions.
         name: Name in results.
     """
 
     settings: PaperSettings = field(default_factory=PaperSettings)
-    policy: PopulationPolicy | None = None
     name: str = "deal-paper"
     stepper = _DealPaper
+
+    def coordinates(self, problem: Problem) -> Coordinates:
+        """Return the coordinates in which this method searches."""
+        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
 
 
 def paper() -> DealPaper:
@@ -158,9 +166,20 @@ def paper() -> DealPaper:
 
 
 def literal() -> DealPaper:
-    """Return Algorithm 1 to the letter: raw softmax (eq. 22), distance summed over K (eq. 1)."""
-    diffusion = DiffusionSettings(temperature=None, divide_distance=False)
-    return DealPaper(PaperSettings(diffusion=diffusion), name="deal-paper-literal")
+    """Return Algorithm 1 with none of our choices where the paper's words can be taken as they stand.
+
+    Raw softmax (eq. 22), distance summed over K (eq. 1), the range normalised to [0, 1], inputs as they are,
+    a critic that is trained against all rollouts so far (line 3 stores them).
+    """
+    return DealPaper(
+        PaperSettings(
+            diffusion=DiffusionSettings(temperature=None, divide_distance=False),
+            box=(0.0, 1.0),
+            standardise=False,
+            replay_generations=None,
+        ),
+        name="deal-paper-literal",
+    )
 
 
 def without_noise_adaptation() -> DealPaper:
@@ -176,3 +195,8 @@ def without_normalisation() -> DealPaper:
 def flat() -> DealPaper:
     """Return `deal-paper` with a constant fitness: whatever it finds, it did not find in the data."""
     return DealPaper(PaperSettings(fitness="flat"), name="deal-paper-flat")
+
+
+def replayed() -> DealPaper:
+    """Return `deal-paper` for recordings without their policy: it replays the commands in open loop."""
+    return DealPaper(PaperSettings(replay=True), name="deal-paper-replay")

@@ -6,7 +6,6 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import Fitness, RolloutView, Samples
-from deal_hw.calib.deal_paper.rollouts import PopulationPolicy
 from deal_hw.calib.search.critic import ClippedCritic, CriticSettings, torch_threads
 from deal_hw.types import FloatArray
 
@@ -16,9 +15,9 @@ class CriticFitness(Fitness):
 
     KEPT = ("_critic", "_replay")
 
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+    def _prepare(self, rng: np.random.Generator) -> None:
         settings = self._settings
-        self._view = RolloutView(self._problem, settings.ticks, policy)
+        self._view = RolloutView(self._problem, settings)
         self._critic = ClippedCritic(self._view.real.shape[1], settings.critic or CriticSettings(), rng)
         self._replay: list[Samples] = []
 

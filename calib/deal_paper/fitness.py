@@ -18,10 +18,10 @@ from scipy.spatial.distance import cdist, pdist
 from deal_hw.calib.data.innovations import Members, Whitening, cut, linearise, whitened_residual
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.rollouts import (
-    PopulationPolicy,
     TransitionScale,
     control_ticks,
     demonstration,
+    policy_of,
     rollout_population,
     transitions,
 )
@@ -52,6 +52,12 @@ class FitnessSettings:
     Attributes:
         horizon_ticks: Window length of `trajectory` in control periods.
         ticks: Most transitions of a rollout (the DEAL paper's Table 4: 200); `critic`, `energy`, `mmd`.
+        replay: Roll out with the recorded commands, not with the policy in closed loop (Algorithm 1, line 3).
+        difference: Score (s, a, s' - s) instead of the paper's (s, a, s'): the same information, but a first
+            layer can see the change at all, as s and s' differ by a hundredth of their range.
+        standardise: Scale transitions to mean 0 and variance 1 over the recording; the paper says nothing of
+            input scaling. Standardised inputs are cut to five standard deviations: a member whose pole spins
+            would own the critic's output, and with it the softmax.
         bandwidth: Width of `mmd`'s kernel in standardised units; None for the median distance between the
             recording's transitions.
         critic: Size and training of the critic; None for the paper's.
@@ -64,6 +70,9 @@ class FitnessSettings:
 
     horizon_ticks: int = 10
     ticks: int = 200
+    replay: bool = False
+    difference: bool = False
+    standardise: bool = True
     bandwidth: float | None = None
     critic: CriticSettings | None = None
     replay_generations: int | None = 1
@@ -85,9 +94,8 @@ class Fitness(Kept, abc.ABC):
     """What a search is told of its members.
 
     Args:
-        problem: Data and simulator.
+        problem: Data, simulator and policy.
         settings: How to score.
-        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
         rng: Seeds the critic; the others learn nothing and keep nothing.
 
     Attributes:
@@ -98,15 +106,14 @@ class Fitness(Kept, abc.ABC):
         self,
         problem: Problem,
         settings: FitnessSettings,
-        policy: PopulationPolicy | None,
         rng: np.random.Generator,
     ) -> None:
         self._problem, self._settings = problem, settings
         self.values: dict[str, float] = {}
-        self._prepare(policy, rng)
+        self._prepare(rng)
 
     @abc.abstractmethod
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+    def _prepare(self, rng: np.random.Generator) -> None:
         """Make what scoring needs."""
 
     @abc.abstractmethod
@@ -119,26 +126,24 @@ def make_fitness(
     problem: Problem,
     rng: np.random.Generator,
     settings: FitnessSettings | None = None,
-    policy: PopulationPolicy | None = None,
 ) -> Fitness:
     """Return a new fitness.
 
     Args:
         name: A name in `FITNESSES`.
-        problem: Data and simulator.
+        problem: Data, simulator and policy.
         rng: Seeds the critic; the others draw nothing from it.
         settings: How to score.
-        policy: pi_0 to run in the loop of the rollouts; None replays its recorded actions.
 
     Raises:
         UnknownNameError: The name is not in the table.
-        InsufficientDataError: The recording is too short for it.
+        InsufficientDataError: The recording is too short for it, or it needs the policy of the recording.
     """
     if name not in FITNESSES:
         raise UnknownNameError("fitness", name, FITNESSES)
     module, _, attribute = FITNESSES[name].partition(":")
     made: Fitness = getattr(importlib.import_module(module), attribute)(
-        problem, settings or FitnessSettings(), policy, rng
+        problem, settings or FitnessSettings(), rng
     )
     return made
 
@@ -146,7 +151,7 @@ def make_fitness(
 class FlatFitness(Fitness):
     """The same number for every member: a search that cannot see the data."""
 
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+    def _prepare(self, rng: np.random.Generator) -> None:
         # The critic's seed, which nobody reads: search and no-data baseline then see the same random numbers.
         rng.integers(2**62)
 
@@ -163,7 +168,7 @@ class TrajectoryFitness(Fitness):
     generations, or scores would not compare.
     """
 
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
+    def _prepare(self, rng: np.random.Generator) -> None:
         self._windows = cut(self._problem, self._settings.horizon_ticks)
         coordinates = Coordinates(self._problem)
         self._midpoint = coordinates.members(np.full((1, coordinates.count), 0.5))
@@ -183,19 +188,32 @@ class TrajectoryFitness(Fitness):
 
 
 class RolloutView:
-    """Transitions (s, a, s' - s) of the recording and of rollouts, standardised by the recording's.
+    """Transitions (s, a, s') of the recording and of rollouts.
 
     Args:
-        problem: Data and simulator.
-        ticks: Most transitions of a rollout of one episode.
-        policy: pi_0 to run in the loop; None replays its recorded actions.
+        problem: Data, simulator and policy.
+        settings: How to roll out, and what of it is seen.
+
+    Raises:
+        InsufficientDataError: A recording is too short, or its policy is not known.
     """
 
-    def __init__(self, problem: Problem, ticks: int, policy: PopulationPolicy | None) -> None:
-        self._problem, self._policy = problem, policy
-        self._ticks = [control_ticks(problem, index, ticks) for index in range(len(problem.episodes))]
-        raw = np.concatenate([demonstration(problem, i, ticks) for i, ticks in enumerate(self._ticks)])
-        self._scale = TransitionScale.of(raw.astype(np.float64))
+    def __init__(self, problem: Problem, settings: FitnessSettings) -> None:
+        self._problem, self._settings = problem, settings
+        history = 0 if settings.replay else policy_of(problem).history
+        self._ticks = [
+            control_ticks(problem, index, settings.ticks, history) for index in range(len(problem.episodes))
+        ]
+        raw = np.concatenate(
+            [
+                demonstration(problem, index, ticks, difference=settings.difference)
+                for index, ticks in enumerate(self._ticks)
+            ]
+        )
+        width = raw.shape[1]
+        self._scale = TransitionScale(np.zeros(width), np.ones(width), np.inf)
+        if settings.standardise:
+            self._scale = TransitionScale.of(raw.astype(np.float64))
         self.real: Samples = self._scale.apply(raw)
         """The recording's transitions, (n, inputs)."""
 
@@ -203,8 +221,8 @@ class RolloutView:
         """Return each member's transitions, (N, n, inputs), and which members did not diverge, (N,)."""
         blocks = []
         for index, ticks in enumerate(self._ticks):
-            moved = rollout_population(self._problem, members, index, ticks, self._policy)
-            blocks.append(transitions(*moved))
+            moved = rollout_population(self._problem, members, index, ticks, replay=self._settings.replay)
+            blocks.append(transitions(*moved, difference=self._settings.difference))
         raw = blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=1)
         usable = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
         return self._scale.apply(raw), usable
@@ -213,8 +231,8 @@ class RolloutView:
 class EnergyFitness(Fitness):
     """Minus the energy distance between the recording's transitions and the member's own."""
 
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
-        self._view = RolloutView(self._problem, self._settings.ticks, policy)
+    def _prepare(self, rng: np.random.Generator) -> None:
+        self._view = RolloutView(self._problem, self._settings)
         self._real = self._view.real.astype(np.float64)
 
     def score(self, members: Members) -> FloatArray:
@@ -232,8 +250,8 @@ class EnergyFitness(Fitness):
 class KernelFitness(EnergyFitness):
     """Minus the squared maximum mean discrepancy (Gaussian kernel) between the same transitions."""
 
-    def _prepare(self, policy: PopulationPolicy | None, rng: np.random.Generator) -> None:
-        super()._prepare(policy, rng)
+    def _prepare(self, rng: np.random.Generator) -> None:
+        super()._prepare(rng)
         self._bandwidth = self._settings.bandwidth or float(np.median(pdist(self._real)))
 
     def _distance(self, samples: FloatArray) -> float:

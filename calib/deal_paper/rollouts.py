@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.innovations import Members, early_setpoints
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import PopulationPolicy, Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps
+from deal_hw.sim.engine.servo import slew
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray, IntArray
-
-PopulationPolicy = Callable[[FloatArray, FloatArray, int], FloatArray]
-"""pi_0 in the loop: position (N, J), velocity (N, J), tick -> position target (N, A)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,39 +26,63 @@ class Ticks:
         start: Grid index at which each tick starts, (T + 1,); the last one ends the last tick.
         sample: Index of the state sample at each of them, (T + 1,).
         changes: Ticks at which what is sent (gains, limits) differs from the tick before; starts with 0.
+        lead: Device periods from the start of a tick, whose state the controller saw, until its command acts.
+        number: Commands of the recording before the first tick's.
+        past: Index of the state sample at the start of each of the last ticks before the first, (h,).
     """
 
     start: IntArray
     sample: IntArray
     changes: tuple[int, ...]
+    lead: int
+    number: int
+    past: IntArray
 
     def __len__(self) -> int:
         return len(self.start) - 1
 
     @property
     def action(self) -> IntArray:
-        """Grid index at which each tick's action is read, (T,): commands arrive some periods into a tick."""
-        return np.asarray((self.start[:-1] + self.start[1:]) // 2)
+        """Grid index at which each tick's action is read, (T,)."""
+        return np.asarray(self.lead + (self.start[:-1] + self.start[1:]) // 2)
+
+    @property
+    def past_action(self) -> IntArray:
+        """Grid index at which the action of each of the ticks before is read, (h,)."""
+        period = self.start[1] - self.start[0]
+        return np.asarray(self.action[0] + period * np.arange(-len(self.past), 0))
 
 
-def control_ticks(problem: Problem, index: int, most: int | None = None) -> Ticks:
+def control_ticks(problem: Problem, index: int, most: int | None = None, history: int = 0) -> Ticks:
     """Divide an episode into control periods, from its first usable sample to the first gap.
+
+    A tick starts at the newest state that the controller can have seen, the last sample before its command
+    acts.
 
     Args:
         problem: Gives the episodes and the control rate.
         index: Which episode.
         most: Most ticks to return.
+        history: Control periods that the policy looks back. Where the recording begins after the policy did,
+            so many ticks are left out, so that its past is known.
 
     Raises:
         InsufficientDataError: There are fewer than two ticks.
     """
     episode, description = problem.episodes[index], problem.robot.description
     period = round(1.0 / (description.control_rate_hz * episode.step_s))
-    first = int(np.argmax(episode.usable))
     row_of = {int(s): i for i, s in enumerate(episode.sample)}
-    start, sample = [], []
+    first = int(np.argmax(episode.usable))
+    # Commands come once a period, at the phase at which most of them change the target.
+    changed = np.flatnonzero(np.any(episode.target[1:] != episode.target[:-1], axis=1)) + 1
+    phase = int(np.bincount(changed % period, minlength=period).argmax())
+    lead = int((phase - episode.sample[first]) % episode.stride)
     at = int(episode.sample[first])
+    at += (phase - lead - at) % period
+    number = (at + lead - phase) // period
+    start, sample = [], []
     last_usable = first
+    skip = history if number > 0 else 0
     while at <= episode.steps and at in row_of:
         row = row_of[at]
         if not episode.usable[last_usable : row + 1].all():
@@ -70,15 +91,20 @@ def control_ticks(problem: Problem, index: int, most: int | None = None) -> Tick
         sample.append(row)
         last_usable = row
         at += period
-        if most is not None and len(start) > most:
+        if most is not None and len(start) > most + skip:
             break
-    if len(start) < 3:
+    if len(start) < 3 + skip:
         raise InsufficientDataError(
-            f"episode {index} has {max(len(start) - 1, 0)} whole control periods; a rollout needs 2 or more"
+            f"episode {index} has {max(len(start) - 1, 0)} whole control periods; a rollout needs {2 + skip} "
+            "or more"
         )
-    sent = np.concatenate([episode.stiffness, episode.damping, episode.effort_limit], axis=1)[start[:-1]]
+    past, start, sample = sample[:skip], start[skip:], sample[skip:]
+    sent = np.concatenate([episode.stiffness, episode.damping, episode.effort_limit], axis=1)
+    sent = sent[np.array(start[:-1]) + lead]
     changes = [0, *(np.flatnonzero(np.any(sent[1:] != sent[:-1], axis=1)) + 1).tolist()]
-    return Ticks(np.array(start), np.array(sample), tuple(changes))
+    return Ticks(
+        np.array(start), np.array(sample), tuple(changes), lead, number + skip, np.array(past, dtype=int)
+    )
 
 
 def _send(batch: ServoBatch, episode: Episode, at: int) -> None:
@@ -90,23 +116,24 @@ def rollout_population(
     members: Members,
     index: int,
     ticks: Ticks,
-    policy: PopulationPolicy | None = None,
+    *,
+    replay: bool = False,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Roll all members out from the recording's initial state (Algorithm 1, line 3).
 
-    Without a policy the recorded targets are sent: pi_0's actions on the robot. Closed loop needs pi_0
-    itself.
-
     Args:
-        problem: Data and simulator; its physics step may be longer than the device's period.
+        problem: Data, simulator and pi_0; its physics step may be longer than the device's period.
         members: The N simulators.
         index: Which episode.
         ticks: Its control periods.
-        policy: pi_0, or None.
+        replay: Send the recorded targets, pi_0's actions on the robot, instead of asking pi_0.
 
     Returns:
         Positions and velocities at the ticks, (N, T + 1, J) each, and the action of each tick, (N, T, A).
         Members that diverged are NaN from there on.
+
+    Raises:
+        InsufficientDataError: As :func:`policy_of`.
     """
     episode = problem.episodes[index]
     batch = problem.batch(len(members.theta))
@@ -117,9 +144,27 @@ def rollout_population(
         starts.velocity[first],
         reference=None if episode.reference is None else episode.reference[first],
     )
-    if policy is None:
+    if replay:
         return _replay(batch, episode, members, ticks)
+    policy = policy_of(problem)
+    seen = recorded_states(problem, index, ticks.past)
+    policy.restart(batch.count, *seen, episode.target[ticks.past_action], ticks.number)
     return _closed_loop(batch, episode, members, ticks, policy)
+
+
+def policy_of(problem: Problem) -> PopulationPolicy:
+    """Return the policy that moved the robot all through the recordings.
+
+    Raises:
+        InsufficientDataError: It is not known, or no policy did.
+    """
+    if problem.policy is None:
+        raise InsufficientDataError(
+            "a rollout in closed loop needs the policy that moved the robot all through the recordings, and "
+            "it is not known; record with `deal-hw collect --profile balance`, or use a method that needs no "
+            "policy: eki, deal, deal-paper-replay"
+        )
+    return problem.policy
 
 
 def _replay(
@@ -131,7 +176,7 @@ def _replay(
     position[:, 0], velocity[:, 0] = batch.position, batch.velocity
     every = round((ticks.start[1] - ticks.start[0]) * episode.step_s / batch.robot.step_s)
     for begin, end in zip(ticks.changes, (*ticks.changes[1:], T), strict=True):
-        _send(batch, episode, int(ticks.start[begin]))
+        _send(batch, episode, int(ticks.start[begin]) + ticks.lead)
         control = on_physics_steps(batch, path[:, ticks.start[begin] : ticks.start[end]], episode.step_s)
         moved = batch.advance(control, every)
         position[:, begin + 1 : end + 1], velocity[:, begin + 1 : end + 1] = moved
@@ -146,21 +191,31 @@ def _closed_loop(
     batch: ServoBatch, episode: Episode, members: Members, ticks: Ticks, policy: PopulationPolicy
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     N, T, J = batch.count, len(ticks), episode.position.shape[1]
-    A = episode.target.shape[1]
+    A, lead, first = episode.target.shape[1], ticks.lead, int(ticks.start[0])
     position, velocity = np.empty((N, T + 1, J)), np.empty((N, T + 1, J))
     action = np.empty((N, T, A))
     position[:, 0], velocity[:, 0] = batch.position, batch.velocity
     period = int(ticks.start[1] - ticks.start[0])
-    loop = ClosedLoop(batch, period, episode.step_s)
-    loop.restart(np.repeat(episode.start_setpoint[None], N, axis=0), members.latency_s)
     speed = batch.servo_factor("servo_speed_limit") * episode.step_s
+    loop = ClosedLoop(batch, period, episode.step_s)
+    setpoint = np.repeat(episode.start_setpoint[None], N, axis=0)
+    sent = setpoint
+    if first + lead > 0:
+        sent = np.repeat(episode.target[first + lead - 1][None], N, axis=0)
+    if first > 0:
+        rate = speed[:, None] * episode.speed_limit[None, :first]
+        setpoint = slew(setpoint, episode.target[:first], rate)[:, -1]
+    loop.restart(setpoint, members.latency_s)
     for t in range(T):
         at = int(ticks.start[t])
         if t in ticks.changes:
-            _send(batch, episode, at)
-        action[:, t] = policy(position[:, t], velocity[:, t], t)
+            _send(batch, episode, at + lead)
+        action[:, t] = policy(position[:, t], velocity[:, t])
+        target = np.repeat(action[:, t, None], period, axis=1)
+        target[:, :lead] = sent[:, None]
+        sent = action[:, t]
         rate = speed[:, None] * episode.speed_limit[None, at : at + period]
-        moved = loop.advance(action[:, t], rate)
+        moved = loop.advance(target, rate)
         position[:, t + 1], velocity[:, t + 1] = moved[0][:, 0], moved[1][:, 0]
         bad = ~np.isfinite(position[:, t]).all(axis=1)
         position[bad, t + 1], velocity[bad, t + 1] = np.nan, np.nan
@@ -170,10 +225,6 @@ def _closed_loop(
 @dataclass(frozen=True, slots=True)
 class TransitionScale:
     """Standardises transitions by the recording's statistics.
-
-    The paper feeds (s, a, s'). This feeds (s, a, s' - s), each with mean 0 and variance 1 over the recording:
-    the same information in coordinates in which a first layer can see the change at all, as s and s' differ
-    by a hundredth of their range. The paper says nothing of input scaling.
 
     Attributes:
         mean: (2 J + A + 2 J,).
@@ -199,34 +250,44 @@ class TransitionScale:
         return raw
 
 
-def transitions(position: FloatArray, velocity: FloatArray, action: FloatArray) -> npt.NDArray[np.float32]:
-    """Return (s, a, s' - s) of rollouts, (N, T, 2 J + A + 2 J), not yet standardised.
+def transitions(
+    position: FloatArray, velocity: FloatArray, action: FloatArray, *, difference: bool = False
+) -> npt.NDArray[np.float32]:
+    """Return (s, a, s') of rollouts, (N, T, 2 J + A + 2 J), not yet standardised.
 
     Args:
         position: (N, T + 1, J).
         velocity: (N, T + 1, J).
         action: (N, T, A).
+        difference: Return (s, a, s' - s).
     """
-    N, T, A = action.shape
-    J = position.shape[2]
-    out = np.empty((N, T, 4 * J + A), dtype=np.float32)
-    out[..., :J], out[..., J : 2 * J] = position[:, :-1], velocity[:, :-1]
-    out[..., 2 * J : 2 * J + A] = action
-    out[..., 2 * J + A : 3 * J + A] = np.diff(position, axis=1)
-    out[..., 3 * J + A :] = np.diff(velocity, axis=1)
-    return out
+    state = np.concatenate([position, velocity], axis=2)
+    after = np.diff(state, axis=1) if difference else state[:, 1:]
+    return np.concatenate([state[:, :-1], action, after], axis=2, dtype=np.float32)
 
 
-def demonstration(problem: Problem, index: int, ticks: Ticks) -> npt.NDArray[np.float32]:
-    """Return the recording's own transitions D_T, (T, inputs), not yet standardised.
+def demonstration(
+    problem: Problem, index: int, ticks: Ticks, *, difference: bool = False
+) -> npt.NDArray[np.float32]:
+    """Return the recording's own transitions D_T, (T, inputs), as :func:`transitions` does.
 
     Noisy positions are smoothed first (:func:`deal_hw.calib.data.noise.smooth_states`), which helps the
     paper's method.
     """
+    position, velocity = recorded_states(problem, index, ticks.sample)
+    action = problem.episodes[index].target[ticks.action]
+    seen = transitions(position[None], velocity[None], action[None], difference=difference)
+    return np.asarray(seen[0])
+
+
+def recorded_states(problem: Problem, index: int, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return smoothed positions and velocities of an episode's samples, (n, C) each.
+
+    A rollout is far from the recording: orientations of both are put in one chart, that of the identity.
+    """
     starts, episode = problem.starts[index], problem.episodes[index]
-    position, velocity = starts.position[ticks.sample].copy(), starts.velocity[ticks.sample]
+    position, velocity = starts.position[rows].copy(), starts.velocity[rows]
     if episode.reference is not None:
-        # A rollout is far from the recording: both are put in one chart, that of the identity.
-        turned = to_quaternion(position[:, problem.robot.rotation], episode.reference[ticks.sample])
+        turned = to_quaternion(position[:, problem.robot.rotation], episode.reference[rows])
         position[:, problem.robot.rotation] = to_vector(turned, IDENTITY)
-    return np.asarray(transitions(position[None], velocity[None], episode.target[ticks.action][None])[0])
+    return position, velocity

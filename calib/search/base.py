@@ -40,11 +40,17 @@ class Coordinates:
         problem: Gives the space and the range of the latency, or the latency.
         margin_s: The latency's coordinate reaches so far beyond its range, or a latency of zero would sit at
             infinity [s]; less than :func:`~deal_hw.calib.data.innovations.early_setpoints` can undo.
+        linear: Parameters are equal steps of their value, whatever their scale.
+        latency: Search the latency where it is not given; otherwise it then counts as none.
     """
 
-    def __init__(self, problem: Problem, margin_s: float = 0.004) -> None:
-        self.space = problem.space
+    def __init__(
+        self, problem: Problem, margin_s: float = 0.004, *, linear: bool = False, latency: bool = True
+    ) -> None:
+        self.space, self._linear = problem.space, linear
         self.fixed_latency_s = problem.fixed_latency_s
+        if self.fixed_latency_s is None and not latency:
+            self.fixed_latency_s = 0.0
         self._range = problem.latency_range_s
         self._low = self._range[0] - margin_s
         self._width = self._range[1] - self._range[0] + 2 * margin_s
@@ -61,8 +67,10 @@ class Coordinates:
 
     def members(self, unit: FloatArray) -> Members:
         """Map unit coordinates, (N, C), to physical values; parameters are clipped to their range."""
-        K = len(self.space)
-        theta = np.clip(self.space.unnormalize(unit[:, :K]), self.space.low, self.space.high)
+        K, space = len(self.space), self.space
+        part = unit[:, :K]
+        theta = space.low + (space.high - space.low) * part if self._linear else space.unnormalize(part)
+        theta = np.clip(theta, space.low, space.high)
         if self.fixed_latency_s is not None:
             return Members(theta, np.full(len(unit), self.fixed_latency_s))
         latency = self._low + self._width * np.clip(unit[:, K], 0.0, 1.0)
@@ -75,10 +83,6 @@ class Coordinates:
             inner = self._range[0] + (self._range[1] - self._range[0]) * unit[:, -1]
             unit[:, -1] = (inner - self._low) / self._width
         return unit
-
-    def latency_unit(self, latency_s: FloatArray) -> FloatArray:
-        """Return the unit coordinate of latencies, (N,)."""
-        return np.asarray((latency_s - self._low) / self._width)
 
     def clip_latency(self, latency_s: float) -> float:
         """Return the latency inside the range that was asked for [s]."""
@@ -96,6 +100,7 @@ class SearchLog:
         budget: What may be used.
         progress: Called after each generation.
         settings: The method's settings, a dataclass.
+        coordinates: In which it searches; those of the problem by default.
     """
 
     def __init__(
@@ -105,9 +110,10 @@ class SearchLog:
         budget: Budget,
         progress: ProgressCallback | None,
         settings: Any,
+        coordinates: Coordinates | None = None,
     ) -> None:
         self.method, self.problem, self.budget, self._settings = method, problem, budget, settings
-        self.coordinates = Coordinates(problem)
+        self.coordinates = coordinates or Coordinates(problem)
         self.trace: list[dict[str, float]] = []
         self._progress = progress
         self._steps = problem.steps
@@ -250,6 +256,10 @@ class Search(CalibrationMethod[Problem]):
     stepper: ClassVar[type[Stepper]]
     """Makes a run before its first generation; its arguments are those of :class:`Stepper`."""
 
+    def coordinates(self, problem: Problem) -> Coordinates:
+        """Return the coordinates in which this method searches."""
+        return Coordinates(problem)
+
     def run(
         self,
         problem: Problem,
@@ -259,7 +269,7 @@ class Search(CalibrationMethod[Problem]):
         checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
         """Search to the end; see :meth:`deal_hw.calibration.CalibrationMethod.run`."""
-        log = SearchLog(self.name, problem, budget, progress, self.settings)
+        log = SearchLog(self.name, problem, budget, progress, self.settings, self.coordinates(problem))
         stepper = self.stepper(log, rng, self)
         saved = checkpoint.load() if checkpoint is not None else None
         if saved is not None:

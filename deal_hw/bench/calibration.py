@@ -90,7 +90,7 @@ def make_cells(
     ]  # fmt: skip
 
 
-def cells(chosen: Sequence[Cell], *, population: int, generations: int, threads: int | None) -> Cells:
+def cells(chosen: Sequence[Cell], *, population: int | None, generations: int, threads: int | None) -> Cells:
     """Return what runs cells; see :func:`run_cell`."""
 
     def make(cell: Cell) -> Callable[[], Row]:
@@ -99,13 +99,19 @@ def cells(chosen: Sequence[Cell], *, population: int, generations: int, threads:
     return Cells(names=KEY, runs=[(cell.key, make(cell)) for cell in chosen])
 
 
-def run_cell(cell: Cell, *, population: int, generations: int, threads: int | None) -> dict[str, Any]:
-    """Run one cell; an error is kept in the row, so that the other cells still run."""
+def run_cell(cell: Cell, *, population: int | None, generations: int, threads: int | None) -> dict[str, Any]:
+    """Run one cell; an error is kept in the row, so that the other cells still run.
+
+    Without a population each method has its usual one.
+    """
+    from deal_hw.calib.methods import usual_population
+
     row: dict[str, Any] = {"bench": cell.protocol}
     row |= {name: getattr(cell, name) for name in KEY} | {"error": ""}
     if cell.protocol == "paper":
         row["note"] = PAPER_NOTE
-    budget = Budget(population=population, generations=generations, refine=cell.refined)
+    members = population or usual_population(cell.method)
+    budget = Budget(population=members, generations=generations, refine=cell.refined)
     try:
         case = make_case(
             cell.task, cell.profile, cell.seed, cell.xi, cell.space,

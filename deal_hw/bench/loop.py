@@ -29,7 +29,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
 
 TASK_EPISODES = 5
-SEARCHES = ("deal", "eki", "deal-paper", "deal-paper-flat", "midpoint")
+SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")
 """Run without the refinement, beside the default with everything."""
 
 
@@ -51,7 +51,7 @@ def calibration_row(
     d = case
     result = calibrate_episodes(
         d.robot, d.space, [d.fit], [], method=method, budget=budget, rng=np.random.default_rng(d.seed),
-        threads=threads,
+        threads=threads, policy=d.policy,
     )  # fmt: skip
     coverage, width = _intervals(d, result, threads)
     truth = d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]

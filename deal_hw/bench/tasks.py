@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from deal_hw.calib.data.problem import PopulationPolicy
 from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole, demonstrate
+from deal_hw.control.vigor import ATTEMPTS
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.oracle import draw_truth
@@ -53,6 +55,7 @@ class Case:
         channel_std: True standard deviation of the measured channels, (M,); None where nothing is noisy.
         refused: Truths that were drawn and could not demonstrate.
         truth: The emulated robot's truth, where there is an emulator.
+        policy: What moved the robot all through the demonstration; None where that was no policy alone.
         vigors: How lively each attempt at a demonstration was; the one in use moves best.
     """
 
@@ -70,6 +73,7 @@ class Case:
     channel_std: FloatArray | None
     refused: int
     truth: Truth | None = None
+    policy: PopulationPolicy | None = None
     vigors: tuple[float, ...] = (0.0,)
 
 
@@ -111,8 +115,8 @@ def make_case(
         xi: Ratio of the search range.
         space: Name of the parameter set; the task's default.
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
-        by_policy: Ant and Go2 are demonstrated by their shipped policies, as in the paper, instead of by
-            motions that excite more. The cart-pole's demonstration always begins with its policy.
+        by_policy: The robot is demonstrated by its shipped policy, as in the paper, instead of by motions
+            that excite more. The cart-pole's demonstration always begins with its policy.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
@@ -123,14 +127,20 @@ def make_case(
 
 def _cartpole(ask: _Ask) -> Case:
     seed, profile = ask.seed, ask.profile
-    truth = nominal_truth(profile, seed) if ask.centred else draw_truth(profile, seed, xi=ask.xi)
     space = ask.ranges(SPACES)
+    truth = nominal_truth(profile, seed)
+    if ask.centred:
+        preset = {p.name: p.nominal for p in space.parameters}
+        truth = replace(truth, parameters={**truth.parameters, **preset})
+    else:
+        truth = draw_truth(profile, seed, xi=ask.xi)
     virtual = VirtualCartpole(truth)
     plan = RunPlan(
-        robot="cartpole", profile="rich", seconds=DEMONSTRATION_S, seed=seed,
+        robot="cartpole", profile="balance" if ask.by_policy else "rich", seconds=DEMONSTRATION_S, seed=seed,
         policy=str(shipped_policy("cartpole") or ""),
     )  # fmt: skip
-    shown, search = demonstrate(virtual, plan)
+    # A balanced pole is no livelier the second time.
+    shown, search = demonstrate(virtual, plan, 1 if ask.by_policy else ATTEMPTS)
     chirp = replace(plan, profile="chirp")
     recordings = (shown, virtual.run(make_behaviour(chirp, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
@@ -142,6 +152,7 @@ def _cartpole(ask: _Ask) -> Case:
         heldout=heldout, fit_truth=recordings[0].true_states(fit),
         heldout_truth=recordings[1].true_states(heldout)[0],
         channel_std=find_profile(profile).sensor.position_std, refused=truth.refused, truth=truth,
+        policy=_population("cartpole", DESCRIPTION) if ask.by_policy else None,
         vigors=tuple(attempt.vigor for attempt in search.attempts),
     )  # fmt: skip
 
@@ -187,10 +198,19 @@ FORWARD_M_S = 0.4
 """Speed that a demonstration policy is asked for, where it observes one [m/s]."""
 
 
+WANTED = (FORWARD_M_S, 0.0, 0.0)
+
+
 def _policy(robot: str, description: RobotDescription) -> Behaviour:
     from deal_hw.policies.demonstration import Demonstration, demonstration_policy
 
-    return Demonstration(demonstration_policy(robot), description, wanted=(FORWARD_M_S, 0.0, 0.0))
+    return Demonstration(demonstration_policy(robot), description, WANTED)
+
+
+def _population(robot: str, description: RobotDescription) -> PopulationPolicy:
+    from deal_hw.policies.demonstration import PopulationDemonstration, demonstration_policy
+
+    return PopulationDemonstration(demonstration_policy(robot), description, WANTED)
 
 
 def _target(
@@ -204,7 +224,8 @@ def _target(
     seed = ask.seed
     rng = np.random.default_rng([seed, sum(task.encode())])
     low, high = (round(t / robot.step_s) for t in LATENCY_S)
-    for refused in range(MOST_REDRAWS):  # noqa: B007
+    draws = 1 if ask.centred else MOST_REDRAWS
+    for refused in range(draws):  # noqa: B007
         theta = space.unnormalize(rng.uniform(*TRUTH_PART, len(space)))
         if ask.centred:
             theta = space.nominal
@@ -222,12 +243,16 @@ def _target(
         if all(_stands(task, r) for r in (fit, heldout)):
             break
     else:
-        raise CalibrationError(f"{task}, seed {seed}: none of {MOST_REDRAWS} truths could demonstrate")
+        what = "the preset's robot falls" if ask.centred else f"all of {draws} robots that were drawn fall"
+        raise CalibrationError(
+            f"{task}, seed {seed}: {what}, so that there is no demonstration; use another --space or --xi"
+        )
     std = None if sensing is None else _channel_std(robot, sensing)
     return Case(
         task=task, profile=ask.profile, seed=seed, robot=robot, space=space, theta=theta, latency_s=latency_s,
         fit=fit.episode, heldout=heldout.episode, fit_truth=(fit.position, fit.velocity),
         heldout_truth=heldout.position, channel_std=std, refused=refused,
+        policy=_population(task, robot.description) if ask.by_policy else None,
     )  # fmt: skip
 
 

@@ -84,10 +84,11 @@ class Bench:
     """Refine every method; by default only `default` is."""
 
     demonstration: Literal["excite", "policy"] = "excite"
-    """How ant and Go2 are demonstrated: by motions that excite, or by their shipped policies."""
+    """How robots are demonstrated: by motions that excite, or by their shipped policies, which methods of the
+    paper need."""
 
-    population: Annotated[int, Range(2, 100_000)] = 100
-    """Members of a search."""
+    population: Annotated[int | None, Range(2, 100_000)] = None
+    """Members of a search; by default 100, for methods of the paper 200."""
 
     generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of a search."""
@@ -230,7 +231,7 @@ def _first_answer(config: Bench, out: Path) -> _Table:
 
 
 def _budget(config: Bench) -> Budget:
-    return Budget(population=config.population, generations=config.generations)
+    return Budget(population=config.population or Budget().population, generations=config.generations)
 
 
 def _draw(out: Path, rows: Sequence[Row]) -> None:

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from deal_hw.calib.methods import check_method
+from deal_hw.calib.methods import CLOSED_LOOP_METHODS, check_method, usual_population
 from deal_hw.calibration import LATENCY_RANGE_S, Budget
 from deal_hw.cli.calibrate_live import CHECKPOINT, SO_FAR, check_resume, saying_how_to_resume, watching
 from deal_hw.cli.calibrate_model import Recordings, prepare_model, write_parameters
+from deal_hw.cli.calibrate_policy import recorded_policy
 from deal_hw.cli.calibrate_run import (
     HELDOUT_WINDOW_S,
     CalibrateReport,
@@ -93,6 +94,10 @@ class Calibrate(Checked):
     fixed base, it is output-error unless --residual-std or --no-refine say how to treat what no model
     explains."""
 
+    policy: Path | None = None
+    """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
+    simulator; by default the copy that the dataset keeps."""
+
     space: str = ""
     """Which parameters of a robot of ours, such as k9 or k11 (docs/parameters.md); the first by default."""
 
@@ -129,8 +134,8 @@ class Calibrate(Checked):
     """Fit to about so many states a second of a dataset; by default to four a control period. What was held
     out is judged at the same rate."""
 
-    population: Annotated[int, Range(2, 100_000)] = 100
-    """Members of the search."""
+    population: Annotated[int | None, Range(2, 100_000)] = None
+    """Members of the search; by default 100, for methods of the paper 200."""
 
     generations: Annotated[int, Range(1, 100_000)] = 50
     """Most generations of the search."""
@@ -200,10 +205,18 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     if config.latency is not None:
         refuse(given(config, Calibrate(), ("latency_range",)), "--latency says the latency")
     check_method(config.method)
+    if config.method not in CLOSED_LOOP_METHODS:
+        refuse(given(config, Calibrate(), ("policy",)), f"--method {config.method} runs no policy")
+    elif source.model is not None:
+        raise ConfigurationError(
+            f"--method {config.method} runs the policy that moved the robot, which recordings of --model do "
+            "not name; use eki, deal or deal-paper-replay"
+        )
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
-    budget = Budget(population=config.population, generations=config.generations, refine=config.refine)
+    population = config.population or usual_population(config.method)
+    budget = Budget(population=population, generations=config.generations, refine=config.refine)
     work = prepare(config)
     known_std = residual_std(config.residual_std, work.robot)
     method = usual_method(config, work.robot, walks=work.walks)
@@ -232,6 +245,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             known_std=known_std,
             heldout_window_s=config.heldout_window,
             smoothing_s=GAIT_SMOOTHING_S if work.walks else None,
+            policy=work.policy,
         )
     settings: dict[str, Any] = {
         "seed": config.seed,
@@ -333,6 +347,10 @@ def prepare_dataset(config: Calibrate) -> CalibrationInputs:
     dataset = Dataset.open(config.dataset)
     held = [int(str(i)) for i in config.holdout]
     fit, holdout = choose_episodes(dataset, config.episodes, held)
+    policy = None
+    if config.method in CLOSED_LOOP_METHODS:
+        description = recorded_description(dataset.description["name"])
+        policy = recorded_policy(dataset, fit, description, config.policy)
     space = make_space(dataset.description["name"], config)
     recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
     spikes = SpikeSettings(ratio=config.spike_ratio)
@@ -371,6 +389,7 @@ def prepare_dataset(config: Calibrate) -> CalibrationInputs:
         balance=balancer(robot.description, None),
         name="" if robot.base is not None else robot.description.name,
         walks=walks,
+        policy=policy,
     )
 
 

@@ -30,6 +30,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.control.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
@@ -56,6 +57,7 @@ class CalibrationInputs:
         balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
         name: Name under which `deal-hw collect` records this robot; "" where it does not.
         walks: Whether all recordings are of a policy that walks.
+        policy: What moved the robot all through the recordings, where the method needs it.
     """
 
     robot: RobotModel
@@ -69,6 +71,7 @@ class CalibrationInputs:
     balance: Callable[[], Behaviour] | None = None
     name: str = ""
     walks: bool = False
+    policy: PopulationPolicy | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,6 +142,7 @@ def calibrate_episodes(
     known_std: FloatArray | None = None,
     heldout_window_s: float = HELDOUT_WINDOW_S,
     smoothing_s: float | None = None,
+    policy: PopulationPolicy | None = None,
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid; the heart of the verb, without files.
 
@@ -162,6 +166,7 @@ def calibrate_episodes(
             the recordings show it.
         heldout_window_s: Held-out predictions restart this often [s].
         smoothing_s: Start states are smoothed over so long [s]; None for the usual time.
+        policy: What moved the robot all through the recordings, for methods that need it.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -185,6 +190,7 @@ def calibrate_episodes(
         fixed_latency_s=latency_s,
         known_std=known_std,
         settings=DATA if smoothing_s is None else dataclasses.replace(DATA, smoothing_s=smoothing_s),
+        policy=policy,
     )
     check_delays(problem)
 

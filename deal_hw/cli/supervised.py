@@ -120,6 +120,8 @@ def run_episodes(
         connected(robot),
         _open_dataset(dataset, robot.description) as store,
     ):
+        if store is not None and plan.policy_digest:
+            store.keep_policy(Path(plan.policy), plan.policy_digest)
         for number in range(episodes):
             # The robot's own controller gets it back after the last episode only.
             last = number == episodes - 1

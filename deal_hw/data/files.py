@@ -44,13 +44,17 @@ def read_episode_bytes(path: Path) -> bytes:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write plain JSON values: to a temporary file beside it, onto the disk, then renamed over."""
+    """Write plain JSON values as :func:`write_bytes` does."""
+    write_bytes(path, f"{json.dumps(values, indent=2)}\n".encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file: to a temporary one beside it, onto the disk, then renamed over."""
     path = Path(path)
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with open(fresh, "w", encoding="utf-8") as file:
-            json.dump(values, file, indent=2)
-            file.write("\n")
+        with open(fresh, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(fresh, path)

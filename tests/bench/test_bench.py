@@ -6,11 +6,13 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deal_hw.bench.rows import write_rows
+from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
-from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
+from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
 
 FIELDS = {
     "bench", "task", "profile", "method", "refined", "xi", "seed", "error_percent", "log_error_x100",
@@ -114,6 +116,37 @@ def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> No
     # The centre of a linear range [p / 5, 5 p] is 2.6 p.
     assert rows["midpoint"]["error_percent"] == pytest.approx(160.0)
     assert "scores 0" in rows["midpoint"]["note"]
+
+
+@pytest.mark.parametrize(
+    ("task", "space"), [("cartpole", "paper"), ("ant", "paper"), ("go2", "paper-swapped")]
+)
+def test_presets_of_the_paper_are_the_truth_there(task: str, space: str) -> None:
+    """The hidden robot has the values of Tables 7 to 9, inside the range around them."""
+    case = make_case(task, "ideal", 3, 5.0, space, centred=True)
+    np.testing.assert_array_equal(case.theta, case.space.nominal)
+    assert np.all((case.space.low < case.theta) & (case.theta < case.space.high))
+
+
+def test_a_preset_that_cannot_stand_is_said() -> None:
+    """Table 9 as printed: motors of 0.5 N·m/rad do not hold a Go2."""
+    with pytest.raises(CalibrationError, match="the preset's robot falls"):
+        make_case("go2", "ideal", 3, 5.0, "paper", centred=True)
+
+
+def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
+    """On motions that excite the row says so; on the policy's own motion it runs."""
+    errors = {}
+    for shown in ("excite", "policy"):
+        out = tmp_path / f"{shown}.json"
+        settings = Bench(
+            bench="honest", task="cartpole", profile="ideal", seeds="3", methods="deal-paper", population=4,
+            generations=1, demonstration=shown, out=out, threads=1, quiet=True,
+        )  # fmt: skip
+        bench(settings)
+        (row,) = json.loads(out.read_text())["rows"]
+        errors[shown] = row["error"]
+    assert "needs the policy that moved the robot" in errors["excite"] and errors["policy"] == ""
 
 
 def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:

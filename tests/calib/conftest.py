@@ -17,6 +17,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.testing.recorded_commands import RecordedCommands
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
@@ -76,7 +77,10 @@ def small_problem() -> Callable[..., Problem]:
 
     def make(seconds: float = 1.2, latency_ticks: int = 0, fixed_latency_s: float | None = 0.0) -> Problem:
         space, _, episode = _recorded(seconds, latency_ticks)
-        return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s)
+        return Problem(
+            load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s,
+            policy=RecordedCommands.of(episode.target, 20),
+        )  # fmt: skip
 
     return make
 

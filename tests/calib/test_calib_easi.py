@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.easi import Box, Easi, EasiSettings, EliteGaussian, elite_weights, published
+from deal_hw.calib.baselines.easi import Easi, EasiSettings, EliteGaussian, elite_weights, logarithmic
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FITNESSES
-from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
@@ -49,7 +48,7 @@ class TestEasiOfTrajectories(MethodSuite):
     def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
-            method=Easi(EasiSettings(fitness="trajectory")),
+            method=Easi(EasiSettings(fitness="trajectory", linear=False)),
             make_problem=small_problem,
             truth=recorded()[1],
             budget=Budget(population=30, generations=12),
@@ -101,7 +100,9 @@ def test_with_its_critic_it_gets_nearer_than_the_centre(
 ) -> None:
     """Mean |ln| is 0.92 for the centre and, over seeds and budgets, 0.05 to 0.65 for the critic's search."""
     theta = recorded()[1]
-    result = Easi().run(small_problem(), Budget(population=24, generations=20), np.random.default_rng(1))
+    result = logarithmic().run(
+        small_problem(), Budget(population=24, generations=20), np.random.default_rng(1)
+    )
     error, null = (np.mean(np.abs(np.log(x / theta))) for x in (result.estimate, result.space.center))
     assert error < 0.75 * null
     assert np.isfinite([row["wasserstein"] for row in result.trace]).all()
@@ -109,17 +110,19 @@ def test_with_its_critic_it_gets_nearer_than_the_centre(
 
 def test_published_box_is_linear(small_problem: Callable[..., Problem]) -> None:
     """The middle of a range is its arithmetic mean there, and its geometric mean in our own scale."""
-    coordinates, middle = Coordinates(small_problem()), np.full((1, 2), 0.5)
-    space = coordinates.space
-    linear = Box(coordinates, published().settings.scale).members(middle).theta[0]
+    problem, middle = small_problem(), np.full((1, 2), 0.5)
+    space = problem.space
+    linear, ours = (
+        method.coordinates(problem).members(middle).theta[0] for method in (Easi(), logarithmic())
+    )
     np.testing.assert_allclose(linear, 0.5 * (space.low + space.high))
-    np.testing.assert_allclose(Box(coordinates, "own").members(middle).theta[0], space.center)
+    np.testing.assert_allclose(ours, space.center)
 
 
 def test_published_box_is_searched(small_problem: Callable[..., Problem]) -> None:
     """The linear box keeps to the range too, and its result is another one."""
-    budget, ours = Budget(population=10, generations=2), Easi(EasiSettings(fitness="trajectory"))
-    theirs = Easi(EasiSettings(fitness="trajectory", scale="linear"))
+    budget, theirs = Budget(population=10, generations=2), Easi(EasiSettings(fitness="trajectory"))
+    ours = Easi(EasiSettings(fitness="trajectory", linear=False))
     found = [m.run(small_problem(), budget, np.random.default_rng(0)) for m in (ours, theirs)]
     assert np.all(found[1].estimate <= found[1].space.high)
     assert np.all(found[0].estimate != found[1].estimate)

@@ -23,6 +23,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
+from deal_hw.testing.recorded_commands import RecordedCommands
 from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")
@@ -35,7 +36,10 @@ def problem() -> Problem:
     space = k9_space().with_free(FREE)
     trajectory = simulated_episode(DESCRIPTION, space, 2 * space.nominal, seconds=1.5, latency_ticks=0)
     episode = align(trajectory, DESCRIPTION)
-    return Problem(load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=0.0)
+    return Problem(
+        load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=0.0,
+        policy=RecordedCommands.of(episode.target, 20),
+    )  # fmt: skip
 
 
 def members(problem: Problem) -> Members:

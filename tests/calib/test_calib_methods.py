@@ -11,16 +11,24 @@ import pytest
 from deal_hw.bench.loop import demonstrate
 from deal_hw.bench.tasks import Case as Demonstration
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.deal_paper.algorithm1 import DealPaper, PaperSettings, _Box
 from deal_hw.calib.fit.refinement import refine
-from deal_hw.calib.methods import METHODS, NO_DATA_METHODS, check_method, make_method
+from deal_hw.calib.methods import (
+    CLOSED_LOOP_METHODS,
+    METHODS,
+    NO_DATA_METHODS,
+    check_method,
+    make_method,
+)
 from deal_hw.calib.pipeline import Calibration
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
-from deal_hw.errors import UnknownNameError
+from deal_hw.errors import InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
+from deal_hw.testing.recorded_commands import RecordedCommands
 
 FREE = ("cart.frictionloss", "servo.damping")
 SECONDS = 1.2
@@ -58,7 +66,10 @@ def small_problem() -> Problem:
         effort_limit=fit.effort_limit[:steps],
         speed_limit=fit.speed_limit[:steps],
     )
-    return Problem(d.robot, two_parameters()[0], [short], threads=1, fixed_latency_s=0.0)
+    return Problem(
+        d.robot, two_parameters()[0], [short], threads=1, fixed_latency_s=0.0,
+        policy=RecordedCommands.of(short.target, 20),
+    )  # fmt: skip
 
 
 def case_of(name: str, budget: Budget, tolerance: float | None) -> MethodCase:
@@ -114,6 +125,40 @@ class TestDealPaperFlat(MethodSuite):
         return case_of("deal-paper-flat", Budget(population=10, generations=3), None)
 
 
+class TestDealPaperReplayed(MethodSuite):
+    """`deal-paper-replay`: the same without the policy."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        case = case_of("deal-paper-replay", Budget(population=60, generations=15), 0.4)
+        make = functools.partial(dataclasses.replace, small_problem(), policy=None)
+        return dataclasses.replace(case, make_problem=make)
+
+
+class TestDealPaperLiteral(MethodSuite):
+    """`deal-paper-literal` keeps the contract; it does not find anything."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        # Its critic is trained against all rollouts so far.
+        case = case_of("deal-paper-literal", Budget(population=10, generations=2), None)
+        return dataclasses.replace(case, grows=True)
+
+
+class TestDealPaperWithoutNoiseAdaptation(MethodSuite):
+    """`deal-paper-fn` keeps the contract."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> MethodCase:
+        """Return the method under test."""
+        return case_of("deal-paper-fn", Budget(population=10, generations=2), None)
+
+
 class TestDealPaperWithoutNormalisation(MethodSuite):
     """`deal-paper-pn` keeps the contract in raw units."""
 
@@ -144,6 +189,28 @@ class TestMidpoint(MethodSuite):
         return case_of("midpoint", Budget(population=10, generations=1), None)
 
 
+@pytest.mark.parametrize("name", sorted(CLOSED_LOOP_METHODS))
+def test_methods_that_need_the_policy_say_so(name: str) -> None:
+    """Without it they are refused before anything is simulated, and the message names others."""
+    problem = dataclasses.replace(small_problem(), policy=None)
+    with pytest.raises(InsufficientDataError, match="eki, deal, deal-paper-replay"):
+        make_method(name).run(problem, Budget(population=4, generations=1), np.random.default_rng(0))
+    assert problem.steps == 0
+
+
+def test_raw_units_differ_from_the_normalised_in_one_thing() -> None:
+    """Both boxes are centred on the same simulators; only their widths differ."""
+    problem = small_problem()
+    for settings in (PaperSettings(), PaperSettings(normalise=False)):
+        coordinates = DealPaper(settings).coordinates(problem)
+        box = _Box(coordinates, settings)
+        space = problem.space
+        np.testing.assert_allclose(box.from_unit(np.full((1, 2), 0.5)), np.zeros((1, 2)), atol=1e-12)
+        np.testing.assert_allclose(box.members(np.zeros((1, 2))).theta[0], (space.low + space.high) / 2)
+    ends = _Box(coordinates, settings).from_unit(np.array([[0.0, 0.0], [1.0, 1.0]]))
+    np.testing.assert_allclose(ends[1] - ends[0], space.high - space.low)
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_every_name_in_the_table_makes_a_method(name: str) -> None:
     """Each row imports, and names its result after itself; the default is one of the others."""
@@ -171,6 +238,8 @@ def test_nominal_and_centre_are_what_they_say() -> None:
     centre = make_method("midpoint").run(problem, Budget(), rng)
     np.testing.assert_array_equal(nominal.estimate, problem.space.nominal)
     np.testing.assert_array_equal(centre.estimate, problem.space.center)
+    linear = make_method("midpoint-linear").run(problem, Budget(), rng).estimate
+    np.testing.assert_allclose(linear, (problem.space.low + problem.space.high) / 2)
     assert nominal.steps == centre.steps == 0
 
 
@@ -185,7 +254,8 @@ def test_constant_fitness_does_not_find_the_truth() -> None:
         result = make_method("deal-paper-flat").run(
             problem, Budget(population=30, generations=15), np.random.default_rng(seed)
         )
-        units.append(problem.space.normalize(result.estimate))
+        space = problem.space
+        units.append((result.estimate - space.low) / (space.high - space.low))
     values = np.array(units)
     error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
     assert problem.steps == 0

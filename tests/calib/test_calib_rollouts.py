@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.bench.tasks import Case
+from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.innovations import Members, explained, linearise, predict
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.rollouts import (
@@ -20,6 +20,7 @@ from deal_hw.calib.deal_paper.rollouts import (
 from deal_hw.calib.search.base import Coordinates
 from deal_hw.calib.search.eki import logistic, logit
 from deal_hw.errors import InsufficientDataError
+from deal_hw.testing.recorded_commands import RecordedCommands
 from deal_hw.types import FloatArray
 
 
@@ -37,11 +38,13 @@ def members(ideal: Case, latency_s: FloatArray) -> Members:
 def test_replay_of_the_truth_follows_the_recording(ideal: Case, problem: Problem) -> None:
     """With the true parameters the first second of the unstable pole is reproduced to 0.1 mm and 0.1 mrad."""
     ticks = control_ticks(problem, 0)
-    position, velocity, action = rollout_population(problem, members(ideal, np.zeros(2)), 0, ticks)
+    position, velocity, action = rollout_population(
+        problem, members(ideal, np.zeros(2)), 0, ticks, replay=True
+    )
     recorded = problem.starts[0].position[ticks.sample]
     assert position.shape == (2, len(ticks) + 1, 2)
     assert velocity.shape == position.shape
-    np.testing.assert_array_equal(action[0], ideal.fit.target[ticks.start[:-1] + 10])
+    np.testing.assert_array_equal(action[0], ideal.fit.target[ticks.start[:-1] + ticks.lead + 10])
     assert np.abs(position[0, :50] - recorded[:50]).max() < 1e-4
     assert np.abs(position[1, :50] - recorded[:50]).max() > 1e-2
 
@@ -49,22 +52,38 @@ def test_replay_of_the_truth_follows_the_recording(ideal: Case, problem: Problem
 def test_policy_in_the_loop_equals_the_replay(ideal: Case, problem: Problem) -> None:
     """A policy that answers with the recorded targets makes the rollouts of the replay, at any latency."""
     target = np.random.default_rng(0).uniform(-0.1, 0.1, (60, 1))
-    # Commands of the recording arrive within a tick; those of a policy in the loop at its start.
     steps = ideal.fit.target.copy()
     ticks = control_ticks(problem, 0, 60)
-    steps[: ticks.start[0]] = ideal.fit.start_setpoint
-    steps[ticks.start[0] : ticks.start[-1]] = np.repeat(target, 20, axis=0)
+    # Until the first tick the set-point rested; a latency looks back to before it.
+    steps[: ticks.start[0] + ticks.lead] = ideal.fit.start_setpoint
+    steps[ticks.start[0] + ticks.lead : ticks.start[-1] + ticks.lead] = np.repeat(target, 20, axis=0)
     held = dataclasses.replace(ideal.fit, target=steps)
-    problem = Problem(ideal.robot, ideal.space, [held], threads=1)
+    policy = RecordedCommands(np.concatenate([np.zeros((ticks.number, 1)), target]))
+    problem = Problem(ideal.robot, ideal.space, [held], threads=1, policy=policy)
     population = members(ideal, np.array([0.0, 0.0125]))
-
-    def answer(position: FloatArray, velocity: FloatArray, tick: int) -> FloatArray:
-        return np.repeat(target[tick][None], len(position), axis=0)
-
-    replayed = rollout_population(problem, population, 0, ticks)
-    closed = rollout_population(problem, population, 0, ticks, answer)
+    replayed = rollout_population(problem, population, 0, ticks, replay=True)
+    closed = rollout_population(problem, population, 0, ticks)
     np.testing.assert_allclose(closed[0], replayed[0], atol=1e-9)
     np.testing.assert_allclose(closed[2], replayed[2])
+
+
+def test_the_truth_in_closed_loop_repeats_the_emulated_robot() -> None:
+    """Through driver, bytes and recorder: 20 ticks of the true robot to 10 um and 10 urad, from its past on.
+
+    Later ticks are not compared: this policy chatters, and a difference of 1e-7 grows by half a decade a
+    tenth of a second.
+    """
+    case = make_case("cartpole", "ideal", 1, 5.0, by_policy=True)
+    problem = Problem(case.robot, case.space, [case.fit], threads=1, fixed_latency_s=0.0, policy=case.policy)
+    assert case.policy is not None and case.policy.history == 14
+    ticks = control_ticks(problem, 0, 20, case.policy.history)
+    # The state before a command is one device period older; the first command's is not in the recording.
+    assert (ticks.lead, ticks.number, len(ticks.past)) == (1, 15, 14)
+    position, _, action = rollout_population(problem, members(case, np.zeros(2)), 0, ticks)
+    recorded = case.fit.position[ticks.sample]
+    assert np.abs(position[0] - recorded).max() < 1e-5
+    assert np.abs(action[0] - case.fit.target[ticks.action]).max() < 1e-4
+    assert np.abs(position[1] - recorded).max() > 1e-3
 
 
 def test_gains_change_where_the_recording_changed_them(ideal: Case, problem: Problem) -> None:
@@ -74,10 +93,13 @@ def test_gains_change_where_the_recording_changed_them(ideal: Case, problem: Pro
     weak = dataclasses.replace(ideal.fit, effort_limit=effort)
     other = Problem(ideal.robot, ideal.space, [weak], threads=1)
     ticks = control_ticks(other, 0, 80)
-    assert ticks.changes[:2] == (0, 50)
-    one = rollout_population(problem, members(ideal, np.zeros(2)), 0, control_ticks(problem, 0, 80))[0]
-    two = rollout_population(other, members(ideal, np.zeros(2)), 0, ticks)[0]
-    np.testing.assert_array_equal(one[:, :51], two[:, :51])
+    # Commands number 1 and later: that of period 1000 is number 50, the 49th tick's.
+    assert ticks.changes[:2] == (0, 49)
+    one, two = (
+        rollout_population(p, members(ideal, np.zeros(2)), 0, control_ticks(p, 0, 80), replay=True)[0]
+        for p in (problem, other)
+    )
+    np.testing.assert_array_equal(one[:, :50], two[:, :50])
     assert np.abs(one[:, 80] - two[:, 80]).max() > 1e-3
 
 
@@ -86,18 +108,21 @@ def test_ticks_stop_at_a_gap(ideal: Case) -> None:
     usable = ideal.fit.usable.copy()
     usable[41] = False
     broken = Problem(ideal.robot, ideal.space, [dataclasses.replace(ideal.fit, usable=usable)], threads=1)
-    assert len(control_ticks(broken, 0)) == 10
+    assert len(control_ticks(broken, 0)) == 9
     usable[3:] = False
     useless = Problem(ideal.robot, ideal.space, [dataclasses.replace(ideal.fit, usable=usable)], threads=1)
     with pytest.raises(InsufficientDataError, match="control periods"):
         control_ticks(useless, 0)
 
 
-def test_transitions_hold_state_action_and_change(problem: Problem) -> None:
-    """(s, a, s' - s) in this order, standardised to mean 0 and variance 1 over the recording."""
+def test_transitions_hold_state_action_and_next_state(problem: Problem) -> None:
+    """(s, a, s') or (s, a, s' - s), standardised to mean 0 and variance 1 over the recording."""
     position = np.array([[[1.0, 2.0], [1.5, 1.0], [1.5, 3.0]]])
     velocity = 10 * position
-    made = transitions(position, velocity, np.array([[[7.0], [8.0]]]))
+    action = np.array([[[7.0], [8.0]]])
+    plain = transitions(position, velocity, action)
+    np.testing.assert_allclose(plain[0, 1], [1.5, 1, 15, 10, 8, 1.5, 3, 15, 30])
+    made = transitions(position, velocity, action, difference=True)
     np.testing.assert_allclose(made[0, 0], [1, 2, 10, 20, 7, 0.5, -1, 5, -10])
     np.testing.assert_allclose(made[0, 1], [1.5, 1, 15, 10, 8, 0, 2, 0, 20])
     raw = demonstration(problem, 0, control_ticks(problem, 0))

@@ -98,11 +98,11 @@ def test_a_target_is_driven_without_divergence_and_moves(robot: str, seed: int) 
 def test_the_truth_in_closed_loop_repeats_the_target(robot: str) -> None:
     """In the calibrator's closed loop the true member does what the target did, and others do otherwise."""
     model, space, theta, made = recorded(robot, 2, 0.6)
-    problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0)
     population = PopulationDemonstration(demonstration_policy(robot), model.description, WALK)
-    ticks = control_ticks(problem, 0)
+    problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0, policy=population)
+    ticks = control_ticks(problem, 0, history=population.history)
     members = Members(np.stack([theta, space.center]), np.zeros(2))
-    position, _, action = rollout_population(problem, members, 0, ticks, population)
+    position, _, action = rollout_population(problem, members, 0, ticks)
     wanted = made.episode.target[ticks.action]
     joints = made.position[ticks.sample][:, model.joints]
     short = 10
@@ -115,9 +115,9 @@ def test_the_truth_in_closed_loop_repeats_the_target(robot: str) -> None:
 def test_the_paper_takes_pi_0_in_the_loop(robot: str) -> None:
     """`deal-paper` with the policy instead of its recorded actions runs to the end, inside the ranges."""
     model, space, _, made = recorded(robot, 3, 1.0)
-    problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0)
     population = PopulationDemonstration(demonstration_policy(robot), model.description, WALK)
-    method = DealPaper(PaperSettings(ticks=20), population)
+    problem = Problem(model, space, [made.episode], threads=1, fixed_latency_s=0.0, policy=population)
+    method = DealPaper(PaperSettings(ticks=20))
     budget = Budget(population=4, generations=2, refine=False)
     found = method.run(problem, budget, np.random.default_rng(0))
     assert (found.estimate >= space.low).all() and (found.estimate <= space.high).all()
@@ -142,21 +142,29 @@ def resting(count: int) -> tuple[FloatArray, FloatArray]:
     return position, np.zeros_like(position)
 
 
-def test_tick_zero_forgets_and_members_that_diverged_rest() -> None:
+def start(population: PopulationDemonstration, count: int) -> None:
+    """Begin anew with robots that have no past."""
+    population.restart(count, *np.empty((2, 0, 18)), np.empty((0, 12)), 0)
+
+
+def test_a_restart_forgets_and_members_that_diverged_rest() -> None:
     """The second rollout equals the first; a member that is NaN is sent the default pose again."""
     population = PopulationDemonstration(Leap(walk_spec(GO2)), GO2, WALK)
     position, velocity = resting(3)
-    first = [population(position, velocity, tick) for tick in range(3)]
-    again = [population(position, velocity, tick) for tick in range(3)]
+    runs = []
+    for _ in range(2):
+        start(population, 3)
+        runs.append([population(position, velocity) for _ in range(3)])
+    first, again = runs
     np.testing.assert_array_equal(first, again)
     calf = GO2.actuated.index("FL_calf_joint")
     # -1.8 + 0.5 after one tick; 0.6, the whole scale, after two.
     np.testing.assert_allclose([a[0, calf] for a in first], [-1.3, -1.2, -1.2])
     position[1] = np.nan
-    sent = [population(position, velocity, tick) for tick in range(2)]
+    start(population, 3)
+    sent = [population(position, velocity) for _ in range(2)]
     np.testing.assert_array_equal(sent[1][1], GO2.default_position)
     np.testing.assert_array_equal(sent[1][0], first[1][0])
-    assert population(position[:2], velocity[:2], 5).shape == (2, 12)
 
 
 def test_the_wish_is_observed() -> None:
@@ -190,5 +198,6 @@ def test_a_checkpoint_tells_policies_and_wishes_apart(tmp_path: Path) -> None:
     ]
     assert len({digest(ant), digest(made[0]), digest(made[1])}) == 3
     again = PopulationDemonstration(demonstration_policy("go2"), GO2, WALK)
-    again(*resting(2), 0)
+    start(again, 2)
+    again(*resting(2))
     assert digest(again) == digest(made[0])

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from deal_hw.data.files import write_json
+from deal_hw.data.files import write_bytes, write_json
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.reader import Episode, check_description, read_episode
 from deal_hw.data.recording.repair import repair
@@ -24,6 +24,7 @@ from deal_hw.schema import STRICT
 
 SCHEMA_VERSION = 1
 INDEX_NAME = "dataset.json"
+POLICY_FOLDER = "policies"
 _WHAT = "the index of a dataset"
 _INDEX_BYTES = 64 * MIB
 """That of 10,000 episodes has some 30 MB [B]."""
@@ -186,6 +187,34 @@ class Dataset:
     def read(self, index: int) -> Episode:
         """Read an episode; errors as :func:`~deal_hw.data.recording.reader.read_episode` and :meth:`path`."""
         return read_episode(self.path(index))
+
+    def policy_path(self, digest: str) -> Path:
+        """Return where a policy is kept; ``digest`` is its file's SHA-256 or the first 16 digits of that."""
+        return self.folder / POLICY_FOLDER / f"{digest[:16]}.onnx"
+
+    def keep_policy(self, file: Path, digest: str) -> Path:
+        """Keep a copy of the policy that moves the robot; one that is kept already is left as it is.
+
+        Args:
+            file: The policy's file.
+            digest: SHA-256 of its bytes.
+
+        Raises:
+            DatasetError: It cannot be copied, or the file is another one now.
+        """
+        self._require_lock()
+        path = self.policy_path(digest)
+        if path.is_file():
+            return path
+        try:
+            content = file.read_bytes()
+            if hashlib.sha256(content).hexdigest() != digest:
+                raise DatasetError(f"{file} was changed after it was checked; start again")
+            path.parent.mkdir(exist_ok=True)
+            write_bytes(path, content)
+        except OSError as error:
+            raise DatasetError(f"{path} cannot be written: {error.strerror}") from error
+        return path
 
     def next_episode_path(self) -> Path:
         """Return the path of the next episode for a recorder to create; then call :meth:`note_episode`."""

@@ -66,7 +66,8 @@ class ClosedLoop:
         """Send targets and advance by one control period.
 
         Args:
-            target: Position targets [m or rad] or motor commands, (N, A).
+            target: Position targets [m or rad] or motor commands, (N, A), or those in force at each step,
+                (N, S, A).
             rate: Largest change of a set-point in a device period, (N, A) or at each of its steps (N, S, A);
                 None for motors, whose commands are not slewed.
             every: Record after each ``every``-th device period; 0 records the end alone.
@@ -74,7 +75,7 @@ class ClosedLoop:
         Returns:
             Positions and velocities there, (N, S // every, C) each; NaN where a member diverged.
         """
-        ahead = np.repeat(target[:, None], self.steps, axis=1)
+        ahead = target if target.ndim == 3 else np.repeat(target[:, None], self.steps, axis=1)
         if rate is not None:
             ahead = slew(self._path[:, -1], ahead, rate)
         path = np.concatenate([self._path, ahead], axis=1)

@@ -152,5 +152,12 @@ def walk_space() -> ParameterSpace:
     return ParameterSpace([*parameter_space().parameters, *more])
 
 
-SPACES: Final = {"default": parameter_space, "walk": walk_space, "paper": paper_space}
+def swapped_paper_space() -> ParameterSpace:
+    """Return the same with the two columns of Table 9 swapped: stiffness 20, damping 0.5."""
+    return parameter_space(PAPER_DAMPING_NMS_RAD, PAPER_STIFFNESS_NM_RAD)
+
+
+SPACES: Final = {
+    "default": parameter_space, "walk": walk_space, "paper": paper_space, "paper-swapped": swapped_paper_space,
+}  # fmt: skip
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

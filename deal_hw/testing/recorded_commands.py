@@ -1,0 +1,39 @@
+"""A policy whose answers are known beforehand, for methods that run a recording's policy in simulators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from deal_hw.types import FloatArray
+
+
+@dataclass(eq=False)
+class RecordedCommands:
+    """Answers with given commands, whatever it sees.
+
+    Attributes:
+        commands: The command of each control period, (T, A).
+        history: Control periods that it says it looks back.
+    """
+
+    commands: FloatArray
+    history: int = 0
+
+    @classmethod
+    def of(cls, target: FloatArray, period: int) -> Self:
+        """Take those of a recording: targets of device periods, (S, A), so many in a control period."""
+        return cls(target[period // 2 :: period])
+
+    def restart(
+        self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
+    ) -> None:
+        """Begin with the command after ``number`` others, for N simulators."""
+        self._count, self._next = count, number
+
+    def __call__(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the next command, (N, A)."""
+        self._next += 1
+        return np.repeat(self.commands[self._next - 1][None], self._count, axis=0)

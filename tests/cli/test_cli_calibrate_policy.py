@@ -1,0 +1,123 @@
+"""Methods that run the recordings' policy in every simulator: where it comes from, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deal_hw.cli.calibrate import Calibrate, calibrate
+from deal_hw.cli.calibrate_model import Recordings
+from deal_hw.cli.run_plan import RunPlan, check_plan, make_behaviour, shipped_policy
+from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.data.recording.dataset import Dataset
+from deal_hw.drivers.cartpole.description import DESCRIPTION
+from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, InsufficientDataError
+
+POLICY = shipped_policy("cartpole") or Path()
+
+
+def record(folder: Path, *changes: Mapping[str, Any]) -> Path:
+    """Record seconds of balancing for each set of changes to the metadata, as `collect` does."""
+    plan = check_plan(
+        RunPlan(robot="cartpole", profile="balance", seconds=2.4, policy=str(POLICY)), DESCRIPTION
+    )
+    with Dataset.create_or_open(folder, DESCRIPTION) as store:
+        for change in changes:
+            path = store.next_episode_path()
+            metadata = {
+                "profile": plan.profile, "purpose": "collect", "robot": "cartpole",
+                "policy_digest": plan.policy_digest[:16], "velocity": plan.velocity, "stand": plan.stand,
+            }  # fmt: skip
+            robot = VirtualCartpole(nominal_truth("ideal", 4))
+            robot.run(make_behaviour(plan, DESCRIPTION), plan.seconds, path, {**metadata, **change})
+            store.note_episode(path)
+        if changes and "policy_digest" not in changes[0]:
+            store.keep_policy(POLICY, plan.policy_digest)
+    return folder
+
+
+def settings(folder: Path, **changes: Any) -> Calibrate:
+    """A calibration by the paper's method that is over in two generations."""
+    values: dict[str, Any] = {
+        "dataset": folder, "method": "deal-paper", "refine": False, "population": 6, "generations": 2,
+        "advise": False, "report": False, "quiet": True, "free": ("cart.mass", "servo.stiffness"),
+    }  # fmt: skip
+    return Calibrate(**{**values, **changes})
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One episode that its policy moved all the time, with the policy."""
+    return record(tmp_path_factory.mktemp("run") / "dataset", {})
+
+
+def test_the_datasets_own_policy_is_run(dataset: Path, tmp_path: Path) -> None:
+    """Two generations end inside the ranges; a policy that is named is the same run."""
+    found = [
+        calibrate(settings(dataset, out=tmp_path / name, policy=policy)).result
+        for name, policy in (("kept", None), ("named", POLICY))
+    ]
+    space = found[0].space
+    assert np.all((space.low <= found[0].estimate) & (found[0].estimate <= space.high))
+    assert found[0].latency_s == 0.0
+    np.testing.assert_array_equal(found[0].estimate, found[1].estimate)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ([{"profile": "rich"}], "episode 0 was recorded with profile 'rich'.*deal-paper-replay"),
+        ([{"stand": True}], "episode 0 stands up and lies down"),
+        ([{}, {"policy_digest": "0123456789abcdef"}], "recorded with 2 policies"),
+        ([{"velocity": "keyboard"}], "one fixed velocity"),
+        ([{"policy_digest": "0123456789abcdef"}], "keeps no copy.*0123456789abcdef.*--policy FILE"),
+    ],
+)
+def test_recordings_that_one_policy_did_not_make_are_refused(
+    tmp_path: Path, changes: list[dict[str, Any]], words: str
+) -> None:
+    """Each is said before anything is simulated, with what to do."""
+    folder = record(tmp_path / "dataset", *changes)
+    with pytest.raises((InsufficientDataError, ConfigurationError), match=words):
+        calibrate(settings(folder))
+
+
+def test_another_policy_than_the_recordings_is_refused(dataset: Path) -> None:
+    """Its digest is not that of the metadata."""
+    other = shipped_policy("go2")
+    with pytest.raises(ConfigurationError, match="is not the policy that moved the robot"):
+        calibrate(settings(dataset, policy=other))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"method": "eki", "policy": POLICY}, "--method eki runs no policy"),
+        (
+            {"dataset": None, "recordings": Recordings(model=Path("robot.xml"), data=(Path("a.csv"),))},
+            "which recordings of --model do not name",
+        ),
+    ],
+)
+def test_a_policy_that_would_do_nothing_is_refused(
+    dataset: Path, changes: dict[str, Any], words: str
+) -> None:
+    """Methods without rollouts take none, and recordings of a model have none."""
+    with pytest.raises(DealHwError, match=words):
+        calibrate(settings(dataset, **changes))
+
+
+def test_a_policy_is_kept_once_and_as_it_was_checked(tmp_path: Path) -> None:
+    """The copy has the checked file's bytes; a file that was changed since is not kept."""
+    digest = check_plan(RunPlan(robot="cartpole", policy=str(POLICY)), DESCRIPTION).policy_digest
+    with Dataset.create_or_open(tmp_path / "dataset", DESCRIPTION) as store:
+        kept = store.keep_policy(POLICY, digest)
+        assert kept.read_bytes() == POLICY.read_bytes()
+        assert store.keep_policy(tmp_path / "gone.onnx", digest) == kept
+        with pytest.raises(DatasetError, match="was changed after it was checked"):
+            store.keep_policy(POLICY, "0" * 64)
