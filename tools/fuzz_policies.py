@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import driver_description
@@ -36,6 +35,7 @@ from deal_hw.policies.trial import TrialSettings, check_policy
 from deal_hw.policies.trial_states import ProbeStates
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray
+from deal_hw.workflows.shipped import shipped_policy
 
 ROBOTS = ("cartpole", "go2")
 MEMORY_BYTES = 2**30

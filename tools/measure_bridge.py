@@ -36,12 +36,12 @@ from stall_monitor import watch_stalls
 
 from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.cli.emulator_process import VerbProcess
-from deal_hw.cli.options import Checked, Range
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import FIFO_PRIORITY
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.errors import DealHwError, TransportError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.options import Checked, Range
 
 SIDES: Final = Path(__file__).with_name("bridge_sides.py")
 HOSTS: Final = "10.97.43.1", "10.97.43.2"

@@ -22,11 +22,11 @@ import numpy as np
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.calibration import Budget, Progress
 from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
-from deal_hw.cli.calibrate_model import Recordings
-from deal_hw.cli.calibrate_run import CalibrationInputs
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.run import CalibrationInputs
 
 KEY = ("task", "seed")
 
@@ -289,7 +289,7 @@ def _compared(
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 
     # Imports are not counted.
-    method = usual_method(config, work.robot)
+    method = usual_method(config, work)
     make_method(method, refine=True)
     require_sysid()
     load, shown, since = os.getloadavg()[0], list[_Shown](), _Stopwatch.start()
@@ -301,7 +301,7 @@ def _compared(
 
     result = calibrate_episodes(
         work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget,
-        rng=np.random.default_rng(seed), threads=threads, watch=watch,
+        rng=np.random.default_rng(seed), threads=threads, progress=watch,
     )  # fmt: skip
     shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s))
 

@@ -18,8 +18,6 @@ from deal_hw.bench.rows import Cells, Row
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.cli.calibrate_run import calibrate_episodes
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -27,6 +25,8 @@ from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.shipped import shipped_policy
 
 TASK_EPISODES = 5
 SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")

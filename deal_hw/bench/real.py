@@ -19,10 +19,15 @@ import numpy as np
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget
-from deal_hw.cli.calibrate_model import HELDOUT_PART, Recordings, prepare_model
-from deal_hw.cli.calibrate_run import CalibrationInputs, SpaceOverrides, calibrate_episodes, residual_std
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.model import HELDOUT_PART, Recordings, prepare_model
+from deal_hw.workflows.calibration.run import (
+    CalibrationInputs,
+    SpaceOverrides,
+    calibrate_episodes,
+    residual_std,
+)
 
 KEY = ("task", "split", "method", "refined", "xi", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deal_hw.calib.data.problem import PopulationPolicy
-from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.cli.virtual import VirtualCartpole, demonstrate
 from deal_hw.control.vigor import ATTEMPTS
 from deal_hw.description import RobotDescription
@@ -25,6 +25,7 @@ from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import Episode, align, fill_gaps
 from deal_hw.sim.recordings.target import Behaviour, Sensing, TargetRecording, record_target
 from deal_hw.types import FloatArray
+from deal_hw.workflows.shipped import shipped_policy
 
 DEMONSTRATION_S = 4.0
 TRUTH_PART = (0.1, 0.9)

@@ -17,7 +17,6 @@ from deal_hw.bench.rows import Cells, Row
 from deal_hw.calib.validation.verdict import SETTINGS, trust
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
-from deal_hw.cli.calibrate_model import Recordings
 from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import (
     CAUSES,
@@ -29,6 +28,7 @@ from deal_hw.testing.plain_robots import (
     make_robot,
     write,
 )
+from deal_hw.workflows.calibration.model import Recordings
 
 KEY = ("task", "fault", "seed")
 RIGHT = ""
@@ -88,7 +88,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
         )
         try:
             work = prepare(config)
-            method = usual_method(config, work.robot)
+            method = usual_method(config, work)
             result = calibrate_episodes(
                 work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget,
                 rng=np.random.default_rng(seed), threads=threads,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from deal_hw.calibration import Budget
-from deal_hw.cli.calibrate_model import Recordings
-from deal_hw.cli.options import Range, Ratio, Threads, check_ranges, given, refuse
 from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.options import Range, Ratio, Threads, check_ranges, given, refuse
 
 if TYPE_CHECKING:
     from deal_hw.bench.rows import Cells, Row

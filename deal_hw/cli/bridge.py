@@ -13,7 +13,6 @@ import tyro
 
 from deal_hw.cli.emulate_common import run_until, signalled
 from deal_hw.cli.emulate_go2 import free_port
-from deal_hw.cli.options import Checked, Range, refuse
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.claim import LocalClaim
 from deal_hw.control.realtime import become_realtime
@@ -26,6 +25,7 @@ from deal_hw.drivers.transports.zenoh_session import parse_endpoints
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.options import Checked, Range, refuse
 
 ROBOTS = ("go2",)
 LOOPBACK_PORT = 7447

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,11 +11,29 @@ import numpy as np
 import tyro
 
 from deal_hw.calib.methods import CLOSED_LOOP_METHODS, check_method, usual_population
-from deal_hw.calibration import LATENCY_RANGE_S, Budget
-from deal_hw.cli.calibrate_live import CHECKPOINT, SO_FAR, check_resume, saying_how_to_resume, watching
-from deal_hw.cli.calibrate_model import Recordings, prepare_model, write_parameters
-from deal_hw.cli.calibrate_policy import recorded_policy
-from deal_hw.cli.calibrate_run import (
+from deal_hw.calibration import LATENCY_RANGE_S, Budget, Progress
+from deal_hw.cli.calibrate_output import print_result, show_progress
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.workflows.calibration.best_so_far import (
+    CHECKPOINT,
+    SO_FAR,
+    Say,
+    check_resume,
+    saying_how_to_resume,
+    silent,
+    watching,
+)
+from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
+from deal_hw.workflows.calibration.model import (
+    DEFAULT,
+    Recordings,
+    method_for,
+    prepare_model,
+    write_parameters,
+)
+from deal_hw.workflows.calibration.run import (
     HELDOUT_WINDOW_S,
     CalibrateReport,
     CalibrationInputs,
@@ -26,37 +42,15 @@ from deal_hw.cli.calibrate_run import (
     finish,
     residual_std,
 )
-from deal_hw.cli.options import Checked, Range, Ratio, Seed, Threads, given, refuse
-from deal_hw.cli.run_plan import balancer
-from deal_hw.control.velocity_error import wanted_velocity
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
-from deal_hw.drivers import parameter_spaces, recorded_description
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
-from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
-from deal_hw.types import Trajectory
+from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S, WALK_TELLS
+from deal_hw.workflows.options import Checked, Range, Ratio, Seed, Threads, given, refuse
 
 if TYPE_CHECKING:
-    from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.sim.engine.model import RobotModel
-    from deal_hw.sim.recordings.episode import Episode
+    pass
 
 __all__ = [
     "Calibrate", "CalibrateReport", "calibrate", "calibrate_episodes", "calibrate_or_write_parameters",
-    "make_space",
 ]  # fmt: skip
-
-HELDOUT_PROFILE = "chirp"
-DEFAULT = "default"
-GAIT_SMOOTHING_S = 0.04
-"""Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
-WALK_TELLS = (
-    "a walk tells the gains of the joints and the floor's friction; it hardly tells their dry friction, not "
-    "their armature, and masses only where the motors' efforts weigh the robot (docs/calibration.md)"
-)
-WEIGHING_S = 0.35
-"""A robot that is about to walk has stood still for so long [s]."""
-SAMPLES_A_PERIOD = 4
-"""States of a control period that are fitted to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,13 +213,20 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     budget = Budget(population=population, generations=config.generations, refine=config.refine)
     work = prepare(config)
     known_std = residual_std(config.residual_std, work.robot)
-    method = usual_method(config, work.robot, walks=work.walks)
+    method = usual_method(config, work)
     with (
         saying_how_to_resume(checkpoint),
         watching(
             config.watch, config.watch_save, work.space, work.robot.description, work.shown, config.latency
         ) as watch,
+        show_progress(f"calibrate ({method})", config.quiet) as bar,
     ):
+
+        def progress(found: Progress) -> None:
+            bar(found)
+            if watch is not None:
+                watch(found)
+
         result = calibrate_episodes(
             work.robot,
             work.space,
@@ -237,15 +238,15 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             latency_s=config.latency,
             latency_range_s=config.latency_range,
             threads=config.threads,
-            quiet=config.quiet,
+            progress=progress,
+            say=_say(config),
             checkpoint=checkpoint,
             resume=config.resume,
-            watch=watch,
             keep=folder / SO_FAR,
             known_std=known_std,
             heldout_window_s=config.heldout_window,
-            smoothing_s=GAIT_SMOOTHING_S if work.walks else None,
             policy=work.policy,
+            smoothing_s=GAIT_SMOOTHING_S if work.walks else None,
         )
     settings: dict[str, Any] = {
         "seed": config.seed,
@@ -255,7 +256,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     }
     if config.residual_std:
         settings["residual_std"] = list(config.residual_std)
-    return finish(
+    report = finish(
         work,
         result,
         folder,
@@ -264,8 +265,11 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         page=config.report,
         advise=config.advise,
         threads=config.threads,
-        quiet=config.quiet,
     )
+    if not config.quiet:
+        print_result(report.result, work.advice, work.name)
+        print("written: " + ", ".join(str(f) for f in report.files.values()))
+    return report
 
 
 def prepare(config: Calibrate) -> CalibrationInputs:
@@ -274,27 +278,21 @@ def prepare(config: Calibrate) -> CalibrationInputs:
     Raises:
         DealHwError: A setting or a recording is unusable.
     """
-    return prepare_dataset(config) if config.recordings.model is None else _prepare_model(config)
+    return prepare_recorded(config) if config.recordings.model is None else _prepare_model(config)
 
 
-def usual_method(config: Calibrate, robot: RobotModel, *, walks: bool = False) -> str:
+def usual_method(config: Calibrate, work: CalibrationInputs) -> str:
     """Return the method, where none is named that which suits the recordings."""
-    if config.method != DEFAULT or config.residual_std or not config.refine:
+    if config.method != DEFAULT:
         return config.method
-    facts = robot.description
-    held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
-    if walks:
-        usual = "gait"
-        if not config.quiet:
-            print(WALK_TELLS, file=sys.stderr)
-    elif config.recordings.model is not None and robot.base is None and held:
-        usual = "output-error"
-    else:
-        # Predictions of seconds, which output-error compares, mean nothing for a robot that falls.
-        return config.method
-    if not config.quiet:
-        print(f"method: {usual} (--method eki to search and refine to the sensor noise)", file=sys.stderr)
-    return usual
+    told = bool(config.residual_std) or not config.refine
+    method = method_for(work, told=told, real=config.recordings.model is not None)
+    say = _say(config)
+    if work.walks and not told:
+        say(WALK_TELLS)
+    if method != DEFAULT:
+        say(f"method: {method} (--method eki to search and refine to the sensor noise)")
+    return method
 
 
 def _run_folder(config: Calibrate) -> Path:
@@ -326,180 +324,29 @@ def _prepare_model(config: Calibrate) -> CalibrationInputs:
     )
 
 
-def prepare_dataset(config: Calibrate) -> CalibrationInputs:
-    """Read a dataset of a robot of ours.
+def prepare_recorded(config: Calibrate) -> CalibrationInputs:
+    """Read the dataset that the settings name.
 
     Raises:
         DealHwError: A setting or a recording is unusable.
     """
-    from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.data.recording.spikes import without_spikes
-    from deal_hw.data.recording.telemetry_checks import Severity, check
-    from deal_hw.errors import InsufficientDataError
-
-    if config.dataset is None:
-        raise ConfigurationError("no dataset was named")
     wrong = [str(i) for i in config.holdout if not isinstance(i, int)]
-    if wrong:
+    if config.dataset is None or wrong:
         raise ConfigurationError(
             f"--holdout {' '.join(wrong)}: of a dataset name episodes by number; files go with --model"
+            if wrong
+            else "no dataset was named"
         )
-    dataset = Dataset.open(config.dataset)
-    held = [int(str(i)) for i in config.holdout]
-    fit, holdout = choose_episodes(dataset, config.episodes, held)
-    policy = None
-    if config.method in CLOSED_LOOP_METHODS:
-        description = recorded_description(dataset.description["name"])
-        policy = recorded_policy(dataset, fit, description, config.policy)
-    space = make_space(dataset.description["name"], config)
-    recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
-    spikes = SpikeSettings(ratio=config.spike_ratio)
-    verdicts = {index: check(trajectory, spikes) for index, trajectory in recordings.items()}
-    for index, found in verdicts.items():
-        failed = [v.message for v in found if v.severity is Severity.FAIL]
-        if failed:
-            raise InsufficientDataError(
-                f"episode {index} of {config.dataset} cannot be used: {'; '.join(failed)}; "
-                "record again with `deal-hw collect`"
-            )
-        jumps = [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN]
-        if jumps and not config.quiet:
-            print(f"episode {index}: {jumps[0]}", file=sys.stderr)
-    recordings = {index: without_spikes(trajectory, spikes) for index, trajectory in recordings.items()}
-    robot, episodes = _simulation(dataset, recordings, config.sample_hz)
-    walks = robot.base is not None and all(
-        wanted_velocity(recordings[i]) is not None for i in (*fit, *holdout)
+    source = DatasetRecordings(
+        folder=config.dataset,
+        episodes=config.episodes,
+        holdout=[int(str(i)) for i in config.holdout],
+        policy=config.policy,
+        sample_hz=config.sample_hz,
+        spikes=SpikeSettings(ratio=config.spike_ratio),
     )
-    if walks:
-        space = _weighed(space, robot, recordings[fit[0]], quiet=config.quiet)
-    return CalibrationInputs(
-        robot=robot,
-        space=space,
-        episodes=[episodes[i] for i in fit],
-        holdout=[episodes[i] for i in holdout],
-        shown=recordings[fit[0]],
-        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
-        provenance={
-            "dataset": str(config.dataset),
-            "description_digest": dataset.digest,
-            "episodes": list(fit),
-            "holdout": list(holdout),
-        },
-        advice="`deal-hw collect --profile chirp` records one",
-        balance=balancer(robot.description, None),
-        name="" if robot.base is not None else robot.description.name,
-        walks=walks,
-        policy=policy,
-    )
+    return prepare_dataset(source, config.space, _overrides(config, config.xi), config.method, _say(config))
 
 
-def choose_episodes(
-    dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int]
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the episodes to fit and those to judge by.
-
-    Raises:
-        ConfigurationError: Nothing is left to fit, or an episode is in both.
-    """
-    every = range(len(dataset.episodes))
-    metadata = [dataset.read(i).metadata for i in every]
-    profiles = [str(m.get("profile", "")) for m in metadata]
-    held = tuple(holdout) or tuple(i for i in every if profiles[i] == HELDOUT_PROFILE and i not in episodes)
-    repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
-    if repeated:
-        print(
-            f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)",
-            file=sys.stderr,
-        )
-    fit = tuple(episodes) or tuple(i for i in every if i not in held and i not in repeated)
-    both = sorted(set(fit) & set(held))
-    if both:
-        raise ConfigurationError(
-            f"episodes {both} are to be fitted and held out; a held-out episode must not be seen"
-        )
-    if not fit:
-        raise ConfigurationError(
-            f"nothing to fit: the dataset has {len(every)} episodes, {len(held)} of them held out; "
-            "collect one with `deal-hw collect --profile rich`"
-        )
-    return fit, held
-
-
-def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
-    """Say whether a recording is the livelier repetition of the one before, by their metadata."""
-    same = all(one.get(key) == former.get(key) for key in ("profile", "seed", "seconds"))
-    return same and one.get("attempt", 0) == former.get("attempt", 0) + 1
-
-
-def make_space(robot: str, config: Calibrate) -> ParameterSpace:
-    """Return the parameters to search.
-
-    Raises:
-        UnknownNameError: A name is not known; the message lists the names.
-        ConfigurationError: A range is empty, reversed, or excludes the nominal value.
-    """
-    table = parameter_spaces(robot)
-    name = config.space or next(iter(table))
-    if name not in table:
-        raise UnknownNameError("parameter set", name, table)
-    return _overrides(config, config.xi).apply(table[name]())
-
-
-def _simulation(
-    dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
-) -> tuple[RobotModel, dict[int, Episode]]:
-    try:
-        from deal_hw.sim.engine.model import load_model
-        from deal_hw.sim.recordings.episode import align, thin
-        from deal_hw.sim.recordings.standing import with_sensed_base
-    except ModuleNotFoundError as err:
-        raise MissingExtraError(str(err.name), "calib") from err
-
-    robot = load_model(recorded_description(dataset.description["name"]))
-    episodes = {}
-    for i, trajectory in recordings.items():
-        episodes[i] = align(trajectory, robot.description)
-        if robot.base is not None and trajectory.body is not None:
-            episodes[i] = _while_walking(with_sensed_base(episodes[i], robot, trajectory), trajectory)
-        episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)
-    return robot, episodes
-
-
-def _while_walking(episode: Episode, trajectory: Trajectory) -> Episode:
-    """Return the episode without standing up and lying down where it is of a walk."""
-    wanted = wanted_velocity(trajectory)
-    if wanted is None:
-        return episode
-    rows = slice(episode.first_row, episode.first_row + len(episode.sample))
-    host_s = trajectory.device_s[rows] + np.median(trajectory.receive_s - trajectory.device_s)
-    walks = (host_s >= wanted.time_s[0]) & (host_s <= wanted.end_s)
-    return dataclasses.replace(episode, usable=episode.usable & walks)
-
-
-def _weighed(
-    space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, *, quiet: bool
-) -> ParameterSpace:
-    """Return the space with the trunk's mass as the robot weighs itself, where that is searched.
-
-    No motion on feet tells masses and gains apart: all forces scale together. The motors' efforts do, in the
-    last moments before the robot walks.
-    """
-    from deal_hw.sim.legged.weighing import standing_mass
-
-    trunk, wanted, body = robot.description.floating_base, wanted_velocity(trajectory), trajectory.body
-    names = [p.name for p in space if p.kind == "body_mass" and p.elements == (trunk,)]
-    if not names or wanted is None or body is None:
-        return space
-    since_s = trajectory.receive_s - wanted.time_s[0]
-    rows = (since_s > -WEIGHING_S) & (since_s < 0) & np.isfinite(trajectory.effort).all(axis=1)
-    if not rows.any():
-        return space
-    whole = standing_mass(robot, body.orientation[rows], trajectory.position[rows], trajectory.effort[rows])
-    mass = whole - float(robot.model.body_mass.sum() - robot.model.body(trunk).mass[0])
-    if not quiet:
-        print(
-            f"{names[0]}: {mass:.2f} kg, by the motors' efforts while the robot stands (the whole robot "
-            f"{whole:.2f} kg); not fitted, --known {names[0]} KG gives another",
-            file=sys.stderr,
-        )
-    return space.with_known({names[0]: mass})
+def _say(config: Calibrate) -> Say:
+    return silent if config.quiet else lambda text: print(text, file=sys.stderr)

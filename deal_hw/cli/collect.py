@@ -12,12 +12,13 @@ import tyro
 from deal_hw.calibration import SHORTEST_S
 from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.link import RunOptions, plan_options
-from deal_hw.cli.options import Range, RunSeconds, Seed, given, refuse
-from deal_hw.cli.run_plan import RunPlan, shipped_policy
+from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
 from deal_hw.control.vigor import ATTEMPTS, GENTLEST, LIVELIEST
+from deal_hw.workflows.options import Range, RunSeconds, Seed, given, refuse
+from deal_hw.workflows.shipped import shipped_policy
 
 EXCITATION_FILE = "excitation.json"
 """Where the excitation of `--excite optimal` is kept, in the run folder."""

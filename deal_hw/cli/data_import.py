@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from deal_hw.cli.calibrate_checks import examine_recording
-from deal_hw.cli.options import Checked, Range, given, refuse
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, read_json, reading
+from deal_hw.workflows.calibration.checks import examine_recording
+from deal_hw.workflows.options import Checked, Range, given, refuse
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table

@@ -13,11 +13,11 @@ from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.link import LinkOptions
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.train import Train, train
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
+from deal_hw.workflows.shipped import shipped_policy
 
 EPISODES = 3
 

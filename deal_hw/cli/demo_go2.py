@@ -19,7 +19,6 @@ from deal_hw.cli.emulate_go2 import read_track
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.episode_report import EpisodeReport, RunReport
 from deal_hw.cli.link import LegOptions, LinkOptions
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.train import Train, read_distribution, train
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
@@ -29,6 +28,7 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
+from deal_hw.workflows.shipped import shipped_policy
 
 STEPS: Final = 300_000
 """Of the fine-tune: a minute of a processor."""

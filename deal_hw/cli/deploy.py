@@ -10,9 +10,10 @@ import tyro
 
 from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.link import RunOptions, plan_options
-from deal_hw.cli.options import Range, RunSeconds, Seed
-from deal_hw.cli.run_plan import RunPlan, shipped_policy
+from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import dataset_folder, run_episodes
+from deal_hw.workflows.options import Range, RunSeconds, Seed
+from deal_hw.workflows.shipped import shipped_policy
 
 
 @dataclass(frozen=True, kw_only=True)

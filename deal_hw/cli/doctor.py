@@ -15,7 +15,6 @@ import tyro
 
 from deal_hw.cli.doctor_machine import examine_machine
 from deal_hw.cli.doctor_serial import examine_robot
-from deal_hw.cli.options import Range, check_ranges
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers import (
     CAN_BUSES,
@@ -28,6 +27,7 @@ from deal_hw.drivers import (
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.options import Range, check_ranges
 
 _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: "FAIL"}
 

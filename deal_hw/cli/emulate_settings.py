@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from deal_hw.cli.options import Range, Ratio, Seed, Share, check_ranges, given
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.options import Range, Ratio, Seed, Share, check_ranges, given
 
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 """Transports of the Go2, and where its emulator is by default: on this machine alone."""

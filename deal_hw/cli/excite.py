@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
-from deal_hw.cli.options import Range, Ratio, Seed, Threads, check_ranges, given, refuse
-from deal_hw.cli.run_plan import balancer
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import (
@@ -25,6 +23,8 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.workflows.options import Range, Ratio, Seed, Threads, check_ranges, given, refuse
+from deal_hw.workflows.shipped import balancer
 
 if TYPE_CHECKING:
     from deal_hw.calib.design.excitation_search import Optimum

@@ -12,7 +12,6 @@ from typing import Annotated
 import tyro
 
 from deal_hw.calibration import CalibrationResult, read_result
-from deal_hw.cli.options import Range, check_ranges, refuse
 from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import recorded_description
@@ -22,6 +21,7 @@ from deal_hw.sim.recordings.overlay import DEFAULT_WINDOW_S, Overlay, compute_ov
 from deal_hw.viz.episode_log import write_episode
 from deal_hw.viz.screenshot import save_screenshot
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
+from deal_hw.workflows.options import Range, check_ranges, refuse
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import tyro
 
-from deal_hw.cli.options import Checked, Range
 from deal_hw.drivers.transports.certificates import (
     AUTHORITY,
     Certificate,
@@ -18,6 +17,7 @@ from deal_hw.drivers.transports.certificates import (
     sign,
 )
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.options import Checked, Range
 
 Days = Annotated[float, Range(1, 36500, "days")]
 WARN_DAYS = 30

@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import tyro
 
-from deal_hw.cli.options import Checked, given, refuse
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.options import Checked, given, refuse
 
 
 @dataclass(frozen=True, kw_only=True)

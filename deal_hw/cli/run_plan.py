@@ -10,9 +10,8 @@ import dataclasses
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
@@ -126,17 +125,6 @@ class RunPlan:
     def from_json(cls, values: dict[str, Any]) -> RunPlan:
         """Return the plan that :meth:`to_json` wrote; other keys are ignored."""
         return from_values(cls, values)
-
-
-SHIPPED: Final[Mapping[str, str]] = {"go2": "go2_walk"}
-"""Shipped policies that are not called ROBOT_udr: the Go2's of that name is what benches excite it with."""
-
-
-def shipped_policy(robot: str) -> Path | None:
-    """Return the policy that is shipped for a robot; None where there is none."""
-    name = SHIPPED.get(robot, f"{robot}_udr")
-    path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{name}.onnx"))
-    return path if path.is_file() else None
 
 
 def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
@@ -280,15 +268,3 @@ def _loaded(plan: RunPlan, load: Callable[[RunPlan], Policy]) -> Policy:
             "give --policy FILE, or use --profile chirp or hold"
         )
     return load(plan)
-
-
-def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
-    """Return what makes a robot's balancing behaviour; None where the robot has no policy."""
-    path = policy or shipped_policy(description.name)
-    if path is None:
-        return None
-    from deal_hw.policies.onnx_runtime import OnnxPolicy
-    from deal_hw.policies.trial import check_policy
-
-    digest = check_policy(path, description).digest
-    return lambda: PolicyBehaviour(OnnxPolicy(path, digest), description)

@@ -14,11 +14,11 @@ import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from deal_hw.cli.options import Checked, Range, Seed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.policy import VERDICT
 from deal_hw.reading import read_json, reading
+from deal_hw.workflows.options import Checked, Range, Seed
 
 if TYPE_CHECKING:
     from deal_hw.policies.onnx_runtime import OnnxPolicy

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.bench import Bench, bench
-from deal_hw.cli.calibrate_model import Recordings
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.calibration.model import Recordings
 
 HINGE = """
 <mujoco model="hinge">

@@ -18,9 +18,9 @@ from deal_hw.calib.validation.diagnosis import Evidence, Finding, evidence, find
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Answer, Cause, Signature, held_direction
 from deal_hw.cli.calibrate import Calibrate, prepare
-from deal_hw.cli.calibrate_model import Recordings
 from deal_hw.testing.plain_robots import Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.model import Recordings
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
 DAMPING = 2.0

@@ -22,10 +22,10 @@ from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
-from deal_hw.cli.calibrate_model import Recordings, prepare_model
-from deal_hw.cli.calibrate_run import SpaceOverrides
 from deal_hw.sim.recordings.episode import Episode
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.model import Recordings, prepare_model
+from deal_hw.workflows.calibration.run import SpaceOverrides
 
 HINGE = """
 <mujoco model="hinge">

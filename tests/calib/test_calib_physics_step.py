@@ -18,9 +18,9 @@ from deal_hw.calib.uncertainty.time_steps import (
     halved,
     step_alarm,
 )
-from deal_hw.cli.calibrate_model import Recordings, prepare_model
-from deal_hw.cli.calibrate_run import SpaceOverrides
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.model import Recordings, prepare_model
+from deal_hw.workflows.calibration.run import SpaceOverrides
 
 HINGE = """
 <mujoco model="hinge">

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calibration import read_result
-from deal_hw.cli.calibrate import Calibrate, calibrate, make_space
+from deal_hw.cli.calibrate import Calibrate, calibrate, prepare
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
@@ -137,8 +137,8 @@ def test_dataset_of_held_out_episodes_only_is_refused(tmp_path: Path) -> None:
 
 def test_parameter_sets_and_known_values(dataset: Path) -> None:
     """k11 frees everything; a weighed cart is known; an unknown set lists the sets."""
-    assert len(make_space("cartpole", settings(dataset, free=(), space="k11"))) == 11
-    space = make_space("cartpole", settings(dataset, free=(), known=(("cart.mass", 0.41),)))
+    assert len(prepare(settings(dataset, free=(), space="k11")).space) == 11
+    space = prepare(settings(dataset, free=(), known=(("cart.mass", 0.41),))).space
     assert space.known["cart.mass"] == 0.41 and len(space) == 8
     with pytest.raises(UnknownNameError, match=r"k7.*k9, k11"):
-        make_space("cartpole", settings(dataset, free=(), space="k7"))
+        prepare(settings(dataset, free=(), space="k7"))

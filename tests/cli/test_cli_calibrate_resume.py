@@ -18,13 +18,13 @@ from deal_hw import calibration
 from deal_hw.calib.report import page
 from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli import calibrate as verb
-from deal_hw.cli.calibrate_live import BestSoFar
 from deal_hw.cli.main import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_OK, main
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.workflows.calibration.best_so_far import BestSoFar
 
 
 @pytest.fixture(scope="module")
@@ -164,18 +164,18 @@ def test_the_best_fit_so_far_is_said_and_kept(
     assert not kept.exists()
 
 
-def test_a_worse_fit_does_not_replace_the_best(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_worse_fit_does_not_replace_the_best() -> None:
     """Of three fits the second predicts held-out motion best; the third is neither said nor kept."""
     space = k9_space().with_free(("cart.mass", "servo.stiffness"))
     errors = iter((0.2, 0.1, 0.15))
-    best = BestSoFar(space, lambda *_: {"nominal": 0.5, "calibrated": next(errors), "null": 1.0})
+    told: list[str] = []
+    best = BestSoFar(space, lambda *_: {"nominal": 0.5, "calibrated": next(errors), "null": 1.0}, told.append)
     best(Progress("search", 1, 9))
     assert best.result is None
     for stage in ("local fit", "search", "refinement"):
         best(Progress(stage, 1, 1, estimate=space.nominal, latency_s=0.01, values={"chi2": 2.0}))
     assert best.result is not None and best.result.method == "interrupted after search"
     assert best.result.heldout_nrmse == {"nominal": 0.5, "calibrated": 0.1, "null": 1.0}
-    told = capsys.readouterr().err.splitlines()
     assert len(told) == 2 and "held-out error 10 % of the signal's range (your own model: 50 %)" in told[1]
 
 

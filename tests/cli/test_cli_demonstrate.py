@@ -14,11 +14,9 @@ from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Verdict
-from deal_hw.cli.calibrate import choose_episodes
-from deal_hw.cli.calibrate_run import calibrate_episodes
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.run_plan import RunPlan, shipped_policy
+from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode, demonstrate
 from deal_hw.control.loop import Outcome
 from deal_hw.control.vigor import VigorSearch
@@ -29,6 +27,9 @@ from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
+from deal_hw.workflows.calibration.dataset import choose_episodes
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.shipped import shipped_policy
 
 
 def shown(truth: Truth) -> tuple[VirtualEpisode, VigorSearch]:

@@ -12,7 +12,7 @@ import pytest
 
 from deal_hw.cli.collect import Collect, _excitation
 from deal_hw.cli.excite import Excite, excite
-from deal_hw.cli.run_plan import RunPlan, make_behaviour, shipped_policy
+from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation_plan import ExcitationBehaviour, read_plan
 from deal_hw.control.loop import Outcome
@@ -21,6 +21,7 @@ from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.workflows.shipped import shipped_policy
 
 POLICY = str(shipped_policy("cartpole") or "")
 TRUTHS = [nominal_truth("sensor", 3, actuation_ticks=9), draw_truth("sensor", 3, xi=5.0)]

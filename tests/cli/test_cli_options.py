@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import pytest
 
 from deal_hw.cli.main import VERBS, main, run
-from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.workflows.options import Range
 
 NO_USE: tuple[float, ...] = (math.nan, math.inf, -math.inf, 1e300)
 """No option takes one of these."""

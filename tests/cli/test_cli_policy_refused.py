@@ -11,13 +11,14 @@ import onnx
 import pytest
 
 from deal_hw.cli.main import main
-from deal_hw.cli.run_plan import RunPlan, check_plan, shipped_policy
+from deal_hw.cli.run_plan import RunPlan, check_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.policy import VERDICT
 from deal_hw.testing.faulty_policy import faulty_policy
+from deal_hw.workflows.shipped import shipped_policy
 
 REFUSED = 2
 

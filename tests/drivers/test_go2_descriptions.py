@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand, on_stand_recording
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.engine.model import load_model
+from deal_hw.workflows.shipped import shipped_policy
 
 BOTH = pytest.mark.parametrize("description", [DRIVER, on_stand.DESCRIPTION], ids=lambda d: d.name)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.demo_go2 import write_script
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.cli.virtual_go2 import VirtualWalk, walk
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity import ScriptVelocity
@@ -19,6 +18,7 @@ from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.legged.weighing import standing_mass
+from deal_hw.workflows.shipped import shipped_policy
 
 SEED = 1
 SECONDS = 7.0

@@ -19,14 +19,15 @@ LAYER = {
     **dict.fromkeys(CONTRACTS, 1),
     **dict.fromkeys(SERVICES, 2),
     **dict.fromkeys(LEAVES, 3),
-    "cli": 4,
-    "bench": 4,
-    "__main__": 5,
+    "workflows": 4,
+    "cli": 5,
+    "bench": 5,
+    "__main__": 6,
 }
 """Layer of each part; a part may import parts of lower layers and itself."""
 
 BESIDE = {("bench", "cli"), ("cli.bench", "bench")}
-"""Benches run what verbs run, which lies in cli until there are workflows; one verb runs the benches."""
+"""Benches run what verbs run, which lies in cli where there is no workflow yet; one verb runs the benches."""
 
 ROOMS = {
     "calib": (

@@ -9,12 +9,12 @@ import measure_go2_walk
 import numpy as np
 import pytest
 
-from deal_hw.cli.run_plan import shipped_policy
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import CheckpointError
 from deal_hw.policies.checkpoint import read_checkpoint
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import ObservationBuilder
+from deal_hw.workflows.shipped import shipped_policy
 
 
 @pytest.fixture(scope="module")

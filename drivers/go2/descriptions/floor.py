@@ -158,6 +158,9 @@ def swapped_paper_space() -> ParameterSpace:
 
 
 SPACES: Final = {
-    "default": parameter_space, "walk": walk_space, "paper": paper_space, "paper-swapped": swapped_paper_space,
-}  # fmt: skip
+    "default": parameter_space,
+    "walk": walk_space,
+    "paper": paper_space,
+    "paper-swapped": swapped_paper_space,
+}
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

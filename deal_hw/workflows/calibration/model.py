@@ -10,13 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from deal_hw.cli.calibrate_checks import (
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.checks import (
     examine_recording,
     require_base,
     require_sensitive_parameters,
     warn_of_gravity,
 )
-from deal_hw.cli.calibrate_recordings import (
+from deal_hw.workflows.calibration.recordings import (
     aligned,
     common_rates,
     divide,
@@ -25,17 +29,15 @@ from deal_hw.cli.calibrate_recordings import (
     seconds_of,
     without,
 )
-from deal_hw.cli.calibrate_run import CalibrationInputs, SpaceOverrides
-from deal_hw.cli.options import Checked, Range
-from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
-from deal_hw.errors import ConfigurationError, MissingExtraError
-from deal_hw.parameters import ParameterSpace
-from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
+from deal_hw.workflows.options import Checked, Range
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
 
 HELDOUT_PART = 0.25
+DEFAULT = "default"
+"""Name of the method where none is named."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,6 +206,24 @@ def prepare_model(
         },
         advice="name recordings of other motion with --holdout",
     )
+
+
+def method_for(work: CalibrationInputs, *, told: bool, real: bool) -> str:
+    """Return the method that suits recordings of a robot.
+
+    Args:
+        work: Robot and recordings.
+        told: Whether the user said how to treat what no model explains.
+        real: Whether they are of a robot that the user's own MJCF describes.
+    """
+    facts = work.robot.description
+    held = set(facts.actuated) == set(facts.joint_names) and all(kp > 0 for kp in facts.stiffness)
+    if told:
+        return DEFAULT
+    if work.walks:
+        return "gait"
+    # Predictions of seconds, which output-error compares, mean nothing for a robot that falls.
+    return "output-error" if real and work.robot.base is None and held else DEFAULT
 
 
 def _holdout_share(config: Recordings, holdout: Sequence[Path]) -> float:

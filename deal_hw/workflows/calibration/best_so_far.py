@@ -73,6 +73,14 @@ def check_resume(path: Path, resume: bool) -> None:
         )
 
 
+Say = Callable[[str], None]
+"""Called with a sentence for the user."""
+
+
+def silent(text: str) -> None:
+    """Say nothing."""
+
+
 class BestSoFar:
     """The best fit of a calibration that is still running: said as it comes, kept where it is stopped.
 
@@ -80,16 +88,16 @@ class BestSoFar:
         space: What is searched.
         judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
             and "null"; None where nothing is held out.
-        quiet: Say nothing.
+        say: Called with a sentence on each better one.
     """
 
     def __init__(
         self,
         space: ParameterSpace,
         judge: Callable[[FloatArray, float], Mapping[str, float]] | None,
-        quiet: bool = False,
+        say: Say = silent,
     ) -> None:
-        self._space, self._judge, self._quiet = space, judge, quiet
+        self._space, self._judge, self._say = space, judge, say
         self._began = time.monotonic()
         self._error = math.inf
         self.result: CalibrationResult | None = None
@@ -123,10 +131,7 @@ class BestSoFar:
                 ),
             ),
         )  # fmt: skip
-        if not self._quiet:
-            print(
-                f"{time.monotonic() - self._began:.0f} s, {progress.stage}: {self.sentence}", file=sys.stderr
-            )
+        self._say(f"{time.monotonic() - self._began:.0f} s, {progress.stage}: {self.sentence}")
 
     @property
     def sentence(self) -> str:

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.control.velocity import FixedVelocity
+from deal_hw.control.velocity import FixedVelocity, make_source
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 
@@ -46,7 +45,7 @@ def recorded_policy(
             f"{len(wishes)} wanted velocities; name episodes of one of each (--episodes)"
         )
     (digest,), (wish,) = digests, wishes
-    source = RunPlan(robot=description.name, velocity=wish).velocity_source()
+    source = make_source(wish)
     if not isinstance(source, FixedVelocity):
         raise InsufficientDataError(
             f"the recordings follow the velocities of {wish!r}, and a simulator is told one fixed velocity; "

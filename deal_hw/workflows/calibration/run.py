@@ -7,7 +7,7 @@ import dataclasses
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,11 +23,19 @@ from deal_hw.calibration import (
     Progress,
     ProgressCallback,
 )
-from deal_hw.cli.calibrate_live import SO_FAR, BestSoFar, keeping_best, open_checkpoint, saying_how_to_resume
-from deal_hw.cli.options import Range
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
+from deal_hw.workflows.calibration.best_so_far import (
+    SO_FAR,
+    BestSoFar,
+    Say,
+    keeping_best,
+    open_checkpoint,
+    saying_how_to_resume,
+    silent,
+)
+from deal_hw.workflows.options import Range
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
@@ -36,7 +44,6 @@ if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import Episode
 
-TABLE_WIDTH = 100
 HELDOUT_WINDOW_S = 0.2
 """The same as in :mod:`deal_hw.calib.validation.metrics`, which is loaded on need."""
 
@@ -134,10 +141,10 @@ def calibrate_episodes(
     latency_s: float | None = None,
     latency_range_s: tuple[float, float] = LATENCY_RANGE_S,
     threads: int | None = None,
-    quiet: bool = True,
+    progress: ProgressCallback | None = None,
+    say: Say = silent,
     checkpoint: Path | None = None,
     resume: bool = False,
-    watch: ProgressCallback | None = None,
     keep: Path | None = None,
     known_std: FloatArray | None = None,
     heldout_window_s: float = HELDOUT_WINDOW_S,
@@ -157,10 +164,10 @@ def calibrate_episodes(
         latency_s: Total latency if it is known [s].
         latency_range_s: Otherwise what is searched [s].
         threads: Simulation threads.
-        quiet: Show no progress.
+        progress: Called with the progress.
+        say: Called with a sentence where a better fit was found, and where it is kept.
         checkpoint: File that holds the state after each generation; None to keep none.
         resume: Go on with what that file holds.
-        watch: Called with the progress, too.
         keep: Folder that gets the best fit so far on Ctrl-C; None to keep none.
         known_std: What a prediction may be off, positions then velocities, (2 C,); None: the sensor noise, as
             the recordings show it.
@@ -200,29 +207,27 @@ def calibrate_episodes(
         return {"nominal": (space.nominal, 0.0), "calibrated": (theta, latency)}
 
     judge = None if held_out is None else lambda *fit: held_out.errors(beside_nominal(*fit)).nrmse
-    best = BestSoFar(space, judge, quiet)
+    best = BestSoFar(space, judge, say)
     searcher = make_method(method, refine=budget.refine)
     # The matrices are small: a second BLAS thread only spins, and where processors are shared each
     # decomposition then takes ten times as long.
     with (
         threadpool_limits(1, user_api="blas"),
-        show_progress(f"calibrate ({method})", quiet) as report,
         keeping_best(best, keep, robot) if keep is not None else contextlib.nullcontext(),
     ):
 
-        def progress(p: Progress) -> None:
-            report(p)
+        def note(p: Progress) -> None:
             best(p)
-            if p.stage == BEFORE_SEARCH and not quiet:
-                print(f"{BEFORE_SEARCH}: {p.message}", file=sys.stderr)
-            if watch is not None:
-                watch(p)
+            if p.stage == BEFORE_SEARCH:
+                say(f"{BEFORE_SEARCH}: {p.message}")
+            if progress is not None:
+                progress(p)
 
         if checkpoint is None:
-            result = searcher.run(problem, budget, rng, progress)
+            result = searcher.run(problem, budget, rng, note)
         else:
             store = open_checkpoint(checkpoint, resume, problem, searcher, budget, rng)
-            result = searcher.run(problem, budget, rng, progress, store)
+            result = searcher.run(problem, budget, rng, note, store)
     alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
     result = dataclasses.replace(result, alarms=alarms)
     if held_out is None:
@@ -306,9 +311,8 @@ def finish(
     page: bool = True,
     advise: bool = True,
     threads: int | None = None,
-    quiet: bool = True,
 ) -> CalibrateReport:
-    """Note where a result comes from, write the result folder, print the result.
+    """Note where a result comes from and write the result folder.
 
     Args:
         work: What was calibrated.
@@ -319,7 +323,6 @@ def finish(
         page: Write report.html.
         advise: Compute what to record next for parameters that stayed open.
         threads: Simulation threads.
-        quiet: Print nothing.
 
     Raises:
         KeyboardInterrupt: Ctrl-C. It is said whether there are results; where there are, they are whole.
@@ -328,23 +331,20 @@ def finish(
     from deal_hw.data.files import interrupts_deferred
 
     with saying_how_to_resume(checkpoint):
-        result, report = _judged(work, result, settings, page=page, advise=advise, threads=threads)
+        result, report = judged(work, result, settings, page=page, advise=advise, threads=threads)
     try:
         # An impatient Ctrl-C must neither cost an hour's work nor leave half of it.
         with interrupts_deferred():
             files = write_result(folder, work.robot, result, report)
             checkpoint.unlink(missing_ok=True)
             shutil.rmtree(folder / SO_FAR, ignore_errors=True)
-        if not quiet:
-            print_result(result, work.advice, work.name)
-            print("written: " + ", ".join(str(f) for f in files.values()))
     except KeyboardInterrupt:
         print(f"\ninterrupted after the end: the results in {folder} are whole", file=sys.stderr)
         raise
     return CalibrateReport(result=result, files=files)
 
 
-def _judged(
+def judged(
     work: CalibrationInputs,
     result: CalibrationResult,
     settings: Mapping[str, Any],
@@ -384,100 +384,3 @@ def _judged(
         threads=threads,
     )
     return result, inputs
-
-
-@contextlib.contextmanager
-def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
-    """Show a progress bar on a terminal; nothing otherwise."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda progress: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[note]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None, note="")
-
-        def report(p: Progress) -> None:
-            bar.update(
-                task, description=f"{title}: {p.stage}", completed=p.done, total=p.total, note=p.message
-            )
-
-        yield report
-
-
-def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
-    """Print the parameters with their intervals, and what the data cannot tell.
-
-    Args:
-        result: What was found.
-        advice: How to get a held-out recording where there is none.
-        name: Name under which `deal-hw collect` records this robot; "" where it does not.
-    """
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.padding import Padding
-    from rich.table import Table
-
-    from deal_hw.calib.design.advice import next_step
-    from deal_hw.calib.validation.verdict import trust
-
-    table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
-    for name, align in (
-        ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"),
-        ("90 % interval", "left"), ("verdict", "left"),
-    ):  # fmt: skip
-        table.add_column(name, justify="right" if align == "right" else "left")
-    for k, p in enumerate(result.space):
-        low, high = result.interval[k]
-        verdict = result.verdicts[k] if result.verdicts else "-"
-        table.add_row(
-            p.name,
-            p.unit,
-            f"{p.nominal:.4g}",
-            "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}",
-            f"{low:.4g} .. {high:.4g}",
-            verdict,
-        )
-    low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
-    table.add_row("latency", "ms", "0", f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}", "")
-    console = Console()
-    if console.width < TABLE_WIDTH:
-        console = Console(width=TABLE_WIDTH)
-    console.print(table)
-    told = trust(result)
-    console.print(f"[bold]{told.colour}:[/bold] {told.sentence}")
-    for words in result.null_directions:
-        console.print(f"the data cannot tell: {words}")
-    for number, line in enumerate(next_step(result.advice, name)):
-        # A command is to be copied: not wrapped.
-        console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
-    for alarm in result.alarms:
-        console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
-        console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
-    step = result.provenance.get("physics_step", {})
-    if "note" in step:
-        console.print(
-            f"physics step of {1e3 * step['step_s']:g} ms, whether it is fine enough: {step['note']}"
-        )
-    if not result.heldout_nrmse:
-        console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
-        return
-    window_s = result.provenance.get("heldout_window_s", HELDOUT_WINDOW_S)
-    errors = ", ".join(f"{name} {value:.4f}" for name, value in result.heldout_nrmse.items())
-    console.print(f"held-out error over the signal's range ({window_s:g} s windows): {errors}")
-    rmse = result.provenance.get("heldout_rmse", {}).get("mean", {})
-    if rmse:
-        errors = ", ".join(
-            f"{name} {'diverged' if value is None else f'{value:.4g}'}" for name, value in rmse.items()
-        )
-        console.print(f"held-out RMSE in rad or m, mean over the joints: {errors}")

@@ -1,0 +1,109 @@
+"""What `deal-hw calibrate` shows: a bar while it runs, and the result."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+
+from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
+from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
+
+TABLE_WIDTH = 100
+
+
+@contextlib.contextmanager
+def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
+    """Show a progress bar on a terminal; nothing otherwise."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda progress: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[note]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, note="")
+
+        def report(p: Progress) -> None:
+            bar.update(
+                task, description=f"{title}: {p.stage}", completed=p.done, total=p.total, note=p.message
+            )
+
+        yield report
+
+
+def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
+    """Print the parameters with their intervals, and what the data cannot tell.
+
+    Args:
+        result: What was found.
+        advice: How to get a held-out recording where there is none.
+        name: Name under which `deal-hw collect` records this robot; "" where it does not.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.padding import Padding
+    from rich.table import Table
+
+    from deal_hw.calib.design.advice import next_step
+    from deal_hw.calib.validation.verdict import trust
+
+    table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
+    for name, align in (
+        ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"),
+        ("90 % interval", "left"), ("verdict", "left"),
+    ):  # fmt: skip
+        table.add_column(name, justify="right" if align == "right" else "left")
+    for k, p in enumerate(result.space):
+        low, high = result.interval[k]
+        verdict = result.verdicts[k] if result.verdicts else "-"
+        table.add_row(
+            p.name,
+            p.unit,
+            f"{p.nominal:.4g}",
+            "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}",
+            f"{low:.4g} .. {high:.4g}",
+            verdict,
+        )
+    low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
+    table.add_row("latency", "ms", "0", f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}", "")
+    console = Console()
+    if console.width < TABLE_WIDTH:
+        console = Console(width=TABLE_WIDTH)
+    console.print(table)
+    told = trust(result)
+    console.print(f"[bold]{told.colour}:[/bold] {told.sentence}")
+    for words in result.null_directions:
+        console.print(f"the data cannot tell: {words}")
+    for number, line in enumerate(next_step(result.advice, name)):
+        # A command is to be copied: not wrapped.
+        console.print(line if number else f"next: {line}", soft_wrap=line.startswith(" "))
+    for alarm in result.alarms:
+        console.print(f"[bold]alarm:[/bold] {escape(alarm.seen)}")
+        console.print(Padding(f"{escape(alarm.means)}\n[bold]do:[/bold] {escape(alarm.do)}", (0, 0, 0, 4)))
+    step = result.provenance.get("physics_step", {})
+    if "note" in step:
+        console.print(
+            f"physics step of {1e3 * step['step_s']:g} ms, whether it is fine enough: {step['note']}"
+        )
+    if not result.heldout_nrmse:
+        console.print(f"no held-out recording: nothing says whether this holds on other motion; {advice}")
+        return
+    window_s = result.provenance.get("heldout_window_s", HELDOUT_WINDOW_S)
+    errors = ", ".join(f"{name} {value:.4f}" for name, value in result.heldout_nrmse.items())
+    console.print(f"held-out error over the signal's range ({window_s:g} s windows): {errors}")
+    rmse = result.provenance.get("heldout_rmse", {}).get("mean", {})
+    if rmse:
+        errors = ", ".join(
+            f"{name} {'diverged' if value is None else f'{value:.4g}'}" for name, value in rmse.items()
+        )
+        console.print(f"held-out RMSE in rad or m, mean over the joints: {errors}")

@@ -1,0 +1,1 @@
+"""Calibration: recordings read and checked, the search run, the result judged and written."""

@@ -1,0 +1,185 @@
+"""From a dataset of deal-hw to what a calibration fits and judges by."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deal_hw.calib.methods import CLOSED_LOOP_METHODS
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.drivers import parameter_spaces, recorded_description
+from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import Trajectory
+from deal_hw.workflows.calibration.best_so_far import Say, silent
+from deal_hw.workflows.calibration.policy import recorded_policy
+from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
+from deal_hw.workflows.calibration.walking import all_walk, weighed, while_walking
+from deal_hw.workflows.shipped import balancer
+
+if TYPE_CHECKING:
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import Episode
+
+HELDOUT_PROFILE = "chirp"
+SAMPLES_A_PERIOD = 4
+"""States of a control period that are fitted to."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetRecordings:
+    """Recordings of a dataset.
+
+    Attributes:
+        folder: The dataset.
+        episodes: What is fitted; empty: all but what is held out.
+        holdout: What only judges; empty: episodes of the profile `chirp`.
+        policy: File of the policy that moved the robot; None: the copy that the dataset keeps.
+        sample_hz: States a second that are fitted to; None: four a control period.
+        spikes: What counts as a spike.
+    """
+
+    folder: Path
+    episodes: Sequence[int] = ()
+    holdout: Sequence[int] = ()
+    policy: Path | None = None
+    sample_hz: float | None = None
+    spikes: SpikeSettings = DEFAULT_SPIKES
+
+
+def prepare_dataset(
+    source: DatasetRecordings, space_name: str, overrides: SpaceOverrides, method: str, say: Say = silent
+) -> CalibrationInputs:
+    """Read a dataset of a robot of ours.
+
+    Args:
+        source: The recordings.
+        space_name: Name of the robot's parameter set; "" for its first.
+        overrides: What is changed about it.
+        method: Name of the method: some need the recordings' policy.
+        say: Called with a sentence on what was found in the recordings.
+
+    Raises:
+        DealHwError: A setting or a recording is unusable.
+    """
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.spikes import without_spikes
+    from deal_hw.data.recording.telemetry_checks import Severity, check
+
+    dataset = Dataset.open(source.folder)
+    robot_name = dataset.description["name"]
+    fit, holdout = choose_episodes(dataset, source.episodes, source.holdout)
+    policy = None
+    if method in CLOSED_LOOP_METHODS:
+        policy = recorded_policy(dataset, fit, recorded_description(robot_name), source.policy)
+    space = overrides.apply(named_space(robot_name, space_name))
+    recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
+    verdicts = {index: check(trajectory, source.spikes) for index, trajectory in recordings.items()}
+    for index, found in verdicts.items():
+        failed = [v.message for v in found if v.severity is Severity.FAIL]
+        if failed:
+            raise InsufficientDataError(
+                f"episode {index} of {source.folder} cannot be used: {'; '.join(failed)}; "
+                "record again with `deal-hw collect`"
+            )
+        for jump in [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN][:1]:
+            say(f"episode {index}: {jump}")
+    recordings = {i: without_spikes(trajectory, source.spikes) for i, trajectory in recordings.items()}
+    robot, episodes = _simulation(dataset, recordings, source.sample_hz)
+    walks = all_walk(robot, recordings.values())
+    if walks:
+        space = weighed(space, robot, recordings[fit[0]], say)
+    return CalibrationInputs(
+        robot=robot,
+        space=space,
+        episodes=[episodes[i] for i in fit],
+        holdout=[episodes[i] for i in holdout],
+        shown=recordings[fit[0]],
+        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
+        provenance={
+            "dataset": str(source.folder),
+            "description_digest": dataset.digest,
+            "episodes": list(fit),
+            "holdout": list(holdout),
+        },
+        advice="`deal-hw collect --profile chirp` records one",
+        balance=balancer(robot.description, None),
+        name="" if robot.base is not None else robot.description.name,
+        policy=policy,
+        walks=walks,
+    )
+
+
+def named_space(robot: str, name: str = "") -> ParameterSpace:
+    """Return a parameter set of a robot; "" is its first.
+
+    Raises:
+        UnknownNameError: There is none of that name; the message lists them.
+    """
+    table = parameter_spaces(robot)
+    name = name or next(iter(table))
+    if name not in table:
+        raise UnknownNameError("parameter set", name, table)
+    return table[name]()
+
+
+def choose_episodes(
+    dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the episodes to fit and those to judge by.
+
+    Raises:
+        ConfigurationError: Nothing is left to fit, or an episode is in both.
+    """
+    every = range(len(dataset.episodes))
+    metadata = [dataset.read(i).metadata for i in every]
+    profiles = [str(m.get("profile", "")) for m in metadata]
+    held = tuple(holdout) or tuple(i for i in every if profiles[i] == HELDOUT_PROFILE and i not in episodes)
+    repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
+    if repeated:
+        print(
+            f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)",
+            file=sys.stderr,
+        )
+    fit = tuple(episodes) or tuple(i for i in every if i not in held and i not in repeated)
+    both = sorted(set(fit) & set(held))
+    if both:
+        raise ConfigurationError(
+            f"episodes {both} are to be fitted and held out; a held-out episode must not be seen"
+        )
+    if not fit:
+        raise ConfigurationError(
+            f"nothing to fit: the dataset has {len(every)} episodes, {len(held)} of them held out; "
+            "collect one with `deal-hw collect --profile rich`"
+        )
+    return fit, held
+
+
+def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
+    """Say whether a recording is the livelier repetition of the one before, by their metadata."""
+    same = all(one.get(key) == former.get(key) for key in ("profile", "seed", "seconds"))
+    return same and one.get("attempt", 0) == former.get("attempt", 0) + 1
+
+
+def _simulation(
+    dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
+) -> tuple[RobotModel, dict[int, Episode]]:
+    try:
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.recordings.episode import align, thin
+        from deal_hw.sim.recordings.standing import with_sensed_base
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+
+    robot = load_model(recorded_description(dataset.description["name"]))
+    episodes = {}
+    for i, trajectory in recordings.items():
+        episodes[i] = align(trajectory, robot.description)
+        if robot.base is not None and trajectory.body is not None:
+            episodes[i] = while_walking(with_sensed_base(episodes[i], robot, trajectory), trajectory)
+        episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)
+    return robot, episodes

@@ -1,0 +1,68 @@
+"""What a calibration makes of recordings of a robot that walks: their walking part, the robot's weight."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from deal_hw.control.velocity_error import wanted_velocity
+from deal_hw.parameters import ParameterSpace
+from deal_hw.types import Trajectory
+from deal_hw.workflows.calibration.best_so_far import Say
+
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import Episode
+
+GAIT_SMOOTHING_S = 0.04
+"""Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
+WALK_TELLS = (
+    "a walk tells the gains of the joints and the floor's friction; it hardly tells their dry friction, not "
+    "their armature, and masses only where the motors' efforts weigh the robot (docs/calibration.md)"
+)
+WEIGHING_S = 0.35
+"""A robot that is about to walk has stood still for so long [s]."""
+
+
+def all_walk(robot: RobotModel, recordings: Iterable[Trajectory]) -> bool:
+    """Return whether all recordings are of a policy that walks."""
+    return robot.base is not None and all(wanted_velocity(r) is not None for r in recordings)
+
+
+def while_walking(episode: Episode, trajectory: Trajectory) -> Episode:
+    """Return the episode without standing up and lying down where it is of a walk."""
+    wanted = wanted_velocity(trajectory)
+    if wanted is None:
+        return episode
+    rows = slice(episode.first_row, episode.first_row + len(episode.sample))
+    host_s = trajectory.device_s[rows] + np.median(trajectory.receive_s - trajectory.device_s)
+    walks = (host_s >= wanted.time_s[0]) & (host_s <= wanted.end_s)
+    return dataclasses.replace(episode, usable=episode.usable & walks)
+
+
+def weighed(space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, say: Say) -> ParameterSpace:
+    """Return the space with the trunk's mass as the robot weighs itself, where that is searched.
+
+    No motion on feet tells masses and gains apart: all forces scale together. The motors' efforts do, in the
+    last moments before the robot walks.
+    """
+    from deal_hw.sim.legged.weighing import standing_mass
+
+    trunk, wanted, body = robot.description.floating_base, wanted_velocity(trajectory), trajectory.body
+    names = [p.name for p in space if p.kind == "body_mass" and p.elements == (trunk,)]
+    if not names or wanted is None or body is None:
+        return space
+    since_s = trajectory.receive_s - wanted.time_s[0]
+    rows = (since_s > -WEIGHING_S) & (since_s < 0) & np.isfinite(trajectory.effort).all(axis=1)
+    if not rows.any():
+        return space
+    whole = standing_mass(robot, body.orientation[rows], trajectory.position[rows], trajectory.effort[rows])
+    mass = whole - float(robot.model.body_mass.sum() - robot.model.body(trunk).mass[0])
+    say(
+        f"{names[0]}: {mass:.2f} kg, by the motors' efforts while the robot stands (the whole robot "
+        f"{whole:.2f} kg); not fitted, --known {names[0]} KG gives another"
+    )
+    return space.with_known({names[0]: mass})

@@ -1,0 +1,33 @@
+"""Policies that are shipped with the package, and what balances a robot with one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Final
+
+from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
+from deal_hw.description import RobotDescription
+
+SHIPPED: Final[Mapping[str, str]] = {"go2": "go2_walk"}
+"""Shipped policies that are not called ROBOT_udr: the Go2's of that name is what benches excite it with."""
+
+
+def shipped_policy(robot: str) -> Path | None:
+    """Return the policy that is shipped for a robot; None where there is none."""
+    name = SHIPPED.get(robot, f"{robot}_udr")
+    path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{name}.onnx"))
+    return path if path.is_file() else None
+
+
+def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:
+    """Return what makes a robot's balancing behaviour; None where the robot has no policy."""
+    path = policy or shipped_policy(description.name)
+    if path is None:
+        return None
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.policies.trial import check_policy
+
+    digest = check_policy(path, description).digest
+    return lambda: PolicyBehaviour(OnnxPolicy(path, digest), description)
