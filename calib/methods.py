@@ -72,6 +72,14 @@ def usual_population(name: str) -> int:
     return PAPER_POPULATION if paper else Budget().population
 
 
+def usual_budget(
+    name: str, population: int | None = None, generations: int | None = None, *, refine: bool = True
+) -> Budget:
+    """Return a method's budget; what is not given is what the method usually has."""
+    members = population or usual_population(name)
+    return Budget(population=members, generations=generations or Budget().generations, refine=refine)
+
+
 def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem]:
     """Return a new method.
 

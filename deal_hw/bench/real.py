@@ -28,6 +28,7 @@ from deal_hw.workflows.calibration.run import (
     calibrate_episodes,
     residual_std,
 )
+from deal_hw.workflows.say import aloud, silent
 
 KEY = ("task", "split", "method", "refined", "xi", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
@@ -64,7 +65,7 @@ def prepare(
         overrides,
         std=lambda robot: residual_std(std, robot),
         threads=threads,
-        quiet=quiet,
+        say=silent if quiet else aloud,
     )
 
 

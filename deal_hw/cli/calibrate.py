@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from deal_hw.calib.methods import CLOSED_LOOP_METHODS, check_method, usual_population
-from deal_hw.calibration import LATENCY_RANGE_S, Budget, Progress
+from deal_hw.calib.methods import CLOSED_LOOP_METHODS, check_method, usual_budget
+from deal_hw.calibration import LATENCY_RANGE_S, Progress
 from deal_hw.cli.calibrate_output import print_result, show_progress
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError
@@ -19,10 +18,8 @@ from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.workflows.calibration.best_so_far import (
     CHECKPOINT,
     SO_FAR,
-    Say,
     check_resume,
     saying_how_to_resume,
-    silent,
     watching,
 )
 from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
@@ -44,6 +41,7 @@ from deal_hw.workflows.calibration.run import (
 )
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S, WALK_TELLS
 from deal_hw.workflows.options import Checked, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:
     pass
@@ -209,8 +207,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)
-    population = config.population or usual_population(config.method)
-    budget = Budget(population=population, generations=config.generations, refine=config.refine)
+    budget = usual_budget(config.method, config.population, config.generations, refine=config.refine)
     work = prepare(config)
     known_std = residual_std(config.residual_std, work.robot)
     method = usual_method(config, work)
@@ -320,7 +317,7 @@ def _prepare_model(config: Calibrate) -> CalibrationInputs:
         std=lambda robot: residual_std(config.residual_std, robot),
         spikes=SpikeSettings(ratio=config.spike_ratio),
         threads=config.threads,
-        quiet=config.quiet,
+        say=_say(config),
     )
 
 
@@ -349,4 +346,4 @@ def prepare_recorded(config: Calibrate) -> CalibrationInputs:
 
 
 def _say(config: Calibrate) -> Say:
-    return silent if config.quiet else lambda text: print(text, file=sys.stderr)
+    return silent if config.quiet else aloud

@@ -26,8 +26,9 @@ LAYER = {
 }
 """Layer of each part; a part may import parts of lower layers and itself."""
 
-BESIDE = {("bench", "cli"), ("cli.bench", "bench")}
-"""Benches run what verbs run, which lies in cli where there is no workflow yet; one verb runs the benches."""
+BESIDE = {("bench", "cli"), ("cli.bench", "bench"), ("deal_hw", "workflows")}
+"""Benches run what verbs run, which lies in cli where there is no workflow yet; one verb runs the benches.
+The package names its workflows and loads them on use."""
 
 ROOMS = {
     "calib": (

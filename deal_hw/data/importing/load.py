@@ -71,15 +71,26 @@ def load_tables(
     Raises:
         DatasetError: It cannot be read or understood.
     """
-    tables = []
     with reading(path, "a recording of a robot", "docs/import.md says what one holds"):
-        for number, channels in enumerate(read_channels(path)):
-            used = columns if columns is not None else guess_columns(channels, joints)
-            if say is not None:
-                _tell(say, channels, used, joints, columns is None and number == 0)
-            tables.append(build_table(channels, used, joints))
+        tables = tables_of(read_channels(path), columns, joints, say)
     if not tables:
         raise DatasetError(f"{path} holds no recording")
+    return tables
+
+
+def tables_of(
+    recordings: Sequence[Channels],
+    columns: ColumnMap | None = None,
+    joints: Sequence[str] | None = None,
+    say: Say | None = None,
+) -> list[Table]:
+    """Interpret channels, as :func:`load_tables` does with those of a file."""
+    tables = []
+    for number, channels in enumerate(recordings):
+        used = columns if columns is not None else guess_columns(channels, joints)
+        if say is not None:
+            _tell(say, channels, used, joints, columns is None and number == 0)
+        tables.append(build_table(channels, used, joints))
     return tables
 
 

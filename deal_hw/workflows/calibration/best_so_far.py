@@ -24,6 +24,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
+from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
@@ -71,14 +72,6 @@ def check_resume(path: Path, resume: bool) -> None:
         raise ConfigurationError(
             f"there is nothing to resume: {path} does not exist; leave --resume out to begin a calibration"
         )
-
-
-Say = Callable[[str], None]
-"""Called with a sentence for the user."""
-
-
-def silent(text: str) -> None:
-    """Say nothing."""
 
 
 class BestSoFar:

@@ -14,10 +14,10 @@ from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.best_so_far import Say, silent
 from deal_hw.workflows.calibration.policy import recorded_policy
 from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
 from deal_hw.workflows.calibration.walking import all_walk, weighed, while_walking
+from deal_hw.workflows.say import Say, silent
 from deal_hw.workflows.shipped import balancer
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from deal_hw.workflows.calibration.checks import (
     warn_of_gravity,
 )
 from deal_hw.workflows.calibration.recordings import (
+    Source,
     aligned,
     common_rates,
     divide,
@@ -31,6 +31,7 @@ from deal_hw.workflows.calibration.recordings import (
 )
 from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
 from deal_hw.workflows.options import Checked, Range
+from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
@@ -108,13 +109,14 @@ def write_parameters(config: Recordings) -> int:
 
 def prepare_model(
     config: Recordings,
-    holdout: Sequence[Path],
+    holdout: Sequence[Source],
     overrides: SpaceOverrides,
     *,
     std: Callable[[RobotModel], FloatArray | None],
+    data: Sequence[Source] = (),
     spikes: SpikeSettings = DEFAULT_SPIKES,
     threads: int | None = None,
-    quiet: bool = False,
+    say: Say = silent,
 ) -> CalibrationInputs:
     """Read and check everything that a calibration of any robot needs; nothing here takes long.
 
@@ -123,9 +125,10 @@ def prepare_model(
         holdout: Recordings that only judge the result.
         overrides: What the command line changes about the parameters.
         std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
+        data: More recordings to fit, also from memory.
         spikes: What counts as a spike.
         threads: Simulation threads.
-        quiet: Say nothing of what was guessed and warned of.
+        say: Called with sentences on what was guessed and what looks odd.
 
     Raises:
         ConfigurationError: A setting, the model or a parameter cannot be used.
@@ -143,22 +146,25 @@ def prepare_model(
         raise MissingExtraError(str(err.name), "calib") from err
 
     share = _holdout_share(config, holdout)
-    if config.model is None or not config.data:
+    data = (*config.data, *data)
+    if config.model is None or not data:
         raise ConfigurationError("--model needs recordings to fit: --data rec.csv [more ...]")
-    if both := sorted({p.resolve() for p in config.data} & {p.resolve() for p in holdout}):
+    files, judges = (
+        {Path(s).resolve() for s in some if isinstance(s, str | Path)} for some in (data, holdout)
+    )
+    if both := sorted(files & judges):
         raise ConfigurationError(
             f"{both[0]} is to be fitted and held out; a held-out recording must not be seen"
         )
-
-    def say(text: str) -> None:
-        if not quiet:
-            print(text, file=sys.stderr)
 
     model = compile_mjcf(config.model)
     space = _space(config, overrides, model)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
-    fitted, held = (read_tables(paths, columns, facts.names, say) for paths in (config.data, holdout))
+    fitted, held = (
+        read_tables(sources, columns, facts.names, say, name)
+        for name, sources in (("data", data), ("holdout", holdout))
+    )
     rates = common_rates([*fitted, *held], model, config.physics_step, config.window)
     description = describe(config.model, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
@@ -226,7 +232,7 @@ def method_for(work: CalibrationInputs, *, told: bool, real: bool) -> str:
     return "output-error" if real and work.robot.base is None and held else DEFAULT
 
 
-def _holdout_share(config: Recordings, holdout: Sequence[Path]) -> float:
+def _holdout_share(config: Recordings, holdout: Sequence[Source]) -> float:
     if holdout and config.holdout_part:
         raise ConfigurationError("give --holdout or --holdout-part, not both")
     if holdout:

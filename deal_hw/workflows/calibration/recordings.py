@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,13 +24,28 @@ STRETCH_S = 2.5
 HELDOUT_STRETCH_S = 20.0
 
 
-def read_tables(
-    paths: Sequence[Path], columns: ColumnMap | None, joints: Sequence[str], say: Callable[[str], None]
-) -> list[Table]:
-    """Return the recordings in files, in SI units, on their own stamps."""
-    from deal_hw.data.importing.load import load_tables
+Source = Path | str | Mapping[str, Any] | Any
+"""A recording: a file's path, or what is in memory (:mod:`deal_hw.data.importing.memory_source`)."""
 
-    return [table for path in paths for table in load_tables(path, columns, joints, say)]
+
+def read_tables(
+    sources: Sequence[Source],
+    columns: ColumnMap | None,
+    joints: Sequence[str],
+    say: Callable[[str], None],
+    name: str = "data",
+) -> list[Table]:
+    """Return recordings in SI units, on their own stamps; those in memory are called NAME[0], NAME[1], ..."""
+    from deal_hw.data.importing.load import load_tables, tables_of
+    from deal_hw.data.importing.memory_source import read_memory
+
+    tables: list[Table] = []
+    for number, source in enumerate(sources):
+        if isinstance(source, str | Path):
+            tables += load_tables(Path(source), columns, joints, say)
+        else:
+            tables += tables_of([read_memory(source, f"{name}[{number}]")], columns, joints, say)
+    return tables
 
 
 def common_rates(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import os
 import shutil
 import sys
@@ -29,13 +30,12 @@ from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.best_so_far import (
     SO_FAR,
     BestSoFar,
-    Say,
     keeping_best,
     open_checkpoint,
     saying_how_to_resume,
-    silent,
 )
 from deal_hw.workflows.options import Range
+from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
@@ -266,39 +266,56 @@ def residual_std(words: Sequence[str], robot: RobotModel) -> FloatArray | None:
     """
     if not words:
         return None
+    if len(words) == 1:
+        return residual_std_of(_number(words[0]), robot)
+    # A last word without a number is a joint that has none.
+    pairs = zip(words[::2], [*map(_number, words[1::2]), *([math.nan] * (len(words) % 2))], strict=True)
+    return residual_std_of(dict(pairs), robot)
+
+
+def residual_std_of(given: float | Mapping[str, float] | None, robot: RobotModel) -> FloatArray | None:
+    """Return what a prediction may be off, positions then velocities, (2 C,); None where it is not given.
+
+    Args:
+        given: One number for all joints of a fixed robot, or one for each name [rad or m].
+        robot: The robot.
+
+    Raises:
+        ConfigurationError: A number is missing, or is not above 0.
+        UnknownNameError: A joint is not known.
+    """
+    if given is None:
+        return None
     names = robot.description.joint_names + (("orientation", "gyro") if robot.base is not None else ())
-    single = len(words) == 1 and robot.base is None
-    given: dict[str, float] = {}
-    for name, word in [(name, words[0]) for name in names] if single else _pairs(words):
+    one = not isinstance(given, Mapping)
+    values = dict.fromkeys(names, given) if isinstance(given, float | int) else dict(given)
+    for name in values:
         if name not in names:
             raise UnknownNameError("joint", name, names)
-        given[name] = _positive(word)
-    if (len(words) % 2 and not single) or set(given) != set(names):
+    if (
+        set(values) != set(names)
+        or any(math.isnan(v) for v in values.values())
+        or (one and robot.base is not None)
+    ):
         whole = "" if robot.base is not None else "one number, or "
         raise ConfigurationError(
-            f"--residual-std {' '.join(words)}: give {whole}a name and a number for each of "
-            f"{', '.join(names)}"
+            f"--residual-std: give {whole}a name and a number for each of {', '.join(names)}"
         )
+    for value in values.values():
+        Range(1e-9, 1e3, "rad or m").check("--residual-std", float(value))
     C = len(robot.coordinates)
     std = np.ones(2 * C)
-    std[:C][robot.joints] = [given[name] for name in robot.description.joint_names]
+    std[:C][robot.joints] = [values[name] for name in robot.description.joint_names]
     if robot.base is not None:
-        std[:C][robot.rotation], std[C:][robot.rotation] = given["orientation"], given["gyro"]
+        std[:C][robot.rotation], std[C:][robot.rotation] = values["orientation"], values["gyro"]
     return std
 
 
-def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
-    # An odd word at the end is refused by the caller, which can say what was expected.
-    return list(zip(words[::2], words[1::2], strict=False))
-
-
-def _positive(word: str) -> float:
+def _number(word: str) -> float:
     try:
-        value = float(word)
+        return float(word)
     except ValueError as err:
         raise ConfigurationError(f"--residual-std: {word!r} is no number [rad or m]") from err
-    Range(1e-9, 1e3, "rad or m").check("--residual-std", value)
-    return value
 
 
 def finish(

@@ -11,7 +11,7 @@ import numpy as np
 from deal_hw.control.velocity_error import wanted_velocity
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
-from deal_hw.workflows.calibration.best_so_far import Say
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel

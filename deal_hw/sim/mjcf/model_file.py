@@ -1,0 +1,54 @@
+"""The MJCF of a model that is in memory, as a file: a calibration edits text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+
+
+def mjcf_file(model: Any, folder: Path) -> Path:
+    """Return the path of a model, or write what is in memory into a folder.
+
+    Args:
+        model: A path, an ``mujoco.MjSpec``, or the ``mujoco.MjModel`` that was compiled last: a compiled
+            model has lost its text, and MuJoCo can only write that of the last one.
+        folder: Where to write.
+
+    Raises:
+        ConfigurationError: It is something else, or another model than the last one.
+    """
+    if isinstance(model, str | Path):
+        return Path(model)
+    path = folder / "model.xml"
+    if isinstance(model, mujoco.MjSpec):
+        path.write_text(model.to_xml(), encoding="utf-8")
+        return path
+    if not isinstance(model, mujoco.MjModel):
+        raise ConfigurationError(
+            f"model is of type {type(model).__name__}; allowed are the path of an MJCF, an mujoco.MjSpec or "
+            "an mujoco.MjModel"
+        )
+    try:
+        mujoco.mj_saveLastXML(str(path), model)
+        again = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise ConfigurationError(f"the MjModel has no MJCF any more ({error}); {_INSTEAD}") from error
+    if not _same(model, again):
+        raise ConfigurationError(f"the MjModel is not the one that was compiled last; {_INSTEAD}")
+    return path
+
+
+_INSTEAD = "give the path of its MJCF, or its mujoco.MjSpec"
+
+
+def _same(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
+    """Return whether two models have the same joints and actuators, and masses to what XML rounds."""
+    sizes = ("nq", "nv", "nu", "nbody", "njnt", "ngeom")
+    if any(getattr(one, name) != getattr(other, name) for name in sizes) or one.names != other.names:
+        return False
+    return np.allclose(one.body_mass, other.body_mass, rtol=1e-5)

@@ -1,0 +1,302 @@
+"""``deal_hw.calibrate``: find the simulator parameters that explain recordings, from Python."""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.methods import check_method, usual_budget
+from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
+from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
+from deal_hw.workflows.calibration.recordings import Source
+from deal_hw.workflows.calibration.run import (
+    HELDOUT_WINDOW_S,
+    CalibrationInputs,
+    SpaceOverrides,
+    calibrate_episodes,
+    judged,
+    residual_std_of,
+)
+from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
+from deal_hw.workflows.say import Say, silent
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """What a calibration found.
+
+    Attributes:
+        result: Estimates, intervals, verdicts, alarms.
+        inputs: What was calibrated.
+        threads: Simulation threads of the report.
+    """
+
+    result: CalibrationResult
+    inputs: CalibrationInputs
+    threads: int | None = None
+
+    @property
+    def distribution(self) -> ParameterDistribution:
+        """What is known of the parameters now; a policy is trained under it."""
+        return self.result.distribution()
+
+    @property
+    def colour(self) -> str:
+        """Whether the result can be used: green, amber or red."""
+        from deal_hw.calib.validation.verdict import trust
+
+        return trust(self.result).colour
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row a parameter, and the latency: name, unit, nominal, estimate, low, high, verdict."""
+        result = self.result
+        verdicts = result.verdicts or ("",) * len(result.space)
+        rows: list[dict[str, Any]] = [
+            {
+                "parameter": p.name, "unit": p.unit, "nominal": p.nominal, "estimate": float(estimate),
+                "low": float(low), "high": float(high), "verdict": verdict,
+            }
+            for p, estimate, (low, high), verdict in zip(
+                result.space, result.estimate, result.interval, verdicts, strict=True
+            )
+        ]  # fmt: skip
+        low, high = result.latency_interval_s
+        latency = {"parameter": "latency", "unit": "s", "nominal": 0.0, "estimate": result.latency_s}
+        return [*rows, {**latency, "low": low, "high": high, "verdict": ""}]
+
+    def table(self) -> str:
+        """Return the parameters with their 90 % intervals, and what to think of them, as text."""
+        head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
+        body = [_cells(row) for row in self.rows()]
+        widths = [max(len(line[k]) for line in (head, *body)) for k in range(len(head))]
+        lines = [
+            "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
+            for line in (head, *body)
+        ]
+        return "\n".join([*lines, "", *self._words()])
+
+    def report(self, path: Path | str) -> Path:
+        """Write everything on one HTML page and return its path; takes some seconds.
+
+        Args:
+            path: The file; a folder gets ``report.html``.
+        """
+        from deal_hw.calib.report.page import REPORT, write_report
+
+        path = Path(path)
+        _, shown = judged(self.inputs, self.result, {}, page=True, advise=False, threads=self.threads)
+        assert shown is not None
+        write_report(path, shown)
+        return path / REPORT if path.is_dir() else path
+
+    def save_model(self, path: Path | str) -> Path:
+        """Write the calibrated MJCF and return its path.
+
+        Raises:
+            ConfigurationError: It is the model's own file, or a value cannot be written.
+        """
+        from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
+
+        path, robot, result = Path(path), self.inputs.robot, self.result
+        require_other(path, robot.description.mjcf)
+        source = f"method {result.method}, distribution {self.distribution.digest()}"
+        write_calibrated_mjcf(robot, result.space, result.estimate, path, result.latency_s, source)
+        return path
+
+    def save(self, folder: Path | str) -> dict[str, Path]:
+        """Write what ``deal-hw calibrate`` writes, but for the report, and return the files by name."""
+        from deal_hw.calib.report.page import write_result
+
+        return write_result(Path(folder), self.inputs.robot, self.result)
+
+    def _words(self) -> list[str]:
+        from deal_hw.calib.validation.verdict import trust
+
+        found = trust(self.result)
+        told = [f"the data cannot tell: {words}" for words in self.result.null_directions]
+        alarms = [f"alarm: {alarm}" for alarm in self.result.alarms]
+        return [f"{found.colour}: {found.sentence}", *told, *alarms]
+
+    def __repr__(self) -> str:
+        return f"<Calibration of {len(self.result.space)} parameters, {self.colour}; table() shows them>"
+
+    def _repr_html_(self) -> str:
+        head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
+        lines = [f"<tr>{''.join(f'<th>{html.escape(name)}</th>' for name in head)}</tr>"]
+        for row in self.rows():
+            lines.append(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in _cells(row))}</tr>")
+        words = "".join(f"<p>{html.escape(line)}</p>" for line in self._words())
+        return f"<table>{''.join(lines)}</table>{words}"
+
+
+def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    value = "no value" if row["verdict"] == "not identifiable" else f"{row['estimate']:.4g}"
+    return (
+        row["parameter"],
+        row["unit"],
+        f"{row['nominal']:.4g}",
+        value,
+        f"{row['low']:.4g} to {row['high']:.4g}",
+        row["verdict"],
+    )
+
+
+def calibrate(
+    model: Any = None,
+    data: Source | Sequence[Source] = (),
+    *,
+    dataset: Path | str | None = None,
+    holdout: Source | int | Sequence[Source | int] = (),
+    episodes: Sequence[int] = (),
+    columns: Path | str | None = None,
+    parameters: Path | str | None = None,
+    space: str = "",
+    free: Sequence[str] = (),
+    known: Mapping[str, float] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    range_ratio: float | None = None,
+    latency_s: float | None = None,
+    latency_range_s: tuple[float, float] = LATENCY_RANGE_S,
+    residual_std: float | Mapping[str, float] | None = None,
+    feet: Sequence[str] = (),
+    holdout_part: float | None = None,
+    fit_seconds: float = Recordings().fit_seconds,
+    heldout_window_s: float = HELDOUT_WINDOW_S,
+    method: str = DEFAULT,
+    refine: bool = True,
+    population: int | None = None,
+    generations: int | None = None,
+    policy: Path | str | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    say: Say = silent,
+) -> Calibration:
+    """Find the simulator parameters that explain recordings.
+
+    Args:
+        model: The robot's MJCF (path), ``mujoco.MjSpec`` or last compiled ``mujoco.MjModel``.
+        data: Recordings to fit: files (CSV, NPZ, MCAP, LeRobot folders), mappings of names to arrays, or data
+            frames. Positions [rad or m] (T, J), commands (T, A), time [s] (T,); see docs/import.md.
+        dataset: Instead of both, a dataset that ``deal-hw collect`` recorded.
+        holdout: What only judges the result: recordings, or episodes of the dataset.
+        episodes: Episodes of the dataset to fit; all but the held-out ones by default.
+        columns: Column map (YAML) of the recordings.
+        parameters: What to search (YAML); friction, damping, armature and gains by default.
+        space: Parameter set of the dataset's robot.
+        free: Search exactly these.
+        known: Values measured by other means, by name (SI).
+        ranges: Search ranges, low and high by name (SI).
+        range_ratio: Search a factor this to either side of the nominal values; by default as the parameter
+            set says, mostly 5.
+        latency_s: Total latency where it is known [s].
+        latency_range_s: Latencies that are searched otherwise [s].
+        residual_std: What a prediction may be off [rad, m], for all or by joint; the sensor noise by default.
+        feet: Sphere geoms of a floating robot's feet.
+        holdout_part: Without ``holdout`` this last share of each recording only judges; 0.25 by default.
+        fit_seconds: Most to fit, spread evenly over the recordings [s].
+        heldout_window_s: Held-out predictions restart this often [s].
+        method: Name of the method; the one that suits the recordings by default.
+        refine: Follow the search by multiple shooting on prediction error.
+        population: Members of the search; the method's usual number by default.
+        generations: Most generations of the search.
+        policy: The policy that moved the robot, for methods that run it (``deal-paper``).
+        seed: Fixes everything random.
+        threads: Simulation threads; all processors by default.
+        progress: Called with each :class:`~deal_hw.calibration.Progress`.
+        say: Called with sentences on what was guessed and found; ``print`` shows them.
+
+    Returns:
+        Estimates with intervals and verdicts; see :class:`Calibration`.
+
+    Raises:
+        DealHwError: A setting or a recording is unusable; nothing long was begun.
+    """
+    check_method(method)
+    if (dataset is None) == (model is None):
+        raise ConfigurationError(
+            "calibrate: name a model and its recordings (model=..., data=[...]), or a dataset (dataset=...), "
+            "not both"
+        )
+    overrides = SpaceOverrides(
+        free=tuple(free),
+        known=dict(known or {}),
+        ranges=[(name, low, high) for name, (low, high) in (ranges or {}).items()],
+        xi=range_ratio,
+    )
+    judges = _listed(holdout)
+    with contextlib.ExitStack() as kept:
+        if dataset is None:
+            from deal_hw.sim.mjcf.model_file import mjcf_file
+
+            scratch = Path(tempfile.mkdtemp(prefix="deal-hw-"))
+            kept.callback(shutil.rmtree, scratch, ignore_errors=True)
+            recordings = Recordings(
+                model=mjcf_file(model, scratch),
+                columns=None if columns is None else Path(columns),
+                parameters=None if parameters is None else Path(parameters),
+                feet=tuple(feet),
+                holdout_part=holdout_part,
+                fit_seconds=fit_seconds,
+            )
+            inputs = prepare_model(
+                recordings, judges, overrides, std=lambda robot: residual_std_of(residual_std, robot),
+                data=_listed(data), threads=threads, say=say,
+            )  # fmt: skip
+        else:
+            source = DatasetRecordings(
+                folder=Path(dataset),
+                episodes=tuple(episodes),
+                holdout=[_episode(one) for one in judges],
+                policy=None if policy is None else Path(policy),
+            )
+            inputs = prepare_dataset(source, space, overrides, method, say)
+        if method == DEFAULT:
+            told = residual_std is not None or not refine
+            method = method_for(inputs, told=told, real=dataset is None)
+        result = calibrate_episodes(
+            inputs.robot,
+            inputs.space,
+            inputs.episodes,
+            inputs.holdout,
+            method=method,
+            budget=usual_budget(method, population, generations, refine=refine),
+            rng=np.random.default_rng(seed),
+            latency_s=latency_s,
+            latency_range_s=latency_range_s,
+            threads=threads,
+            progress=progress,
+            say=say,
+            known_std=residual_std_of(residual_std, inputs.robot),
+            heldout_window_s=heldout_window_s,
+            policy=inputs.policy,
+            smoothing_s=GAIT_SMOOTHING_S if inputs.walks else None,
+        )
+        found = Calibration(result=result, inputs=inputs, threads=threads)
+        # The model's file is read again when the calibrated one is written.
+        weakref.finalize(found, kept.pop_all().close)
+    return found
+
+
+def _listed(given: Any) -> list[Any]:
+    """Return one recording, or several, as a list."""
+    alone = isinstance(given, str | Path | int | Mapping) or hasattr(given, "columns")
+    return [given] if alone else list(given)
+
+
+def _episode(number: Any) -> int:
+    if not isinstance(number, int):
+        raise ConfigurationError(f"holdout={number!r}: of a dataset name episodes by number")
+    return number

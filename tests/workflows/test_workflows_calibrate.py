@@ -1,0 +1,158 @@
+"""`deal_hw.calibrate`: recordings from files and from memory, what comes back, and what is refused."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import deal_hw
+from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, UnknownNameError
+from deal_hw.testing.plain_robots import make_robot, write
+from deal_hw.types import FloatArray
+
+ROOT = Path(__file__).resolve().parents[2]
+Arrays = dict[str, FloatArray]
+
+
+class Frame(dict[str, FloatArray]):
+    """As much of a data frame as is asked of one: columns, and a column by its name."""
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the columns."""
+        return list(self)
+
+
+def arrays_of(path: Path) -> Arrays:
+    """Return the columns of a CSV file."""
+    table = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
+    return {name: table[name] for name in table.dtype.names or ()}
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """A pendulum in plain MuJoCo: model, a recording to fit, one to judge by."""
+    model, fit, other = write(make_robot("pendulum", 0), tmp_path_factory.mktemp("p"), seconds=4.0)
+    return model, fit[0], other
+
+
+@pytest.fixture(scope="module")
+def found(pendulum: tuple[Path, Path, Path]) -> deal_hw.Calibration:
+    """Its calibration from arrays."""
+    model, fit, other = pendulum
+    return deal_hw.calibrate(model, arrays_of(fit), holdout=arrays_of(other), threads=1)
+
+
+def test_arrays_are_calibrated_like_their_file(
+    pendulum: tuple[Path, Path, Path], found: deal_hw.Calibration
+) -> None:
+    """The same estimates from the CSV file, through a path as text, and the truth inside its intervals."""
+    model, fit, other = pendulum
+    again = deal_hw.calibrate(str(model), [fit], holdout=[other], threads=1)
+    np.testing.assert_allclose(again.result.estimate, found.result.estimate, rtol=1e-9)
+    assert found.colour == "green"
+    errors = found.result.heldout_nrmse
+    assert errors["calibrated"] < errors["nominal"]
+
+
+def test_what_comes_back_is_shown_and_written(
+    found: deal_hw.Calibration, pendulum: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    """Rows, text, HTML, distribution, model and report agree with the result."""
+    rows = {row["parameter"]: row for row in found.rows()}
+    assert set(rows) == {*found.result.space.names, "latency"}
+    for p, value in zip(found.result.space, found.result.estimate, strict=True):
+        assert rows[p.name]["estimate"] == value
+        assert p.name in found.table() and p.name in found._repr_html_()
+    assert "green" in found.table() and "green" in repr(found)
+    assert found.distribution.digest() == found.result.distribution().digest()
+    path = found.save_model(tmp_path / "calibrated.xml")
+    written = mujoco.MjModel.from_xml_path(str(path))
+    damping = next(name for name in rows if name.endswith(".damping"))
+    assert written.dof_damping[0] == pytest.approx(rows[damping]["estimate"], rel=1e-4)
+    assert found.report(tmp_path) == tmp_path / "report.html"
+    assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert set(found.save(tmp_path / "all")) >= {"result.json", "distribution.json", "calibrated.xml"}
+    with pytest.raises(ConfigurationError, match="is the model itself"):
+        found.save_model(pendulum[0])
+
+
+def test_models_in_memory(pendulum: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    """A spec and the last compiled model are taken, an older model is refused, and so is anything else."""
+    model, fit, _ = pendulum
+    data = Frame(arrays_of(fit))
+    settings: dict[str, Any] = {"method": "nominal", "threads": 1, "holdout_part": 0.25}
+    by_spec = deal_hw.calibrate(mujoco.MjSpec.from_file(str(model)), data, **settings)
+    compiled = mujoco.MjModel.from_xml_path(str(model))
+    by_model = deal_hw.calibrate(compiled, [data], **settings)
+    np.testing.assert_allclose(by_model.result.estimate, by_spec.result.estimate)
+    assert by_model.save_model(tmp_path / "out.xml").is_file()
+    mujoco.MjModel.from_xml_string("<mujoco><worldbody><light/></worldbody></mujoco>")
+    with pytest.raises(ConfigurationError, match="give the path of its MJCF"):
+        deal_hw.calibrate(compiled, data, **settings)
+    with pytest.raises(ConfigurationError, match="model is of type int"):
+        deal_hw.calibrate(7, data, **settings)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ([3.0], r"data\[0\] is of type float; a recording is a file's path"),
+        ([{}], r"data\[0\] is empty"),
+        ([{"time": ["a", "b"]}], r"data\[0\]\['time'\] has shape \(2,\) and type <U1"),
+        ([{"time": np.zeros((2, 2, 2))}], r"has shape \(2, 2, 2\)"),
+        ([{"speed": np.zeros(5)}], "which channel is the time"),
+        ([], "needs recordings to fit"),
+    ],
+)
+def test_recordings_that_are_none_are_refused(
+    pendulum: tuple[Path, Path, Path], data: list[Any], words: str
+) -> None:
+    """Each says which recording, what was given and what is allowed."""
+    with pytest.raises(DealHwError, match=words):
+        deal_hw.calibrate(pendulum[0], data)
+
+
+def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, Path]) -> None:
+    """Unknown names are answered with the known ones."""
+    model, fit, _ = pendulum
+    with pytest.raises(ConfigurationError, match="or a dataset"):
+        deal_hw.calibrate()
+    with pytest.raises(ConfigurationError, match="not both"):
+        deal_hw.calibrate(model, fit, dataset="runs/first/dataset")
+    with pytest.raises(UnknownNameError, match="eki"):
+        deal_hw.calibrate(model, fit, method="gradient")
+    with pytest.raises(UnknownNameError, match="pivot"):
+        deal_hw.calibrate(model, fit, residual_std={"elbow": 0.01})
+    with pytest.raises(ConfigurationError, match="allowed are"):
+        deal_hw.calibrate(model, fit, residual_std=-1.0)
+    with pytest.raises(DatasetError, match="does not exist"):
+        deal_hw.calibrate(model, "missing.csv")
+
+
+def test_importing_the_package_loads_nothing() -> None:
+    """Neither MuJoCo, torch, scipy nor numpy before a workflow is called."""
+    code = (
+        "import sys, deal_hw; "
+        "print([n for n in ('mujoco', 'torch', 'scipy', 'numpy', 'tyro') if n in sys.modules], dir(deal_hw))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told.startswith("[] ") and "'calibrate'" in told
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        deal_hw.calibrat  # noqa: B018
+
+
+def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    """It ends with a table and a model, and is short enough to read at once."""
+    path = ROOT / "examples" / "calibrate_from_arrays.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 40
+    runpy.run_path(str(path))
+    told = capsys.readouterr().out
+    assert "shoulder" in told and "calibrated.xml" in told
