@@ -256,7 +256,7 @@ def _set_up(inside: socket.socket, interface: str, up: bool) -> None:
 def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
     """Return how soon a bridge that was killed damps once it is started again, and what it let through."""
     delays: list[float] = []
-    refused = 0
+    refused = admitted = 0
     with BridgeRig(folder, config.domain) as rig:
         for _ in range(config.restarts):
             with BridgeClient(rig.port, rig.options("controller")) as client:
@@ -270,10 +270,11 @@ def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
                 delays.append((rig.told()[-1][0] - begun_ns) * 1e-6)
                 client.hear(lambda: client.status.get("refused", {}).get("handover", 0) > 100)
                 refused += client.status["refused"]["handover"]
+                admitted += client.status["admitted"]
                 rig.await_commands([*told, "damping"])
     return {
         "from": "start of the new process to the first damping at the robot", **_spread(delays),
-        "old_stream_refused": refused, "old_stream_admitted": 0,
+        "old_stream_refused": refused, "old_stream_admitted": admitted,
     }  # fmt: skip
 
 
