@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,13 +17,13 @@ from deal_hw.cli.emulate_common import run_until, signalled
 from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.claim import LocalClaim
-from deal_hw.control.realtime import become_realtime
+from deal_hw.control.realtime import FIFO_PRIORITY, priority
 from deal_hw.drivers import claim_name
 from deal_hw.drivers.go2.bridge.bridge import COMMANDS, READABLE, Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.drivers.transports.dds_transport import DdsTransport
 from deal_hw.drivers.transports.zenoh_access import access_settings
-from deal_hw.drivers.transports.zenoh_session import parse_endpoints
+from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpoints
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.transport import WireOptions
@@ -109,25 +111,35 @@ def bridge(config: Bridge) -> int:
                 DdsTransport(config.port, clock, options), _network(config, port), clock, config.rules,
                 state_check=config.state_check, tell=_tell,
             )  # fmt: skip
-            # Two threads share the interpreter; neither may keep the other waiting for the usual 5 ms.
-            sys.setswitchinterval(SWITCH_S)
             # The transports' threads inherit the priority that holds when they are opened.
-            for warning in become_realtime().warnings:
-                print(f"warning: {warning}", file=sys.stderr)
-            made.open()
-            try:
-                print(f"port {port}", flush=True)
+            with priority(FIFO_PRIORITY, children=True, lock=True), _switching():
+                if os.sched_getscheduler(0) != os.SCHED_FIFO:
+                    _tell("warning: real-time priority was refused; damping may be late under load")
+                made.open()
+                try:
+                    print(f"port {port}", flush=True)
 
-                def step() -> bool:
-                    made.step()
-                    return True
+                    def step() -> bool:
+                        made.step()
+                        return True
 
-                run_until(step, stop, config.duration_s, config.parent)
-            finally:
-                made.close()
+                    run_until(step, stop, config.duration_s, config.parent)
+                finally:
+                    made.close()
     for line in summary(made):
         print(line, file=sys.stderr)
     return 0
+
+
+@contextlib.contextmanager
+def _switching() -> Iterator[None]:
+    """Let the interpreter's threads switch sooner: neither may keep the other waiting for the usual 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def _network(config: Bridge, port: str) -> ZenohTransport:
@@ -135,7 +147,10 @@ def _network(config: Bridge, port: str) -> ZenohTransport:
         listen=True, insecure=config.insecure, ca=config.ca, certificate=config.certificate, key=config.key
     )
     settings: Mapping[str, Any] = {}
-    if any(end.protocol == "tls" for end in parse_endpoints(port)):
+    endpoints = parse_endpoints(port)
+    # Before the robot's side is opened, and the robot perhaps damped.
+    check_security(endpoints, options)
+    if any(end.protocol == "tls" for end in endpoints):
         settings = access_settings(config.controllers, config.observers, write=COMMANDS, read=READABLE)
     else:
         default = {f.name: f.default for f in dataclasses.fields(Bridge)}
