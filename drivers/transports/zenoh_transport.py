@@ -78,7 +78,8 @@ class ZenohTransport(TopicTransport):
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._threads: list[threading.Thread] = []
-        self._arrived: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+        # No SimpleQueue: a signal that comes as its time-out ends makes it wait for ever (CPython 3.11).
+        self._arrived: queue.Queue[Message | None] = queue.Queue()
         self._lost = False
         self._heard_ns = 0
         # A daemon thread that is inside Zenoh when the interpreter ends makes the process abort, so close()
@@ -111,7 +112,7 @@ class ZenohTransport(TopicTransport):
         """
         if self._session is not None:
             return
-        self._arrived, self._lost = queue.SimpleQueue(), False
+        self._arrived, self._lost = queue.Queue(), False
         self._echoes = None if self._options.listen else Echoes()
         self._heard_ns = self._clock.now_ns()
         self._session = self._open_session()
@@ -263,7 +264,7 @@ class ZenohTransport(TopicTransport):
         self,
         topic: str,
         subscriber: zenoh.Subscriber[Handler[zenoh.Sample]],
-        arrived: queue.SimpleQueue[Message | None],
+        arrived: queue.Queue[Message | None],
     ) -> None:
         for sample in _until_closed(subscriber.recv):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
@@ -278,7 +279,7 @@ class ZenohTransport(TopicTransport):
     def _follow_links(
         self,
         events: zenoh.TransportEventsListener[Handler[zenoh.TransportEvent]],
-        arrived: queue.SimpleQueue[Message | None],
+        arrived: queue.Queue[Message | None],
     ) -> None:
         import zenoh
 
