@@ -169,6 +169,27 @@ def test_a_link_that_is_silent_is_made_anew_when_asked(endpoint: str) -> None:
         assert near.stream == second
 
 
+def test_signals_never_make_a_wait_endless(endpoint: str) -> None:
+    """One that comes in a wait's last moment: Python's SimpleQueue then waits for ever."""
+    seen = []
+
+    def note(*_: object) -> None:
+        seen.append(1)
+        assert len(seen) < 100_000, "the wait does not end"
+
+    with opened(ZenohTransport(endpoint, MonotonicClock(), LISTEN), STATE, COMMAND) as near:
+        before = signal.signal(signal.SIGALRM, note)
+        signal.setitimer(signal.ITIMER_REAL, 0.00037, 0.00037)
+        try:
+            for _ in range(1000):
+                with pytest.raises(TransportTimeoutError):
+                    near.receive(0.001)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+    assert seen
+
+
 def test_a_reader_that_stays_away_finds_the_newest(endpoint: str) -> None:
     """Of 2000 unread messages the last ones are kept, in order."""
     with opened(ZenohTransport(endpoint, options=LISTEN), STATE, COMMAND) as far:
