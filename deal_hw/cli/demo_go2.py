@@ -79,8 +79,9 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     with _emulated(config, "before") as robot:
         with stages.stage("walk udr", f"stand up, walk {PROFILE_S:g} s, lie down; {episodes} times"):
             walks["udr"] = robot.walk(udr, profile, PROFILE_S, folder.dataset, episodes)
-        with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities, to judge by"):
-            robot.walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
+        if not config.hung:
+            with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities, to judge by"):
+                robot.walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
     if config.hung:
         found, distribution = _on_stand(config, folder, stages)
     else:

@@ -49,7 +49,10 @@ def with_sensed_base(episode: Episode, robot: RobotModel, trajectory: Trajectory
     if body is None:
         raise ConfigurationError("the recording has no body's sensors")
     felt = Felt(trajectory.device_s, body.acceleration, trajectory.effort)
-    whole = all(np.isfinite(values).all() for values in (felt.acceleration, felt.effort))
+    # Efforts that are zero throughout are none: some sources have the column and never fill it.
+    whole = (
+        all(np.isfinite(values).all() for values in (felt.acceleration, felt.effort)) and felt.effort.any()
+    )
     return with_base(episode, robot, feet, body.orientation, body.angular_velocity, felt if whole else None)
 
 

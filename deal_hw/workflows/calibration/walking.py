@@ -57,7 +57,7 @@ def weighed(space: ParameterSpace, robot: RobotModel, trajectory: Trajectory, sa
         return space
     since_s = trajectory.receive_s - wanted.time_s[0]
     rows = (since_s > -WEIGHING_S) & (since_s < 0) & np.isfinite(trajectory.effort).all(axis=1)
-    if not rows.any():
+    if not rows.any() or not trajectory.effort[rows].any():
         return space
     whole = standing_mass(robot, body.orientation[rows], trajectory.position[rows], trajectory.effort[rows])
     mass = whole - float(robot.model.body_mass.sum() - robot.model.body(trunk).mass[0])
