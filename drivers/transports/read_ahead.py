@@ -28,7 +28,8 @@ class ReadAhead:
 
     def __init__(self, fd: int, clock: Clock) -> None:
         self._fd, self._clock = fd, clock
-        self._arrived: queue.SimpleQueue[tuple[int, bytes | OSError]] = queue.SimpleQueue()
+        # No SimpleQueue: a signal that comes as its time-out ends makes it wait for ever (CPython 3.11).
+        self._arrived: queue.Queue[tuple[int, bytes | OSError]] = queue.Queue()
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._run, name="tty read-ahead", daemon=True)
         self._thread.start()
