@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from deal_hw.calib.methods import CLOSED_LOOP_METHODS, check_method, usual_budget
+from deal_hw.calib.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, Progress
 from deal_hw.cli.calibrate_output import print_result, show_progress
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
@@ -30,6 +30,7 @@ from deal_hw.workflows.calibration.model import (
     prepare_model,
     write_parameters,
 )
+from deal_hw.workflows.calibration.policy import check_policy
 from deal_hw.workflows.calibration.run import (
     HELDOUT_WINDOW_S,
     CalibrateReport,
@@ -197,13 +198,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     if config.latency is not None:
         refuse(given(config, Calibrate(), ("latency_range",)), "--latency says the latency")
     check_method(config.method)
-    if config.method not in CLOSED_LOOP_METHODS:
-        refuse(given(config, Calibrate(), ("policy",)), f"--method {config.method} runs no policy")
-    elif source.model is not None:
-        raise ConfigurationError(
-            f"--method {config.method} runs the policy that moved the robot, which recordings of --model do "
-            "not name; use eki, deal or deal-paper-replay"
-        )
+    check_policy(config.method, given=config.policy is not None, model=source.model is not None)
     folder = _run_folder(config) / "calibration"
     checkpoint = folder / CHECKPOINT
     check_resume(checkpoint, config.resume)

@@ -20,6 +20,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
 from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
+from deal_hw.workflows.calibration.policy import check_policy
 from deal_hw.workflows.calibration.recordings import Source
 from deal_hw.workflows.calibration.run import (
     HELDOUT_WINDOW_S,
@@ -30,6 +31,7 @@ from deal_hw.workflows.calibration.run import (
     residual_std_of,
 )
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
+from deal_hw.workflows.options import refuse
 from deal_hw.workflows.say import Say, silent
 
 
@@ -230,6 +232,17 @@ def calibrate(
             "calibrate: name a model and its recordings (model=..., data=[...]), or a dataset (dataset=...), "
             "not both"
         )
+    of_model = {
+        "data": data,
+        "columns": columns,
+        "parameters": parameters,
+        "feet": feet,
+        "holdout_part": holdout_part,
+    }
+    of_dataset = {"episodes": episodes, "space": space}
+    others, where = (of_dataset, "dataset") if dataset is None else (of_model, "model")
+    refuse([name for name, value in others.items() if _given(value)], f"that goes with {where}=...")
+    check_policy(method, given=policy is not None, model=dataset is None)
     overrides = SpaceOverrides(
         free=tuple(free),
         known=dict(known or {}),
@@ -294,6 +307,10 @@ def _listed(given: Any) -> list[Any]:
     """Return one recording, or several, as a list."""
     alone = isinstance(given, str | Path | int | Mapping) or hasattr(given, "columns")
     return [given] if alone else list(given)
+
+
+def _given(value: Any) -> bool:
+    return value is not None and not (isinstance(value, str | list | tuple) and not value)
 
 
 def _episode(number: Any) -> int:

@@ -127,6 +127,18 @@ def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, P
         deal_hw.calibrate()
     with pytest.raises(ConfigurationError, match="not both"):
         deal_hw.calibrate(model, fit, dataset="runs/first/dataset")
+    with pytest.raises(
+        ConfigurationError, match=r"episodes would have no effect: that goes with dataset=\.\.\."
+    ):
+        deal_hw.calibrate(model, fit, episodes=[0])
+    with pytest.raises(
+        ConfigurationError, match=r"data, feet would have no effect: that goes with model=\.\.\."
+    ):
+        deal_hw.calibrate(None, fit, dataset="d", feet=["FL"])
+    with pytest.raises(ConfigurationError, match="eki runs no policy"):
+        deal_hw.calibrate(model, fit, method="eki", policy="pi.onnx")
+    with pytest.raises(ConfigurationError, match="which recordings of --model do not name"):
+        deal_hw.calibrate(model, fit, method="deal-paper")
     with pytest.raises(UnknownNameError, match="eki"):
         deal_hw.calibrate(model, fit, method="gradient")
     with pytest.raises(UnknownNameError, match="pivot"):

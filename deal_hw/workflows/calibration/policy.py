@@ -6,13 +6,35 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from deal_hw.calib.methods import CLOSED_LOOP_METHODS
 from deal_hw.control.velocity import FixedVelocity, make_source
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.workflows.options import refuse
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.policies.demonstration import PopulationDemonstration
+
+
+def check_policy(method: str, *, given: bool, model: bool) -> None:
+    """Check that a method and where the recordings come from go together.
+
+    Args:
+        method: Name of the method.
+        given: Whether a policy was named.
+        model: Whether the recordings are of a robot that the user's own MJCF describes.
+
+    Raises:
+        ConfigurationError: A policy would have no effect, or the method needs one that nobody knows.
+    """
+    if method not in CLOSED_LOOP_METHODS:
+        refuse(["--policy"] if given else [], f"--method {method} runs no policy")
+    elif model:
+        raise ConfigurationError(
+            f"--method {method} runs the policy that moved the robot, which recordings of --model do not "
+            "name; use eki, deal or deal-paper-replay"
+        )
 
 
 def recorded_policy(
