@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -17,6 +18,7 @@ from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
+from deal_hw.workflows.calibration.run import CalibrationInputs
 
 SHARE = 0.04
 """Standard deviation of each parameter before."""
@@ -82,8 +84,13 @@ def test_intervals_hold_what_other_windows_found(problem: Problem) -> None:
 def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
     """A method that is named stays, and so does the default of a robot that stands."""
     robot = load_model(DRIVER)
-    assert usual_method(Calibrate(quiet=True), robot, walks=True) == "gait"
-    assert usual_method(Calibrate(quiet=True), robot) == "default"
-    assert usual_method(Calibrate(quiet=True, method="eki"), robot, walks=True) == "eki"
+
+    def method(*, walks: bool, **settings: str) -> str:
+        work = cast("CalibrationInputs", SimpleNamespace(robot=robot, walks=walks))
+        return usual_method(Calibrate(quiet=True, **settings), work)  # type: ignore[arg-type]
+
+    assert method(walks=True) == "gait"
+    assert method(walks=False) == "default"
+    assert method(walks=True, method="eki") == "eki"
     assert make_method("gait", refine=True).name == "gait"
     assert GAIT.robust and GAIT.long_s < 0.4

@@ -83,7 +83,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
         holdout_part=0.0,
     )
     overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=None)
-    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1, quiet=True)
+    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1)
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
 

@@ -71,7 +71,7 @@ def checked(
         holdout_part=0.0,
     )
     overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=None)
-    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1, quiet=True)
+    work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1)
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = local_fit(problem, None)
     assert fit is not None

@@ -24,7 +24,8 @@ SEGMENT = Segment(**{f.name: getattr(RichConfig().segments[0], f.name) for f in 
 POSTURE = PostureConfig(fold_s=1.0, rise_s=2.0, settle_s=0.5, lie_s=1.5)
 FULL = RunPlan(
     robot="go2", transport="zenoh", profile="rich", policy="p.onnx", recording="r.mcap", seconds=7.5, seed=3,
-    dry_run=True, home=False, policy_digest="ab12", rich=RichConfig(segments=(SEGMENT, SEGMENT)), vigor=1.5,
+    dry_run=True, home=False, policy_digest="ab12", trust_calibration=True,
+    rich=RichConfig(segments=(SEGMENT, SEGMENT)), vigor=1.5,
     excite="multisine", port="tls/192.168.123.18:7447",
     wire=WireOptions(
         domain=4, listen=True, mode="peer", insecure=True, ca=Path("/etc/a.pem"), certificate=Path("b.pem"),

@@ -40,6 +40,7 @@ SIZES = {
     ("cartpole", "paper"): 11,
     ("go2", "default"): 24,
     ("go2", "paper"): 24,
+    ("go2", "walk"): 29,
     ("go2", "paper-swapped"): 24,
     ("go2_hung", "default"): 48,
     ("go2_hung", "biased"): 60,
