@@ -33,11 +33,10 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 from scipy.stats.qmc import Sobol
 
-from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
+from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.base import Coordinates, SearchLog
+from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
@@ -312,7 +311,7 @@ class _Bo(ScoredStepper):
 
     settings: BoSettings
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         # Now rather than after the first generation has been simulated.
         _require_botorch()
@@ -351,16 +350,12 @@ class _Bo(ScoredStepper):
 
 
 @dataclass(frozen=True)
-class BayesianOptimisation(ScoredSearch):
+class BayesianOptimisation(RangedSearch):
     """Bayesian optimisation of a pluggable fitness."""
 
     stepper = _Bo
     settings: BoSettings = field(default_factory=BoSettings)
     name: str = "bo"
-
-    def coordinates(self, problem: Problem) -> Coordinates:
-        """Return the coordinates in which this method searches."""
-        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
 
 
 def critic_return() -> BayesianOptimisation:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
+from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.base import SearchLog
+from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.resume import Kept, State
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
@@ -164,7 +164,7 @@ class _Cma(ScoredStepper):
 
     settings: CmaSettings
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         settings = self.settings
         usual = min(4 + int(3 * np.log(self.coordinates.count)), log.budget.population)
@@ -219,7 +219,7 @@ class _Cma(ScoredStepper):
 
 
 @dataclass(frozen=True)
-class Cma(ScoredSearch):
+class Cma(Search):
     """CMA-ES with restarts, inside the budget's population times generations."""
 
     name = "cma"

@@ -14,11 +14,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from deal_hw.calib.baselines.scored import ScoredSearch, ScoredStepper
+from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
-from deal_hw.calib.search.base import Coordinates, SearchLog
+from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calib.search.resume import Kept
 from deal_hw.errors import ConfigurationError
@@ -114,7 +113,7 @@ class EliteGaussian(Kept):
 class _Easi(ScoredStepper):
     settings: EasiSettings
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         settings = self.settings
         # The latency's coordinate is drawn without its margin, all others uniformly.
@@ -140,16 +139,12 @@ class _Easi(ScoredStepper):
 
 
 @dataclass(frozen=True)
-class Easi(ScoredSearch):
+class Easi(RangedSearch):
     """EASI: critic, elites and a diagonal Gaussian."""
 
     stepper = _Easi
     settings: EasiSettings = field(default_factory=EasiSettings)
     name: str = "easi"
-
-    def coordinates(self, problem: Problem) -> Coordinates:
-        """Return the coordinates in which this method searches."""
-        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
 
 
 def logarithmic() -> Easi:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -18,11 +17,6 @@ CHANGING = frozenset({"critic"})
 """Fitnesses that learn: numbers of different generations do not compare."""
 
 
-@dataclass(frozen=True)
-class ScoredSearch(Search):
-    """A search by a fitness."""
-
-
 class ScoredStepper(Stepper):
     """A run whose members are told one number each.
 
@@ -33,7 +27,7 @@ class ScoredStepper(Stepper):
     KEPT: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
     INTERVAL = "population spread, uncalibrated"
 
-    def __init__(self, log: SearchLog, rng: np.random.Generator, search: ScoredSearch) -> None:
+    def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)
         name = self.settings.fitness
         self._fitness = make_fitness(name, self.problem, rng, self.scoring())

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members
-from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.diffusion_evolution import DiffusionEvolution, DiffusionSettings
 from deal_hw.calib.deal_paper.fitness import FitnessSettings, make_fitness
-from deal_hw.calib.search.base import Coordinates, Search, SearchLog, Stepper
+from deal_hw.calib.search.base import Coordinates, RangedSearch, SearchLog, Stepper
 from deal_hw.calib.search.critic import CriticSettings
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import ConfigurationError
@@ -143,7 +142,7 @@ class _DealPaper(Stepper):
 
 
 @dataclass(frozen=True)
-class DealPaper(Search):
+class DealPaper(RangedSearch):
     """DEAL as published; the budget's population is N, its generations are T.
 
     Attributes:
@@ -154,10 +153,6 @@ class DealPaper(Search):
     settings: PaperSettings = field(default_factory=PaperSettings)
     name: str = "deal-paper"
     stepper = _DealPaper
-
-    def coordinates(self, problem: Problem) -> Coordinates:
-        """Return the coordinates in which this method searches."""
-        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
 
 
 def paper() -> DealPaper:

@@ -283,3 +283,11 @@ class Search(CalibrationMethod[Problem]):
                 state = {"log": log.save(), "search": stepper.save(), "generator": rng.bit_generator.state}
                 checkpoint.save(state)
         return stepper.result()
+
+
+class RangedSearch(Search):
+    """A search whose settings say in which range: ``linear`` and ``latency``, as in :class:`Coordinates`."""
+
+    def coordinates(self, problem: Problem) -> Coordinates:
+        """Return the coordinates in which this method searches."""
+        return Coordinates(problem, linear=self.settings.linear, latency=self.settings.latency)
