@@ -16,7 +16,6 @@ from typing import Any, Literal
 from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.bench.tasks import TASKS, make_case
-from deal_hw.calibration import Budget
 from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["honest", "mismatch", "paper"]
@@ -104,14 +103,13 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
 
     Without a population each method has its usual one.
     """
-    from deal_hw.calib.methods import usual_population
+    from deal_hw.calib.methods import usual_budget
 
     row: dict[str, Any] = {"bench": cell.protocol}
     row |= {name: getattr(cell, name) for name in KEY} | {"error": ""}
     if cell.protocol == "paper":
         row["note"] = PAPER_NOTE
-    members = population or usual_population(cell.method)
-    budget = Budget(population=members, generations=generations, refine=cell.refined)
+    budget = usual_budget(cell.method, population, generations, refine=cell.refined)
     try:
         case = make_case(
             cell.task, cell.profile, cell.seed, cell.xi, cell.space,

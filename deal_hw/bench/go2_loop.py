@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.rows import Cells, Row, per_parameter
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.demo_go2 import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
@@ -32,7 +32,7 @@ from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingFiles
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import required_policy
 
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
 WALKS: Final = 3
@@ -88,7 +88,7 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
 
 def recorded(truth: Truth, out: Path) -> Path:
     """Let the shipped policy walk the profile and another one, and record both; return the dataset."""
-    folder, policy = out / "dataset", _shipped()
+    folder, policy = out / "dataset", OnnxPolicy(required_policy("go2"))
     with Dataset.create_or_open(folder, DRIVER) as store:
         for name, script, seconds in (("profile", PROFILE, PROFILE_S), ("heldout", HELDOUT, HELDOUT_S))[
             len(store.episodes) :
@@ -116,15 +116,7 @@ def calibration_part(result: CalibrationResult, truth: Truth) -> Row:
         "latency_ms_true": truth.latency_ms,
         "latency_ms_found": 1e3 * result.latency_s,
         "alarms": [alarm.seen for alarm in result.alarms],
-        "per_parameter": {
-            name: {
-                "truth": float(values[k]),
-                "estimate": float(result.estimate[k]),
-                "low": float(result.interval[k, 0]),
-                "high": float(result.interval[k, 1]),
-            }
-            for k, name in enumerate(names)
-        },
+        "per_parameter": per_parameter(result, values),
     }
     nominal = {p.name: p.nominal for p in walk_space()}
     for kind in (*KINDS, "frictionloss", "friction"):
@@ -142,8 +134,8 @@ def policies_part(result: CalibrationResult, truth: Truth, steps: int, out: Path
     """Fine-tune the shipped policy in three ways, and let all four walk."""
     space = walk_space()
     values = np.array([truth.walk_parameters()[name] for name in space.names])
-    shipped = _shipped()
-    start = Path(str(shipped_policy("go2"))).with_suffix(".safetensors")
+    shipped = OnnxPolicy(required_policy("go2"))
+    start = shipped.path.with_suffix(".safetensors")
     under: Mapping[str, ParameterDistribution] = {
         "udr_more": udr_distribution("go2"),
         "calibrated": result.distribution(),
@@ -213,10 +205,3 @@ def summary(rows: Sequence[Row]) -> list[str]:
             f"average, better for {int((gains > 0).sum())} of {len(gains)}"
         )
     return lines
-
-
-def _shipped() -> OnnxPolicy:
-    found = shipped_policy("go2")
-    if found is None:
-        raise DealHwError("no walking policy is shipped for the Go2; tools/train_demo_policy.py makes it")
-    return OnnxPolicy(found)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.rows import Cells, Row, per_parameter
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
@@ -26,7 +26,7 @@ from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import required_policy
 
 TASK_EPISODES = 5
 SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")
@@ -79,15 +79,7 @@ def calibration_row(
         "alarms": [str(alarm) for alarm in result.alarms],
         "untold": untold,
         "null_directions": list(result.null_directions),
-        "per_parameter": {
-            p.name: {
-                "truth": float(d.theta[k]),
-                "estimate": float(result.estimate[k]),
-                "low": float(result.interval[k, 0]),
-                "high": float(result.interval[k, 1]),
-            }
-            for k, p in enumerate(d.space)
-        },
+        "per_parameter": per_parameter(result, d.theta),
         "refused_truths": d.refused,
         "vigors": list(d.vigors),
     }
@@ -146,10 +138,8 @@ def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[st
     if truth is None:
         raise ConfigurationError(f"{case.task} has no emulator to deploy on; only the cart-pole has")
     row: dict[str, Any] = {}
-    shipped = shipped_policy("cartpole")
-    if shipped is None:
-        raise DealHwError("no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it")
-    row["angle_error_udr"], row["cart_speed_udr"] = task_score(truth, OnnxPolicy(shipped))
+    shipped = OnnxPolicy(required_policy("cartpole"))
+    row["angle_error_udr"], row["cart_speed_udr"] = task_score(truth, shipped)
     oracle = ParameterDistribution.point(d.space, d.theta, d.latency_s)
     for name, distribution in (("retrained", result.distribution()), ("oracle", oracle)):
         start = time.perf_counter()

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from deal_hw.calibration import CalibrationResult
 from deal_hw.data.files import write_json
 from deal_hw.data.run_folder import git_commit, versions
 from deal_hw.errors import DatasetError, shown
 from deal_hw.reading import read_json
+from deal_hw.types import FloatArray
 
 FORMAT = "deal_hw.bench/1"
 
@@ -117,4 +119,14 @@ def describe_machine() -> dict[str, Any]:
         "load": list(os.getloadavg()),
         "versions": versions(),
         "git_commit": git_commit(),
+    }
+
+
+def per_parameter(result: CalibrationResult, theta: FloatArray) -> dict[str, dict[str, float]]:
+    """Return truth, (K,), estimate and interval of each parameter, by name."""
+    return {
+        name: {"truth": float(true), "estimate": float(found), "low": float(low), "high": float(high)}
+        for name, true, found, (low, high) in zip(
+            result.space.names, theta, result.estimate, result.interval, strict=True
+        )
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -27,7 +26,7 @@ from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpo
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import Checked, Range, refuse
+from deal_hw.workflows.options import Checked, Range, given, refuse
 
 ROBOTS = ("go2",)
 LOOPBACK_PORT = 7447
@@ -153,10 +152,8 @@ def _network(config: Bridge, port: str) -> ZenohTransport:
     if any(end.protocol == "tls" for end in endpoints):
         settings = access_settings(config.controllers, config.observers, write=COMMANDS, read=READABLE)
     else:
-        default = {f.name: f.default for f in dataclasses.fields(Bridge)}
-        named = [
-            f"--{name}" for name in ("controllers", "observers") if getattr(config, name) != default[name]
-        ]
+        default = Bridge(robot=config.robot, port=config.port)
+        named = given(config, default, ("controllers", "observers"))
         refuse(named, f"{port} has no TLS, so nobody's certificate is known; listen on tls/")
     return ZenohTransport(port, MonotonicClock(), options, settings)
 

@@ -40,7 +40,7 @@ from deal_hw.workflows.calibration.run import (
     finish,
     residual_std,
 )
-from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S, WALK_TELLS
+from deal_hw.workflows.calibration.walking import WALK_TELLS
 from deal_hw.workflows.options import Checked, Range, Ratio, Seed, Threads, given, refuse
 from deal_hw.workflows.say import Say, aloud, silent
 
@@ -238,7 +238,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             known_std=known_std,
             heldout_window_s=config.heldout_window,
             policy=work.policy,
-            smoothing_s=GAIT_SMOOTHING_S if work.walks else None,
+            smoothing_s=work.smoothing_s,
         )
     settings: dict[str, Any] = {
         "seed": config.seed,

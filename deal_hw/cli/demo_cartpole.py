@@ -15,30 +15,20 @@ from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.link import LinkOptions
 from deal_hw.cli.train import Train, train
 from deal_hw.data.run_folder import RunFolder
-from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import required_policy
 
 EPISODES = 3
 
 
 def check(config: Demo) -> None:
     """Refuse what cannot work. See :class:`deal_hw.cli.demo.Part`."""
-    _shipped()
-
-
-def _shipped() -> Path:
-    udr = shipped_policy("cartpole")
-    if udr is None:
-        raise ConfigurationError(
-            "no UDR policy is shipped for the cart-pole; tools/train_udr_policy.py makes it"
-        )
-    return udr
+    required_policy("cartpole")
 
 
 def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     """Collect, calibrate, train, deploy, inspect. See :class:`deal_hw.cli.demo.Part`."""
-    udr = _shipped()
+    udr = required_policy("cartpole")
     out, transport, episodes = config.folder, config.transport or "serial", config.episodes or EPISODES
     truth_file = out / "truth.json"
     options = (

@@ -29,7 +29,7 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import required_policy
 
 STEPS: Final = 300_000
 """Of the fine-tune: a minute of a processor."""
@@ -57,20 +57,11 @@ Script = tuple[tuple[float, tuple[float, float, float]], ...]
 
 def check(config: Demo) -> None:
     """Refuse what cannot work. See :class:`deal_hw.cli.demo.Part`."""
-    _shipped()
+    required_policy("go2")
     if _transport(config) not in PORTS:
         raise ConfigurationError(
             f"--transport {config.transport}: the Go2 is reached by {' or '.join(PORTS)}"
         )
-
-
-def _shipped() -> Path:
-    udr = shipped_policy("go2")
-    if udr is None:
-        raise ConfigurationError(
-            "no walking policy is shipped for the Go2; tools/train_demo_policy.py makes it"
-        )
-    return udr
 
 
 def _transport(config: Demo) -> str:
@@ -79,7 +70,7 @@ def _transport(config: Demo) -> str:
 
 def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     """Walk, calibrate, fine-tune, walk again, inspect. See :class:`deal_hw.cli.demo.Part`."""
-    udr = _shipped()
+    udr = required_policy("go2")
     out, episodes = config.folder, config.episodes or 1
     profile, heldout = write_script(out / "profile.csv", PROFILE), write_script(out / "heldout.csv", HELDOUT)
     walks: dict[str, _Walked] = {}

@@ -30,7 +30,6 @@ from deal_hw.workflows.calibration.run import (
     judged,
     residual_std_of,
 )
-from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
 from deal_hw.workflows.options import refuse
 from deal_hw.workflows.say import Say, silent
 
@@ -295,7 +294,7 @@ def calibrate(
             known_std=residual_std_of(residual_std, inputs.robot),
             heldout_window_s=heldout_window_s,
             policy=inputs.policy,
-            smoothing_s=GAIT_SMOOTHING_S if inputs.walks else None,
+            smoothing_s=inputs.smoothing_s,
         )
         found = Calibration(result=result, inputs=inputs, threads=threads)
         # The model's file is read again when the calibrated one is written.

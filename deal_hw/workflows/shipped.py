@@ -9,6 +9,7 @@ from typing import Final
 
 from deal_hw.control.behaviours import Behaviour, PolicyBehaviour
 from deal_hw.description import RobotDescription
+from deal_hw.errors import ConfigurationError
 
 SHIPPED: Final[Mapping[str, str]] = {"go2": "go2_walk"}
 """Shipped policies that are not called ROBOT_udr: the Go2's of that name is what benches excite it with."""
@@ -19,6 +20,19 @@ def shipped_policy(robot: str) -> Path | None:
     name = SHIPPED.get(robot, f"{robot}_udr")
     path = Path(str(resources.files("deal_hw.policies") / "assets" / f"{name}.onnx"))
     return path if path.is_file() else None
+
+
+def required_policy(robot: str) -> Path:
+    """Return the policy that is shipped for a robot.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    path = shipped_policy(robot)
+    if path is None:
+        tool = "train_udr_policy.py" if robot == "cartpole" else "train_demo_policy.py"
+        raise ConfigurationError(f"no policy is shipped for robot {robot!r}; tools/{tool} makes it")
+    return path
 
 
 def balancer(description: RobotDescription, policy: Path | None) -> Callable[[], Behaviour] | None:

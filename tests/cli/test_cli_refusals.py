@@ -20,7 +20,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pytest
 
-from deal_hw.cli import demo_cartpole as demo_module
 from deal_hw.cli.main import EXIT_ERROR, VERBS, main
 from deal_hw.cli.train import udr_distribution
 from deal_hw.cli.virtual import VirtualCartpole
@@ -29,6 +28,7 @@ from deal_hw.control.excitation_plan import ExcitationDesign, make_plan
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.workflows import shipped
 
 ARM = """
 <mujoco model="arm">
@@ -289,7 +289,7 @@ def test_a_demo_without_its_policy_says_how_to_make_it(
     refused: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A checkout in which the assets were left out."""
-    monkeypatch.setattr(demo_module, "shipped_policy", lambda robot: None)
+    monkeypatch.setattr(shipped, "shipped_policy", lambda robot: None)
     refused("demo --out new", "tools/train_udr_policy.py makes it")
 
 

@@ -73,11 +73,13 @@ def prepare_dataset(
     dataset = Dataset.open(source.folder)
     robot_name = dataset.description["name"]
     fit, holdout = choose_episodes(dataset, source.episodes, source.holdout)
+    space = overrides.apply(named_space(robot_name, space_name))
+    episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
     if method in CLOSED_LOOP_METHODS:
-        policy = recorded_policy(dataset, fit, recorded_description(robot_name), source.policy)
-    space = overrides.apply(named_space(robot_name, space_name))
-    recordings = {i: dataset.read(i).trajectory for i in (*fit, *holdout)}
+        runs = {i: episodes_read[i].metadata for i in fit}
+        policy = recorded_policy(dataset, runs, recorded_description(robot_name), source.policy)
+    recordings = {i: episode.trajectory for i, episode in episodes_read.items()}
     verdicts = {index: check(trajectory, source.spikes) for index, trajectory in recordings.items()}
     for index, found in verdicts.items():
         failed = [v.message for v in found if v.severity is Severity.FAIL]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,13 +38,16 @@ def check_policy(method: str, *, given: bool, model: bool) -> None:
 
 
 def recorded_policy(
-    dataset: Dataset, episodes: Sequence[int], description: RobotDescription, given: Path | None
+    dataset: Dataset,
+    runs: Mapping[int, Mapping[str, Any]],
+    description: RobotDescription,
+    given: Path | None,
 ) -> PopulationDemonstration:
     """Return the policy that moved the robot all through some episodes of a dataset.
 
     Args:
         dataset: The dataset.
-        episodes: The episodes.
+        runs: Metadata of the episodes, by number.
         description: Their robot.
         given: File of the policy; by default the copy that the dataset keeps.
 
@@ -56,14 +59,13 @@ def recorded_policy(
     from deal_hw.policies.demonstration import PopulationDemonstration
     from deal_hw.policies.onnx_runtime import OnnxPolicy
 
-    runs = {index: dataset.read(index).metadata for index in episodes}
     for index, run in runs.items():
         _refuse_other_motion(index, run)
     digests = {str(run.get("policy_digest", "")) for run in runs.values()}
     wishes = {str(run.get("velocity", "0,0,0")) for run in runs.values()}
     if len(digests) > 1 or len(wishes) > 1:
         raise InsufficientDataError(
-            f"episodes {', '.join(map(str, episodes))} were recorded with {len(digests)} policies and "
+            f"episodes {', '.join(map(str, runs))} were recorded with {len(digests)} policies and "
             f"{len(wishes)} wanted velocities; name episodes of one of each (--episodes)"
         )
     (digest,), (wish,) = digests, wishes

@@ -34,6 +34,7 @@ from deal_hw.workflows.calibration.best_so_far import (
     open_checkpoint,
     saying_how_to_resume,
 )
+from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
 from deal_hw.workflows.options import Range
 from deal_hw.workflows.say import Say, silent
 
@@ -79,6 +80,11 @@ class CalibrationInputs:
     name: str = ""
     walks: bool = False
     policy: PopulationPolicy | None = None
+
+    @property
+    def smoothing_s(self) -> float | None:
+        """Over how long start states are smoothed [s]; None for the usual time."""
+        return GAIT_SMOOTHING_S if self.walks else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
