@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -19,49 +18,32 @@ from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.rpc import Request, encode_request
 from deal_hw.drivers.go2.messages.wire import low_command_image, words_crc
 from deal_hw.drivers.transports.zenoh_stamps import Echo, read_stamp
-from deal_hw.errors import TransportError, TransportLostError, TransportTimeoutError
-from deal_hw.transport import Message, TopicTransport
+from deal_hw.errors import TransportError, TransportLostError
+from deal_hw.testing.memory_wire import MemoryWire
+from deal_hw.transport import Message
 
 ZERO = np.zeros(12)
 DAMPING = LowCommandEncoder().encode(LowCommand(ZERO, ZERO, ZERO, np.full(12, 5.0), ZERO))
 
 
-class Network(TopicTransport):
-    """The clients' side: what they say is a list, and so is what they hear."""
+class Network(MemoryWire):
+    """The clients' side, in the bridge's time; it may be in use by another program."""
 
     port = "network"
 
     def __init__(self, clock: VirtualClock) -> None:
+        super().__init__()
         self._clock = clock
-        self.arriving: deque[Message] = deque()
-        self.sent: list[Message] = []
-        self.is_open = self.broken = False
-
-    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        self.published = set(publish)
 
     def open(self) -> None:
         if self.broken:
             raise TransportError("in use")
-        self.is_open = True
-
-    def close(self) -> None:
-        self.is_open = False
-
-    def send(self, message: Message) -> None:
-        assert message.channel in self.published
-        if self.broken:
-            raise TransportLostError("cut")
-        self.sent.append(message)
+        super().open()
 
     def receive(self, timeout_s: float) -> Message:
-        if self.arriving:
-            return self.arriving.popleft()
-        self._clock.advance_ns(round(timeout_s * 1e9))
-        raise TransportTimeoutError("nothing")
-
-    def writers(self, topic: str) -> tuple[str, ...]:
-        return ()
+        if not self.arriving:
+            self._clock.advance_ns(round(timeout_s * 1e9))
+        return super().receive(timeout_s)
 
 
 class Bench:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import deque
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -24,47 +22,13 @@ from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder, decode_low_state
 from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_request
-from deal_hw.errors import ConfigurationError, TransportLostError, TransportTimeoutError, UnknownNameError
-from deal_hw.transport import Message, TopicTransport, WireOptions
+from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
+from deal_hw.testing.memory_wire import MemoryWire
+from deal_hw.transport import Message, WireOptions
 
 MS = 1_000_000
 ZERO = np.zeros(12)
 STAND = LowCommandEncoder().encode(LowCommand(STANDING, ZERO, np.full(12, 60.0), np.full(12, 5.0), ZERO))
-
-
-class MemoryWire(TopicTransport):
-    """The robot's end of a wire whose other end is two lists."""
-
-    def __init__(self) -> None:
-        self.published: set[str] = set()
-        self.subscribed: set[str] = set()
-        self.arriving: deque[Message] = deque()
-        self.sent: list[Message] = []
-        self.is_open = self.broken = False
-
-    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        self.published |= set(publish)
-        self.subscribed |= set(subscribe)
-
-    def open(self) -> None:
-        self.is_open = True
-
-    def close(self) -> None:
-        self.is_open = False
-
-    def send(self, message: Message) -> None:
-        assert message.channel in self.published
-        if self.broken:
-            raise TransportLostError("cut")
-        self.sent.append(message)
-
-    def receive(self, timeout_s: float) -> Message:
-        if not self.arriving:
-            raise TransportTimeoutError("nothing")
-        return self.arriving.popleft()
-
-    def writers(self, topic: str) -> tuple[str, ...]:
-        return ()
 
 
 class Bench:
