@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import abc
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import ClassVar
+
+from typing_extensions import Self
 
 from deal_hw.description import RobotDescription
 from deal_hw.transport import Message

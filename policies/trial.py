@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from multiprocessing.connection import Pipe
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
+from typing_extensions import Self
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.behaviours import PolicyBehaviour

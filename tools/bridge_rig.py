@@ -9,7 +9,7 @@ import signal
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from bridge_client import PATIENCE_S
 
@@ -23,14 +23,16 @@ from deal_hw.transport import WireOptions
 
 def make_keys(folder: Path, *addresses: str) -> None:
     """Make the certificates of ``deal-hw keys make``, and one that has expired, named ``expired``."""
-    now = datetime.datetime.now(datetime.UTC)
+    now = datetime.datetime.now(datetime.timezone.utc)
     make(Make(out=folder, robot=addresses, days=30), now)
     sign(folder, "expired", addresses=(), days=1, now=now - datetime.timedelta(days=2))
 
 
 def wire(folder: Path, name: str) -> WireOptions:
     """Return the options of who holds a certificate; of nobody in particular for ""."""
-    own = {"certificate": folder / f"{name}.pem", "key": folder / f"{name}.key"} if name else {}
+    own: dict[str, Any] = (
+        {"certificate": folder / f"{name}.pem", "key": folder / f"{name}.key"} if name else {}
+    )
     return WireOptions(ca=folder / "ca.pem", **own)
 
 

@@ -83,7 +83,7 @@ def _command() -> Callable[[int], bytes]:
 
 
 def _command_number(payload: bytes) -> int:
-    return round(decode_low_command(payload).position[0])
+    return round(float(decode_low_command(payload).position[0]))
 
 
 def main() -> int:

@@ -25,6 +25,7 @@ import argparse
 import itertools
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,7 +68,7 @@ def convert(source: Path, out: Path, parts: int = 1) -> list[Path]:
     paths = []
     for number, (first, last) in enumerate(itertools.pairwise(edges), start=1):
         paths.append(out / (f"{source.stem}_part{number}.npz" if parts > 1 else f"{source.stem}.npz"))
-        rows = {key: values[first:last] for key, values in arrays.items()}
+        rows: dict[str, Any] = {key: values[first:last] for key, values in arrays.items()}
         np.savez_compressed(paths[-1], joint_names=np.array(JOINTS), **rows)
     lines = "".join(f"  - {joint}\n" for joint in JOINTS)
     (out / "columns.yaml").write_text(COLUMNS + lines, encoding="utf-8")

@@ -173,8 +173,8 @@ def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> l
         case "untouched":
             found += [told] if (told := rig.untouched(report)) else []
         case "unhomed":
-            told = [what for _, what in rig.changes(report) if what in rig.active | rig.inactive]
-            found += [f"the motors were told {told}"] if told else []
+            commanded = [what for _, what in rig.changes(report) if what in rig.active | rig.inactive]
+            found += [f"the motors were told {commanded}"] if commanded else []
         case "stiff":
             found += [f"it ends {end['ends']}"] if end["ends"] != "active" else []
     if rig.run.returncode not in case.codes:

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -277,10 +278,11 @@ def main() -> int:
         work(*given.work)
         return 0
     failures: list[str] = []
-    for what, run in (
+    parts: tuple[tuple[str, Callable[[], tuple[collections.Counter[str], list[str]]]], ...] = (
         ("specs", lambda: fuzz_specs(given.specs, given.seed)),
         ("networks", lambda: fuzz_networks(given.networks, given.seed, given.every)),
-    ):
+    )
+    for what, run in parts:
         begun = time.perf_counter()
         outcomes, wrong = run()
         failures += wrong

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import ast
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
+
+import tomllib
 
 When = Literal["load", "call", "types", "text"]
 """When an import happens: as its module loads, as a function runs, never (under ``TYPE_CHECKING``, for type

@@ -59,7 +59,10 @@ def _late_cycles(recording: Episode) -> list[tuple[int, int]]:
     for index in np.flatnonzero(skipped) + 1:
         # The recorded deadline is that of the grid's cycle that was run; the skipped ones were due before it.
         due_s = cycles.deadline_s[index] - skipped[index - 1] / RATE_HZ
-        late.append(tuple(recording.start_ns + round(float(t) * 1e9) for t in (due_s, cycles.start_s[index])))
+        due_ns, start_ns = (
+            recording.start_ns + round(float(t) * 1e9) for t in (due_s, cycles.start_s[index])
+        )
+        late.append((due_ns, start_ns))
     return late
 
 

@@ -44,7 +44,7 @@ def main() -> int:
     options = _options()
     result: dict[str, Any] = {
         **describe_call("tools/measure_go2_calibration.py"),
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         "rows": [],
     }
     for seed in options.seeds:

@@ -9,7 +9,8 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+
+from typing_extensions import Self
 
 from deal_hw.errors import TransportError
 

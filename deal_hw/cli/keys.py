@@ -86,7 +86,7 @@ def keys(config: Make | Add | Show) -> int:
         ConfigurationError: A name or address is none, or a file is there.
         MissingExtraError: cryptography is not installed.
     """
-    now = datetime.datetime.now(datetime.UTC)
+    now = datetime.datetime.now(datetime.timezone.utc)
     if isinstance(config, Show):
         return _show(config.folder, now)
     if isinstance(config, Add):

@@ -9,7 +9,8 @@ import socket
 import struct
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+
+from typing_extensions import Self
 
 from deal_hw.errors import PortBusyError
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
+from deal_hw.child_process import own_process_group
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
 from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
@@ -164,7 +165,7 @@ class Supervisor:
                 [sys.executable, "-m", self._module],
                 pass_fds=inherited,
                 stdin=subprocess.PIPE,
-                process_group=0,
+                **own_process_group(),
             )
         self._child = child
         if self._recorder is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
@@ -20,6 +21,19 @@ from deal_hw.reading import read_bytes, reading
 
 MAX_EPISODE_BYTES = 4 << 30
 """An episode is read into memory as a whole; a Go2 with its raw bytes records 0.7 MB/s at most [B]."""
+
+
+def sha256_of(path: Path) -> hashlib._Hash:
+    """Return the SHA-256 hash of a file's contents; the file is read in parts.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    found = hashlib.sha256()
+    with open(path, "rb") as file:
+        while part := file.read(1 << 20):
+            found.update(part)
+    return found
 
 
 def read_episode_bytes(path: Path) -> bytes:

@@ -8,7 +8,9 @@ import socket
 import struct
 import threading
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal
+
+from typing_extensions import Self
 
 from deal_hw.control.realtime import TRANSPORT_PRIORITY, priority
 

@@ -176,7 +176,7 @@ class OdriveLink:
         if self._encoder.fault:
             return self._encoder.fault
         if self._armed and self._axis_errors:
-            names = ", ".join(flag.name or "" for flag in self._axis_errors)
+            names = ", ".join(flag.name or "" for flag in AxisError if flag in self._axis_errors)
             return (
                 f"the ODrive reports {names or hex(self._axis_errors)}; look it up in ODrive's documentation"
             )

@@ -9,6 +9,7 @@ import pytest
 
 from deal_hw.bench import go2_loop
 from deal_hw.cli.bench import Bench
+from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.errors import ConfigurationError
 
 
@@ -42,7 +43,13 @@ def test_a_row_in_words_names_its_error_or_its_policies() -> None:
 
 def test_cells_are_told_apart_by_what_they_measure(tmp_path: Path) -> None:
     """A seed without training is another cell than the same with it."""
-    some = {"profile": "sensor", "seeds": [0, 1], "steps": 10, "folder": tmp_path, "threads": 1}
+    some: dict[str, Any] = {
+        "profile": "sensor",
+        "seeds": [0, 1],
+        "steps": 10,
+        "folder": tmp_path,
+        "threads": 1,
+    }
     trained, plain = (go2_loop.cells(**some, train=train) for train in (True, False))
     assert [cell for cell, _ in trained.runs] == [("sensor", 0, 10), ("sensor", 1, 10)]
     assert [cell for cell, _ in plain.runs] == [("sensor", 0, 0), ("sensor", 1, 0)]
@@ -71,6 +78,6 @@ def test_a_walk_tells_gains_payload_and_what_is_to_come(
     assert found["payload_error_kg"] == pytest.approx(0.0, abs=0.3)
     assert found["velocity_error_udr"] < 0.2 and found["falls_udr"] == 0
     # Resumed, it takes the recordings that are there.
-    assert go2_loop.recorded(go2_loop.draw_truth("realistic", 4), tmp_path / "realistic_4") == (
+    assert go2_loop.recorded(draw_truth("realistic", 4), tmp_path / "realistic_4") == (
         tmp_path / "realistic_4" / "dataset"
     )

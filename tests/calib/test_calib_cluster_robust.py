@@ -51,8 +51,8 @@ def test_sandwich_equals_the_textbook_up_to_its_small_sample_factor() -> None:
     design = rng.normal(size=(30, 10, 3))
     errors = rng.normal(size=(30, 10)) + rng.normal(size=(30, 1))
     flat, y = design.reshape(-1, 3), errors.ravel()
-    bread = np.linalg.inv(flat.T @ flat)
-    left = (y - flat @ (bread @ flat.T @ y)).reshape(30, 10)
+    bread = np.asarray(np.linalg.inv(flat.T @ flat), dtype=np.float64)
+    left = np.asarray((y - flat @ (bread @ flat.T @ y)).reshape(30, 10), dtype=np.float64)
     score = np.einsum("whp,wh->wp", design, left)
     textbook = bread @ (score.T @ score) @ bread
     # White noise leaves residuals with covariance I - P; block by block, with full matrices.

@@ -29,7 +29,7 @@ DAMPING = 2.0
 
 def _motion() -> tuple[FloatArray, FloatArray]:
     """Return velocity and acceleration of a joint that stirs, (W, H) [rad/s, rad/s^2]."""
-    t = (np.arange(WINDOWS * SAMPLES) * PERIOD_S).reshape(WINDOWS, SAMPLES)
+    t = (np.arange(WINDOWS * SAMPLES, dtype=np.float64) * PERIOD_S).reshape(WINDOWS, SAMPLES)
     velocity, acceleration = np.zeros_like(t), np.zeros_like(t)
     for f, a, phase in ((0.9, 0.4, 0.0), (2.3, 0.3, 1.0), (4.1, 0.1, 2.0)):
         w = 2 * np.pi * f
@@ -85,7 +85,7 @@ def _evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Eviden
         found=_signatures(),
         answers=(),
         period_s=PERIOD_S,
-        time_s=[(np.arange(WINDOWS * SAMPLES) * PERIOD_S).reshape(WINDOWS, SAMPLES)],
+        time_s=[(np.arange(WINDOWS * SAMPLES, dtype=np.float64) * PERIOD_S).reshape(WINDOWS, SAMPLES)],
     )
 
 

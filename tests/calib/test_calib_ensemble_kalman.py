@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -30,8 +32,8 @@ def test_single_step_by_hand() -> None:
     """One coordinate, members -1 and 1, prediction g = z, recording y = 3: with a = 1, gain 2 / (2 + 1)."""
 
     class NoNoise(np.random.Generator):
-        def standard_normal(self, size: object = None, dtype: object = None, out: object = None) -> object:
-            return np.zeros(size)  # type: ignore[call-overload]
+        def standard_normal(self, size: Any = None, dtype: Any = None, out: Any = None) -> Any:
+            return np.zeros(size)
 
     kalman = EnsembleKalman(np.array([[-1.0], [1.0]]), NoNoise(np.random.PCG64(0)), step_clip=np.inf)
     # Sample variance of z and of g is 2. Misfits are 8 and 2: mean 5, variance 9; the controller allows

@@ -32,7 +32,7 @@ class Pull:
 
     def residual(self, value: np.ndarray) -> np.ndarray:
         """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""
-        return value + np.array([0.5, 1.0])
+        return np.asarray(value + np.array([0.5, 1.0]))
 
     def jacobian(self, value: np.ndarray) -> np.ndarray:
         """See :class:`deal_hw.calib.fit.solver.LeastSquares`."""

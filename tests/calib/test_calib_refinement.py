@@ -59,7 +59,7 @@ def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: Ca
     Refined from there the answer is up to 190 % off, at a chi2 of 1.68 instead of 0.92.
     """
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
-    best = refine(problem, noisy.theta, noisy.truth.latency_s)
+    best = refine(problem, noisy.theta, noisy.latency_s)
     search = FixedSearch(problem.space.center, 1e-3, 0.05)
     run = CalibrationRun(
         problem=problem,
@@ -76,9 +76,9 @@ def test_a_search_that_ends_worse_than_the_local_fit_is_not_the_answer(noisy: Ca
 def test_only_the_first_search_is_brief(noisy: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a brief search leaves unexplained is searched for to the end, and that search is compared."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
-    refined = dataclasses.replace(refine(problem, noisy.theta, noisy.truth.latency_s), chi2=9.0)
+    refined = dataclasses.replace(refine(problem, noisy.theta, noisy.latency_s), chi2=9.0)
     monkeypatch.setattr(pipeline, "from_search", lambda run, searched: refined)
-    search = FixedSearch(noisy.theta, noisy.truth.latency_s, 0.05)
+    search = FixedSearch(noisy.theta, noisy.latency_s, 0.05)
     run = CalibrationRun(
         problem=problem,
         budget=Budget(population=8, generations=60),
@@ -98,7 +98,7 @@ def test_refinement_recovers_an_ideal_robot_exactly(ideal: Case) -> None:
     start = ideal.theta * np.exp(0.1 * np.cos(np.arange(9)))
     found = refine(problem, start, 1e-3)
     assert error_percent(found.theta, ideal.theta) < 0.01
-    assert abs(found.latency_s - ideal.truth.latency_s) < 1e-6
+    assert abs(found.latency_s - ideal.latency_s) < 1e-6
     assert found.chi2 < 2.0
 
 
@@ -111,11 +111,11 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None
         stages.append(p.stage)
 
     method = Calibration(
-        FixedSearch(noisy.theta, noisy.truth.latency_s + 1e-3, 0.05), settings=Validation(local_first=False)
+        FixedSearch(noisy.theta, noisy.latency_s + 1e-3, 0.05), settings=Validation(local_first=False)
     )
     result = method.run(problem, Budget(), np.random.default_rng(0), watch)
     assert error_percent(result.estimate, noisy.theta) < 3.0
-    assert abs(result.latency_s - noisy.truth.latency_s) < 1.1e-3
+    assert abs(result.latency_s - noisy.latency_s) < 1.1e-3
     inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
     assert inside.sum() >= 7
     assert result.alarms == ()
@@ -126,7 +126,7 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None
 def test_heldout_error_falls_far_below_nominal(noisy: Case) -> None:
     """On another motion family the true parameters predict four times better than the nominal ones."""
     held_out = HeldOut(noisy.robot, noisy.space, [noisy.heldout], threads=1, truth=[noisy.heldout_truth])
-    truth = (noisy.theta, noisy.truth.latency_s)
+    truth = (noisy.theta, noisy.latency_s)
     errors = held_out.errors({"nominal": (noisy.space.nominal, 0.0), "truth": truth}).nrmse
     assert errors["truth"] < 0.25 * errors["nominal"]
     assert errors["truth"] < errors["null"]
@@ -151,8 +151,11 @@ def test_white_noise_is_measured_under_motion() -> None:
 def test_timing_jitter_is_told_from_noise() -> None:
     """Samples off by up to 2 ms (std 0.816 ms) beside 1 mrad of noise are found, and none where none is."""
     rng = np.random.default_rng(1)
-    t = np.arange(1600) * 5e-3
-    swing = lambda s: 1.5 * np.sin(2 * np.pi * 0.8 * s)  # noqa: E731
+    t = np.arange(1600, dtype=np.float64) * 5e-3
+
+    def swing(at: FloatArray) -> FloatArray:
+        return np.asarray(1.5 * np.sin(2 * np.pi * 0.8 * at))
+
     speed = (1.5 * 2 * np.pi * 0.8 * np.cos(2 * np.pi * 0.8 * t))[:, None]
     jitter = rng.integers(0, 3, t.size) * 1e-3
     noise = rng.normal(0, 1e-3, t.size)
@@ -200,9 +203,8 @@ def test_k11_names_its_null_directions_on_real_information(noisy: Case) -> None:
     """With nothing weighed, two combinations are invisible; each names a mass, together nearly all."""
     space = parameter_space().with_ratio(5.0)
     problem = Problem(noisy.robot, space, [noisy.fit], threads=1)
-    theta = np.array([noisy.truth.parameters[name] for name in space.names])
     shooting = Shooting(problem, 80)
-    start = shooting.start(theta, noisy.truth.latency_s, [noisy.fit_truth])
+    start = shooting.start(noisy.theta, noisy.latency_s, [noisy.fit_truth])
     hessian = shooting.normal(start, stretch=SETTINGS.near, central=True).hessian
     words = _unseen(space, hessian[:-1, :-1])
     assert len(words) == 2

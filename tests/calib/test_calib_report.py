@@ -67,12 +67,13 @@ def inputs(found: CalibrationResult, channels: int = 2, samples: int = 200, name
     overlays = tuple(
         Overlay(
             title=f"{name} {heldout}", heldout=heldout, names=names, units=("rad",) * channels,
-            time_s=np.arange(samples) * 0.01, real=real, nominal=real + 1, calibrated=real, window_s=0.2,
+            time_s=np.arange(samples, dtype=np.float64) * 0.01, real=real, nominal=real + 1,
+            calibrated=real, window_s=0.2,
         )
         for heldout in (False, True)
     )  # fmt: skip
     whitened = rng.normal(size=(samples // 20, 20, channels))
-    time = np.arange(samples).reshape(-1, 20) * 0.01
+    time = np.arange(samples, dtype=np.float64).reshape(-1, 20) * 0.01
     residuals = (Residuals(title=name, names=names, time_s=time, whitened=whitened),)
     return ReportInputs(robot=name, result=found, overlays=overlays, residuals=residuals, tick_s=1e-3)
 

@@ -193,7 +193,8 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     """A real SIGINT while a file is written: all files are there, that is said, and the status is 130."""
     hooks = {"report.html": (page, "write_report"), "moving": (shutil, "move")}
     where, name = hooks[moment]
-    real, pressed = getattr(where, name), []
+    real = getattr(where, name)
+    pressed: list[Any] = []
 
     def interrupted(*arguments: Any, **named: Any) -> Any:
         if not pressed:

@@ -77,7 +77,7 @@ def test_links_are_judged_by_what_ip_tells(
     done = subprocess.CompletedProcess([], 0, stdout=json.dumps(links))
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: done)
     monkeypatch.setattr(doctor_can, "can_links", lambda: ["can0"])
-    monkeypatch.setattr(doctor_can.shutil, "which", lambda name: "/sbin/ip")
+    monkeypatch.setattr("shutil.which", lambda name: "/sbin/ip")
     finding = next(iter(doctor_can.list_adapters()))
     assert finding.level is level
     assert words in finding.remedy

@@ -142,7 +142,7 @@ def leg_distance(joints: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
             of_leg[body[:2]].append(geom)
     pairs = [(a, b) for i, one in enumerate(LEGS) for other in LEGS[i + 1 :]
              for a in of_leg[one] for b in of_leg[other]]  # fmt: skip
-    return min(mujoco.mj_geomDistance(model, data, a, b, 0.5, None) for a, b in pairs)
+    return float(min(mujoco.mj_geomDistance(model, data, a, b, 0.5, None) for a, b in pairs))
 
 
 def test_legs_stay_apart_wherever_an_excitation_takes_them() -> None:

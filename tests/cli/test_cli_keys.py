@@ -16,7 +16,7 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.transport import WireOptions
 
 pytest.importorskip("cryptography", reason="pip install 'deal-hw[keys]'")
-NOW = datetime.datetime.now(datetime.UTC)
+NOW = datetime.datetime.now(datetime.timezone.utc)
 DAY = datetime.timedelta(days=1)
 
 

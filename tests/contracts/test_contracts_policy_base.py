@@ -115,11 +115,11 @@ def test_terms_of_the_base_are_picked_scaled_and_remembered() -> None:
 def test_terms_without_the_base_need_no_base() -> None:
     """Joint terms read the joints, whether the state comes with a base or not."""
     position = np.arange(6.0 + J)
-    built = [
+    first, second = (
         ObservationBuilder(spec(ObservationTerm("position", "FL_hip_joint", 1.0))).build(x, x)
         for x in (position, position[6:])
-    ]
-    np.testing.assert_array_equal(*built)
+    )
+    np.testing.assert_array_equal(first, second)
 
 
 def test_a_state_without_a_base_is_refused() -> None:

@@ -374,8 +374,9 @@ def test_the_defaults_are_as_documented() -> None:
 @pytest.mark.parametrize("value", [0.0, -1.0, 3600.0, math.nan, math.inf])
 def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
     """Both ends are outside."""
+    changes: dict[str, Any] = {name: value}
     with pytest.raises(ConfigurationError) as raised:
-        PassiveConfig(**{name: value})
+        PassiveConfig(**changes)
     assert str(raised.value) == f"PassiveConfig.{name} is {value!r} s; allowed: above 0, below 3600"
 
 
@@ -460,7 +461,12 @@ def test_a_go2_that_was_not_commanded_yet_is_left_alone(phase: str) -> None:
     rig = Hung()
     heard: list[str] = []
     receive = rig.device.receive
-    rig.device.receive = lambda t, p, s=0: (heard.append(t), receive(t, p, s))[1]  # type: ignore[method-assign]
+
+    def overheard(topic: str, payload: bytes, stamp_ns: int = 0) -> None:
+        heard.append(topic)
+        receive(topic, payload, stamp_ns)
+
+    rig.device.receive = overheard  # type: ignore[method-assign]
 
     def at(name: str) -> None:
         if name == phase:

@@ -18,6 +18,7 @@ import pytest
 from deal_hw.clock import VirtualClock
 from deal_hw.control import supervisor as module
 from deal_hw.control.handover import Beat
+from deal_hw.control.realtime import SUPERVISOR_PRIORITY
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
 
@@ -311,7 +312,7 @@ def test_the_supervisor_runs_first_and_stays_in_memory() -> None:
     assert Run("beat('running'); result(passive_confirmed=True)", look).end().passive_confirmed
     if os.geteuid() != 0:
         pytest.skip("neither is granted to this user")
-    assert seen == [(module.SUPERVISOR_PRIORITY, True)]
+    assert seen == [(SUPERVISOR_PRIORITY, True)]
     assert (os.sched_getparam(0).sched_priority, locked()) == (0, False)
 
 
@@ -348,7 +349,7 @@ def test_the_supervisor_wakes_up_as_soon_as_a_sign_of_life_is_overdue(
             run.supervisor.tell("go on")
         return true_select(read, write, other, timeout_s)
 
-    monkeypatch.setattr(module.select, "select", wait)
+    monkeypatch.setattr("select.select", wait)
     assert run.end().killed == "it gave no sign of life while homing"
     assert waits[0] == 0.05
     assert waits[-2:] == pytest.approx([0.021, 0.001], rel=1e-9)

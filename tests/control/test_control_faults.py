@@ -37,7 +37,7 @@ def measure() -> Iterator[Any]:
                 rig_type = sooner(rig_type)
             case = dataclasses.replace(case, phases=phases, within_ms=10_000.0, **changes)
             for attempt in range(3):
-                row = table.repetition(rig_type, case, wire, [attempt], 0, dict(TYPICAL_S))
+                row: dict[str, Any] = table.repetition(rig_type, case, wire, [attempt], 0, dict(TYPICAL_S))
                 # A machine that stands still for 40 ms trips a run, whatever else happens to it.
                 if not (row["complaints"] and row["exit_code"] == 3 and "ms old" in row["operator"]):
                     break

@@ -266,7 +266,8 @@ def test_speeds_trip(joint: str, limit: float) -> None:
     for speed in {*around(limit), *around(-limit)}:
         safety = Safety(DESCRIPTION)
         safety.arm(cycle())
-        verdict = safety.step(cycle(T0 + MS, state(T0 + MS, **{joint: speed})), command())
+        moving: dict[str, Any] = {joint: speed}
+        verdict = safety.step(cycle(T0 + MS, state(T0 + MS, **moving)), command())
         assert (verdict.state is SafetyState.PASSIVE) is (abs(speed) > limit)
         assert ("velocity" in verdict.flags) is (abs(speed) > limit)
 
@@ -340,7 +341,8 @@ def test_a_command_that_is_not_finite_is_withheld_while_disarmed(safety: Safety)
 @pytest.mark.parametrize("where", ["cart", "pole", "cart_speed", "pole_speed"])
 def test_a_state_that_is_not_finite_trips(armed: Safety, where: str) -> None:
     """NaN passes every comparison with a limit unnoticed, so it is looked for by itself."""
-    verdict = armed.step(cycle(T0 + MS, state(T0 + MS, **{where: math.nan})), None)
+    broken: dict[str, Any] = {where: math.nan}
+    verdict = armed.step(cycle(T0 + MS, state(T0 + MS, **broken)), None)
     assert verdict.flags == ("state_not_finite",)
     assert verdict.state is SafetyState.PASSIVE
 

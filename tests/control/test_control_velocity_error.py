@@ -29,7 +29,7 @@ def driven(ahead: float, turn: float, seconds: float = 6.0, heading: float = 0.7
 
 def told(*velocities: tuple[float, float, float], every_s: float = 3.0) -> Wanted:
     """Return velocities that are wanted one after the other."""
-    times = every_s * np.arange(len(velocities))
+    times = every_s * np.arange(len(velocities), dtype=np.float64)
     return Wanted(times, np.array(velocities), every_s * len(velocities))
 
 

@@ -15,7 +15,7 @@ from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.transport import Message
-from deal_hw.types import Event, JointCommand, RobotState, Status, Trajectory
+from deal_hw.types import Event, FloatArray, JointCommand, RobotState, Status, Trajectory
 
 MakeCycle = Callable[[int], CycleRecord]
 WriteEpisode = Callable[..., Path]
@@ -149,21 +149,20 @@ def make_table() -> Callable[..., Table]:
     """
 
     def make(**changes: object) -> Table:
-        time_s = np.arange(1200) * 0.01
+        time_s = np.arange(1200, dtype=np.float64) * 0.01
         frequency = np.array([[0.31, 1.13], [0.47, 1.51], [0.23, 0.89]])
         size = np.array([[0.4, 0.2], [0.3, 0.25], [0.5, 0.15]])
 
-        def motion(at: np.ndarray[tuple[int], np.dtype[np.float64]]) -> object:
-            return np.sum(
-                size[:, None] * np.sin(2 * np.pi * frequency[:, None] * at[None, :, None]), axis=2
-            ).T
+        def motion(at: FloatArray) -> FloatArray:
+            waves = size[:, None] * np.sin(2 * np.pi * frequency[:, None] * at[None, :, None])
+            return np.asarray(waves.sum(axis=2).T)
 
         fields: dict[str, object] = {
             "joint_names": ("hip", "knee", "foot"),
             "actuated": ("hip", "knee", "foot"),
             "units": ("rad", "rad", "rad"),
             "time_s": time_s,
-            "position": 0.98 * motion(time_s - 0.03),  # type: ignore[operator]
+            "position": 0.98 * motion(time_s - 0.03),
             "velocity": None,
             "effort": None,
             "command_s": time_s,

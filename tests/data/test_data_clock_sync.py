@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from deal_hw.data.recording.clock_sync import command_bounds, find_jumps, synchronize
 from deal_hw.errors import InsufficientDataError
-from deal_hw.types import Trajectory
+from deal_hw.types import FloatArray, Trajectory
 
 MakeTrajectory = Callable[..., Trajectory]
 
@@ -50,10 +50,10 @@ def test_truth_lies_within_the_uncertainty(
     """Whatever the delays, offset and drift of the clocks lie within what is reported."""
     rng = np.random.default_rng(seed)
 
-    def to_host(device_s: np.ndarray) -> np.ndarray:
+    def to_host(device_s: FloatArray) -> FloatArray:
         return device_s + offset_s + drift_ppm * 1e-6 * (device_s - 2.0)
 
-    device_s = np.arange(800) * 0.005
+    device_s = np.arange(800, dtype=np.float64) * 0.005
     receive_s = np.maximum.accumulate(to_host(device_s) + 0.0003 + rng.exponential(jitter_s + 1e-9, 800))
     received_s = np.round(np.arange(200) * 0.02 + 0.001, 6)
     sent_s = to_host(received_s) - 0.0002 - rng.exponential(jitter_s + 1e-9, 200)

@@ -20,7 +20,7 @@ STEP_S = 0.002
 def table(position: FloatArray, command: FloatArray) -> Table:
     """Return a recording at 50 Hz of joints that are all commanded."""
     names = tuple(f"joint{i}" for i in range(position.shape[1]))
-    time = np.arange(len(position)) * 0.02
+    time = np.arange(len(position), dtype=np.float64) * 0.02
     return Table(
         joint_names=names, actuated=names, units=("rad",) * len(names), time_s=time, position=position,
         velocity=None, effort=None, command_s=time, target=command, orientation=None, gyro=None,
@@ -33,7 +33,8 @@ def wish(seconds: float, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 0.02)
     tones, phases = rng.uniform(0.2, 1.5, (2, 5)), rng.uniform(0, 2 * np.pi, (2, 5))
-    return 0.2 * np.sin(2 * np.pi * tones[:, :, None] * time + phases[:, :, None]).sum(axis=1).T
+    wave = np.sin(2 * np.pi * tones[:, :, None] * time + phases[:, :, None])
+    return np.asarray(0.2 * wave.sum(axis=1).T)
 
 
 def play(command: FloatArray, *, servo: bool, seed: int) -> FloatArray:

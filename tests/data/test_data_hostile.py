@@ -15,7 +15,7 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from deal_hw.data import files
 from deal_hw.data.recording import mcap_scan
@@ -183,14 +183,14 @@ def test_many_places_are_counted(write_episode: WriteEpisode) -> None:
 def test_bombs_are_not_unpacked(bad: bytes, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A chunk that grows too much, or whose sizes disagree, is refused before any memory is taken for it."""
     monkeypatch.delattr(zstandard, "ZstdDecompressor")
-    (lost, end) = scan(mcap_scan.MCAP0_MAGIC + bad)
+    (lost, end) = scan(MCAP0_MAGIC + bad)
     assert isinstance(lost, Lost) and words in lost.reason
     assert isinstance(end, Lost) and end.torn
 
 
 def test_many_small_bombs_are_bounded() -> None:
     """Chunks that each hold 261 kB in a hundred bytes are read until the file has grown 256-fold."""
-    data = mcap_scan.MCAP0_MAGIC + chunk(bytes(9 * 29_000)) * 500
+    data = MCAP0_MAGIC + chunk(bytes(9 * 29_000)) * 500
     found = [item for item in scan(data) if isinstance(item, Found)]
     assert len(found) == (256 * len(data) + (2 << 20)) // (9 * 29_000) < 60
 
@@ -314,7 +314,7 @@ def episode_of(
             kind = message_type(topic)
             schema = writer.register_schema(kind.name, "ros2msg", kind.definition.encode())
             writer.add_message(writer.register_channel(topic, "cdr", schema), 1, data, 1, 1)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     return path
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -308,7 +309,7 @@ def test_column_map_that_does_not_fit_the_file(tmp_path: Path) -> None:
     def build(joints: list[Any], model: tuple[str, ...] | None = None, **entries: Any) -> None:
         build_table(channels, parse_column_map({"time": "time", "joints": joints, **entries}), model)
 
-    for call, words in (
+    refused: tuple[tuple[Callable[[], None], str], ...] = (
         (lambda: build(["a"], position="qq"), "no channel 'qq'"),
         (lambda: build([{"name": "a", "position": "q"}]), "has 2 columns"),
         (lambda: build([{"name": "a", "position": "q[5]"}]), "no column '5'"),
@@ -317,7 +318,8 @@ def test_column_map_that_does_not_fit_the_file(tmp_path: Path) -> None:
         (lambda: build(["a", "b"], position="q", target="u"), "give `command_time`"),
         (lambda: build(["a", "b"], target="q"), "no position of a, b"),
         (lambda: build(["a", "b"], ("x", "y"), position="q"), "its joints: x, y"),
-    ):
+    )
+    for call, words in refused:
         with pytest.raises(DatasetError, match=words):
             call()
 
@@ -330,7 +332,7 @@ def test_columns_that_do_not_exist_are_never_replaced_by_their_place(tmp_path: P
     np.savez(tmp_path / "b.npz", time=np.arange(4.0), q=q)
     np.savez(tmp_path / "c.npz", time=np.arange(4.0), q=q, joint_names=np.array(["hip", "hip"]))
 
-    def position(file: str, joints: list[Any], **entries: Any) -> list[list[float]]:
+    def position(file: str, joints: list[Any], **entries: Any) -> Any:
         (channels,) = read_channels(tmp_path / file)
         columns = parse_column_map({"time": "time", "position": "q", "joints": joints, **entries})
         return build_table(channels, columns).position.tolist()

@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,9 @@ def records(draw: st.DrawFn) -> CycleRecord:
     )
     command = st.builds(JointCommand, *[arrays(actuated)] * len(fields(JointCommand)))
     return CycleRecord(
-        *(draw(INT64) for _ in range(3)),
+        cycle=draw(INT64),
+        deadline_ns=draw(INT64),
+        start_ns=draw(INT64),
         states=tuple(draw(st.lists(state, max_size=4))),
         action=draw(st.none() | st.integers(0, 4).flatmap(arrays)),
         asked=draw(st.none() | command),
@@ -165,6 +168,6 @@ def test_odd_event_data_does_not_stop_the_loop() -> None:
     back = decode(encode(CycleRecord(0, 0, 0, events=(Event(0, "k", "m", odd),))))
     assert back.events[0].data["array"] == "1.5"
     assert math.isnan(back.events[0].data["nan"])
-    worse = {(1, 2): "a key that is no text"}
+    worse: Any = {(1, 2): "a key that is no text"}
     back = decode(encode(CycleRecord(0, 0, 0, events=(Event(0, "k", "m", worse),))))
     assert "a key that is no text" in back.events[0].data["unreadable"]

@@ -18,7 +18,7 @@ from deal_hw.data.recording.spikes import SpikeSettings, describe, find_spikes, 
 from deal_hw.data.recording.telemetry_checks import Severity, check
 from deal_hw.types import FloatArray, Trajectory
 
-TIME_S = np.arange(200) * 0.01
+TIME_S = np.arange(200, dtype=np.float64) * 0.01
 WAVE = np.sin(2 * np.pi * 1.0 * TIME_S)
 """1 Hz: at most 0.0628 rad a sample, so a spike is more than 0.314 rad from both neighbours."""
 
@@ -97,7 +97,7 @@ def test_a_jump_for_good_and_a_stop_half_way_are_no_spikes() -> None:
 
 def test_chatter_near_half_the_rate_is_motion() -> None:
     """A limit cycle of 0.5 rad at every other sample jumps and comes back all along."""
-    chatter = 0.25 * (-1.0) ** np.arange(200)
+    chatter = 0.25 * (-1.0) ** np.arange(200, dtype=np.float64)
     assert rows(chatter) == []
     burst = np.where((TIME_S > 1.0) & (TIME_S < 1.2), chatter, 0.0)
     assert rows(burst) == []

@@ -53,7 +53,7 @@ class Board(Chip):
         switches: tuple[bool, bool] = (False, False),
     ) -> list[protocol.AnyMessage]:  # fmt: skip
         """Run some ticks with counts for each; return what was said beside the states."""
-        found = []
+        found: list[protocol.AnyMessage] = []
         for _ in range(ticks):
             for payload in self.decoder.feed(self.tick(cart, pole, switches, data)):
                 message = protocol.decode(payload)

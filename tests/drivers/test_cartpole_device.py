@@ -92,8 +92,8 @@ def test_arming_needs_homing() -> None:
     """Arm is refused before homing and during it, accepted after."""
     device = CartpoleDevice(nominal_truth())
     answers = []
-    for request, message in enumerate([protocol.Arm, protocol.Home, protocol.Arm]):
-        device.receive(protocol.encode(message(request)))
+    for message in (protocol.Arm(0), protocol.Home(1), protocol.Arm(2)):
+        device.receive(protocol.encode(message))
         answers += [m.result for m in messages(device.advance_to(device.device_ns)) if isinstance(m, Ack)]
     assert answers == [Result.NOT_HOMED, Result.DONE, Result.HOMING]
     out = device.advance_to(device.device_ns + 600 * MS)

@@ -56,7 +56,7 @@ class Bench:
 
     def states(self) -> list[protocol.State]:
         """Return the states that are at hand."""
-        messages = []
+        messages: list[protocol.AnyMessage] = []
         while True:
             try:
                 data = self.port.receive(0.0).payload

@@ -71,7 +71,7 @@ def test_a_0102_robot_and_we_exchange_commands_and_states(dds_peer: Path, dds_do
     wire = DdsTransport("lo", MonotonicClock(), WireOptions(domain=dds_domain))
     wire.declare(publish=[LOW_COMMAND], subscribe=[LOW_STATE])
     encoder, values = LowCommandEncoder(), np.linspace(-1.0, 1.0, 12)
-    ticks = []
+    ticks: list[int] = []
     with wire, running(dds_peer, "robot", dds_domain, 60) as robot:
         while len(ticks) < MESSAGES:
             state = decode_low_state(wire.receive(10.0).payload)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 
 import pytest
 
@@ -149,7 +150,7 @@ def test_one_domain_has_one_interface_in_a_process(domain: int) -> None:
 def test_a_forked_child_is_told_to_start_anew(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
     """Cyclone's threads do not survive a fork; waiting for them would last for ever."""
     with make(domain):
-        monkeypatch.setattr(dds_domain.os, "getpid", lambda: -1)
+        monkeypatch.setattr("os.getpid", lambda: -1)
         with pytest.raises(TransportError, match="fork"):
             make(domain).open()
         monkeypatch.undo()
@@ -317,7 +318,7 @@ def test_messages_of_several_topics_come_in_the_order_of_writing(domain: int) ->
     near = make(domain, subscribe=("rt/lowstate", "rt/wirelesscontroller"))
     with far, near:
         for topic in ("rt/lowstate", "rt/wirelesscontroller"):
-            patiently(far, lambda topic=topic: near.writers(topic))
+            patiently(far, partial(near.writers, topic))
         sent = ["rt/lowstate", "rt/wirelesscontroller"] * 10
         for topic in sent:
             far.send(Message(topic, payload(topic, 1), 0))

@@ -70,7 +70,7 @@ def test_a_field_of_another_type_is_refused(field: str, text: str) -> None:
 def test_fields_in_another_order_are_refused() -> None:
     """The same fields, turned round, are another message."""
     name = "unitree_go::msg::dds_::WirelessController_"
-    turned = dict(reversed(STRUCTS[name].items()))
+    turned = dict(reversed(list(STRUCTS[name].items())))
     with pytest.raises(VersionMismatchError, match="WirelessController_"):
         check_types(build_types({**STRUCTS, name: turned}))
 

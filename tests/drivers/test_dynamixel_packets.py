@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from dynamixel_easy_sdk.control_table import ControlTable
@@ -70,7 +73,8 @@ def test_packets_survive_any_cut_of_the_stream(
     noise = data.draw(st.binary(max_size=20).filter(lambda n: b"\xff\xff\xfd" not in n and n[-1:] != b"\xff"))
     stream = noise + b"".join(instruction(*packet) for packet in packets)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
-    parser, found = PacketParser(), []
+    parser = PacketParser()
+    found: list[Any] = []
     for begin, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         found += parser.feed(stream[begin:end])
     assert [tuple(packet[:3]) for packet in found] == packets
@@ -138,7 +142,7 @@ def test_hostile_answers_do_not_upset_the_driver(data: bytes, fast: bool) -> Non
 @settings(max_examples=300)
 def test_hostile_answers_to_single_questions(data: bytes) -> None:
     """Ping, read, write and the search: an answer or an error of ours."""
-    questions = (
+    questions: tuple[Callable[[Any], object], ...] = (
         lambda bus: bus.ping(1),
         lambda bus: bus.read(1, PRESENT_POSITION),
         lambda bus: bus.write(1, TORQUE_ENABLE, 0),

@@ -470,4 +470,4 @@ def test_settings_that_mean_nothing_are_refused() -> None:
         ({"pole_zero": 4096}, "0 to 4095"),
     ):
         with pytest.raises(ConfigurationError, match=says):
-            DynamixelSettings(**values)  # type: ignore[arg-type]
+            DynamixelSettings(**values)

@@ -165,10 +165,13 @@ def test_only_the_joints_numbers_pass(make_bench: Callable[[str], Bench]) -> Non
     bench.run(20)
     received: list[bytes] = []
     receive = bench.go2.receive
-    bench.go2.receive = lambda topic, payload, stamp_ns=0: (  # type: ignore[method-assign]
-        received.append(payload) if topic == topics.LOW_COMMAND else None,
-        receive(topic, payload, stamp_ns),
-    )[1]
+
+    def overheard(topic: str, payload: bytes, stamp_ns: int = 0) -> None:
+        if topic == topics.LOW_COMMAND:
+            received.append(payload)
+        receive(topic, payload, stamp_ns)
+
+    bench.go2.receive = overheard  # type: ignore[method-assign]
     evil = bytearray(DAMPING)
     evil[744] = evil[788] = 1
     evil[808:] = words_crc(low_command_image(bytes(evil))).to_bytes(4, "little")

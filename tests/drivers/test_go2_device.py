@@ -223,7 +223,8 @@ def test_hidden_parameters_change_the_motion(make_go2: Any, what: str) -> None:
     paths = []
     for factor in (1.0, 2.0):
         nominal = nominal_truth()
-        changed = dataclasses.replace(nominal, **{what: tuple(factor * v for v in getattr(nominal, what))})
+        scaled: Any = {what: tuple(factor * v for v in getattr(nominal, what))}
+        changed = dataclasses.replace(nominal, **scaled)
         bench = make_go2(truth=changed, on_stand=True)
         paths.append(np.array([s.position for s in bench.run(300, servo(STANDING, 20.0, 1.5))]))
     assert np.abs(paths[0] - paths[1]).max() > 1e-3

@@ -36,7 +36,7 @@ OFF = dataclasses.replace(DAMP, mode=np.zeros(12, np.int64))
 
 def faulty(make_go2: Any, name: str, **options: Any) -> Any:
     """Return a bench whose robot stands, 100 ms after a fault began under stiff commands."""
-    plan = FaultPlan(**{f"{name}_after_s": 0.1}, **options)
+    plan = FaultPlan(**{f"{name}_after_s": 0.1, **options})
     bench = make_go2(start="standing", plan=plan)
     bench.run(100, servo(STANDING))
     assert not bench.device.log.faults

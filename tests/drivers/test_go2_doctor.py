@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
@@ -207,7 +208,10 @@ def test_battery_heat_and_remote() -> None:
             return (payload,)
         values = decode_low_state(payload).values()
         values = dataclasses.replace(
-            values, battery_percent=7, temperature=values.temperature + 60, orientation=[0.7, 0.7, 0.0, 0.14]
+            values,
+            battery_percent=7,
+            temperature=values.temperature + 60,
+            orientation=np.array([0.7, 0.7, 0.0, 0.14]),
         )
         return (encode_low_state(values),)
 

@@ -131,9 +131,9 @@ def test_other_headers_and_heads_are_refused() -> None:
     """Big-endian CDR, and messages that do not begin with FE EF."""
     for payload, decode in ((COMMAND, decode_low_command), (STATE, decode_low_state)):
         with pytest.raises(FrameError, match="CDR header is 00 00 00 00"):
-            decode(b"\0\0\0\0" + payload[4:])  # type: ignore[operator]
+            decode(b"\0\0\0\0" + payload[4:])
         with pytest.raises(FrameError, match="head is 12 34"):
-            decode(payload[:4] + b"\x12\x34" + payload[6:])  # type: ignore[operator]
+            decode(payload[:4] + b"\x12\x34" + payload[6:])
 
 
 @settings(max_examples=50, deadline=None)
@@ -242,4 +242,4 @@ def test_garbage_is_a_frame_error(data: bytes) -> None:
     """Whatever comes, the decoders raise FrameError and nothing else."""
     for decode in (decode_low_command, decode_low_state):
         with pytest.raises(FrameError):
-            decode(data)  # type: ignore[operator]
+            decode(data)

@@ -136,7 +136,8 @@ def test_a_failed_connect_closes_the_transport() -> None:
 def test_nothing_works_before_connecting() -> None:
     """Each says what is missing."""
     robot = FakeBench().robot
-    for call in (lambda: robot.home(1.0), lambda: robot.arm(1.0)):
+    calls: tuple[Callable[[], object], ...] = (lambda: robot.home(1.0), lambda: robot.arm(1.0))
+    for call in calls:
         with pytest.raises(SafetyError, match="connect"):
             call()
     with pytest.raises(TransportError):
@@ -332,8 +333,8 @@ def test_a_command_reaches_the_motors_as_it_was() -> None:
     robot = wire.armed()
     wish = dataclasses.replace(
         default_command(robot), position_target=np.arange(12) / 7, velocity_target=np.arange(12) / 11,
-        stiffness=np.arange(12) + 1.3, damping=np.arange(12) / 13, effort=np.arange(12) / 17,
-        effort_limit=np.zeros(12), speed_limit=np.zeros(12),
+        stiffness=np.arange(12, dtype=np.float64) + 1.3, damping=np.arange(12.0) / 13,
+        effort=np.arange(12.0) / 17, effort_limit=np.zeros(12), speed_limit=np.zeros(12),
     )  # fmt: skip
     sent = robot.send_command(wish)
     robot.read_state(0.1)

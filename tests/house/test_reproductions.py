@@ -371,7 +371,7 @@ def test_ctrl_c_ends_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     runs = where("Supervisor")
     made = 0
 
-    class Pressed(runs.Supervisor):  # type: ignore[misc]
+    class Pressed(runs.Supervisor):  # type: ignore[misc, name-defined]
         def __init__(self, **settings: Any) -> None:
             nonlocal made
             made += 1
@@ -497,7 +497,7 @@ def test_mutated_mcap_files_end_in_one_line(tmp_path: Path) -> None:
         channel = writer.register_channel("/t", "cdr", schema)
         for stamp in range(20):
             writer.add_message(channel, stamp, b"\0\1\0\0" + bytes(60), stamp, stamp)
-        writer.finish()  # type: ignore[no-untyped-call]
+        writer.finish()
     whole = path.read_bytes()
     for mutation in range(60):
         data = bytearray(whole)

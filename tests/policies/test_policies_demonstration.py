@@ -144,7 +144,8 @@ def resting(count: int) -> tuple[FloatArray, FloatArray]:
 
 def start(population: PopulationDemonstration, count: int) -> None:
     """Begin anew with robots that have no past."""
-    population.restart(count, *np.empty((2, 0, 18)), np.empty((0, 12)), 0)
+    past = np.empty((0, 18))
+    population.restart(count, past, past, np.empty((0, 12)), 0)
 
 
 def test_a_restart_forgets_and_members_that_diverged_rest() -> None:
@@ -170,7 +171,8 @@ def test_a_restart_forgets_and_members_that_diverged_rest() -> None:
 def test_the_wish_is_observed() -> None:
     """A wanted speed of 0.4 m/s arrives at the policy."""
     policy = Leap(walk_spec(GO2))
-    Demonstration(policy, GO2, WALK)(*(values[0] for values in resting(1)), 0.0)
+    position, velocity = resting(1)
+    Demonstration(policy, GO2, WALK)(position[0], velocity[0], 0.0)
     told = [term.quantity for term in policy.spec.observation].index("command")
     assert policy.seen[0][0, told] == pytest.approx(0.4)
 

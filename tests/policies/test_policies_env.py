@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ POINT = ParameterDistribution.point(SPACE, SPACE.nominal, 0.01)
 UNIFORM = ParameterDistribution.uniform(SPACE, (0.0, 0.03))
 
 
-def exact_env(count: int = 1, **task: float | int | tuple[float, float]) -> CartPoleEnv:
+def exact_env(count: int = 1, **task: Any) -> CartPoleEnv:
     return CartPoleEnv(
         DESCRIPTION, POINT, count, task=BalanceTask(host_delay_s=(0.0, 0.0), **task), sensor=EXACT_SENSOR
     )

@@ -44,7 +44,8 @@ def make(robot: str, count: int = 4, **task: Any) -> LocomotionEnv:
 @pytest.fixture(scope="module", params=ROBOTS)
 def env(request: pytest.FixtureRequest) -> LocomotionEnv:
     """Return an environment of four robots with episodes of 0.4 s."""
-    return make(request.param, ticks=20, **({"start_speed": 0.0} if request.param == "go2" else {}))
+    options: dict[str, Any] = {"start_speed": 0.0} if request.param == "go2" else {}
+    return make(request.param, ticks=20, **options)
 
 
 def state(count: int, joints: int) -> tuple[FloatArray, FloatArray]:

@@ -72,7 +72,7 @@ def test_spec_travels_inside_the_file(file: Path) -> None:
     assert OnnxPolicy(file).spec == SPEC
 
 
-names = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), min_size=1, max_size=8)
+names = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), min_size=1, max_size=8)
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(0.0, allow_infinity=False)
 

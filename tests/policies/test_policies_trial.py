@@ -39,7 +39,7 @@ SPEC = feedback_spec(CARTPOLE)
 BRIEF = TrialSettings(nominal=2, random=5)
 
 
-def linear_model(observations: int = 4, batch: object = "batch") -> Any:
+def linear_model(observations: int = 4, batch: str | int | None = "batch") -> Any:
     """Return a network of one matrix."""
     gains = np.resize(np.array(CARTPOLE_GAINS), observations)
     value, kind = helper.make_tensor_value_info, onnx.TensorProto.FLOAT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import mujoco
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
-from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.parameters import Parameter, ParameterSpace, Scale
 from deal_hw.sim.parameters.template import template
 from deal_hw.sim.parameters.yaml_space import parse_space, read_space, write_space
 
@@ -179,7 +180,7 @@ _kinds = st.sampled_from(["dof_damping", "dof_frictionloss", "dof_armature", "se
 
 @st.composite
 def _parameters(draw: st.DrawFn, number: int) -> Parameter:
-    scale = draw(st.sampled_from(["log", "linear"]))
+    scale: Scale = draw(st.sampled_from(get_args(Scale)))
     low = draw(st.floats(1e-6, 1e3))
     high = low * draw(st.floats(1.001, 1e3))
     nominal = min(max(low, low + (high - low) * draw(st.floats(0, 1))), high)

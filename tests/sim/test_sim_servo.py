@@ -26,7 +26,7 @@ def test_delay_by_hand() -> None:
     """Two whole steps, and one and a half: half of the value one step ago and half of that two steps ago."""
     path = np.array([1.0, 2.0, 3.0, 4.0])[None, :, None].repeat(2, axis=0)
     late = delay(path, np.array([2.0, 1.5]), np.zeros((2, 1)))
-    np.testing.assert_allclose(late[:, :, 0], [[0, 0, 1, 2], [0, 0.5, 1.5, 2.5]])
+    np.testing.assert_allclose(late[:, :, 0], [[0.0, 0.0, 1.0, 2.0], [0.0, 0.5, 1.5, 2.5]])
 
 
 @settings(max_examples=50, deadline=None)

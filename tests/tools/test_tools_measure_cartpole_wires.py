@@ -23,7 +23,7 @@ def test_times_on_the_wire_follow_from_the_frames() -> None:
     command, state = WIRE_MS["can"]
     assert command == pytest.approx(ms("Target1", "Target2", "Target3"), abs=0.005)
     assert state == pytest.approx(ms(*(f"State{k}" for k in range(1, 6))), abs=0.005)
-    assert WIRE_MS["odrive"] == (pytest.approx((95 + 3 * 135) / 500), pytest.approx(4 * 135 / 500))
+    assert WIRE_MS["odrive"] == pytest.approx(((95 + 3 * 135) / 500, 4 * 135 / 500))
 
 
 def test_a_row_counts_every_command() -> None:

@@ -46,7 +46,7 @@ def result() -> CalibrationResult:
         space=space,
         estimate=estimate,
         interval=np.stack([0.9 * estimate, 1.1 * estimate], axis=1),
-        verdicts=("weak", *("identifiable",) * (len(space) - 1)),
+        verdicts=tuple("identifiable" if number else "weak" for number in range(len(space))),
         null_directions=("all masses together",),
         latency_s=LATENCY_S,
         latency_interval_s=(0.007, 0.009),
@@ -85,7 +85,7 @@ def shown(
     overlay = compute_overlay(
         trajectory, DESCRIPTION, result.space, sets, latency_s=LATENCY_S, smoothing_s=0.0
     )
-    start_s = np.arange(100) * 0.02
+    start_s = np.arange(100, dtype=np.float64) * 0.02
     cycles = CycleTable(
         cycle=np.arange(100),
         deadline_s=start_s,
@@ -133,7 +133,7 @@ def record(path: Path, trajectory: Trajectory) -> Path:
                     sent_ns=sent_ns,
                     state_age_ns=1_000_000,
                     safety_state="active",
-                    events=trajectory.events if number == 0 else (),
+                    events=tuple(trajectory.events) if number == 0 else (),
                 )
             )
     return path

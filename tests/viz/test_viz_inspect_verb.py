@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -141,7 +142,7 @@ def test_wrong_files_are_named(episode_file: Path, tmp_path: Path) -> None:
         ({"web_port": 70_000}, "--web-port 70000: allowed are 0 to 65535"),
     ],
 )
-def test_settings_are_checked(changes: dict[str, float], words: str) -> None:
+def test_settings_are_checked(changes: dict[str, Any], words: str) -> None:
     """A setting out of range is refused when it is given."""
     with pytest.raises(ConfigurationError, match=words):
         dataclasses.replace(Inspect(episode=Path("x.mcap")), **changes)

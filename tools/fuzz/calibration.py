@@ -76,7 +76,7 @@ def import_recording(path: Path) -> None:
         to_trajectories(table, period_s=period)
 
 
-def _signals() -> dict[str, np.ndarray[Any, Any]]:
+def _signals() -> dict[str, Any]:
     time = np.arange(_ROWS) * 0.01
     return {"time": time, "elbow_pos": np.sin(9 * time), "elbow_target": np.cos(9 * time)}
 
@@ -86,7 +86,7 @@ def make_npz(folder: Path) -> list[bytes]:
     found = []
     for save in (np.savez, np.savez_compressed):
         buffer = io.BytesIO()
-        wide = {
+        wide: dict[str, Any] = {
             "dof_pos": np.zeros((_ROWS, 2)),
             "dof_target": np.ones((_ROWS, 2)),
             "names": np.array(["a", "b"]),
@@ -243,7 +243,7 @@ def make_result(folder: Path) -> list[bytes]:
     interval = np.stack([space.low, space.high], axis=1)
     result = CalibrationResult(
         method="fuzz", space=space, estimate=space.nominal, interval=interval, covariance=np.eye(K) * 0.01,
-        verdicts=("weak",) * K, latency_s=0.01, chi2=1.0, heldout_nrmse={"nominal": 0.1},
+        verdicts=tuple(["weak"] * K), latency_s=0.01, chi2=1.0, heldout_nrmse={"nominal": 0.1},
         alarms=(Alarm("a", "b", "c"),),
         advice=({"sentence": "b"},), null_directions=("c",), provenance={"seed": 1},
     )  # fmt: skip

@@ -42,7 +42,7 @@ def make_cycle(number: int, body: bool = False) -> CycleRecord:
     start_ns = 7_000_000_000_000 + number * _CYCLE_NS
 
     def values(size: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        return np.sin(0.1 * number + np.arange(size))
+        return np.sin(0.1 * number + np.arange(size, dtype=np.float64))
 
     sensed = BodyState(
         orientation=values(4), angular_velocity=values(3), acceleration=values(3), sticks=values(4),
@@ -227,7 +227,7 @@ def make_plans(folder: Path) -> list[bytes]:
     found = []
     for family in ("multisine", "chirp", "steps"):
         path = folder / f"{family}.json"
-        design = ExcitationDesign(family=family, effort=(0.5, 1.0))  # type: ignore[arg-type]
+        design = ExcitationDesign(family=family, effort=(0.5, 1.0))
         make_plan(DESCRIPTION, design).write(path)
         found.append(path.read_bytes())
     return found

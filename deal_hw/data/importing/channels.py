@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deal_hw.data.files import sha256_of
 from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
@@ -96,8 +96,7 @@ def digest_of_file(path: Path) -> str:
         DatasetError: It cannot be read.
     """
     try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256_of(path).hexdigest()
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
 

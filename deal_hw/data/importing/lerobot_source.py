@@ -9,7 +9,6 @@ features. The action of a frame is sent right after the frame was observed.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from deal_hw.data.files import sha256_of
 from deal_hw.data.importing.channels import Channels, as_floats
 from deal_hw.errors import DatasetError, MissingExtraError, short
 from deal_hw.reading import NUMBERS, RECORDING_BYTES, check_size, read_json, reading
@@ -204,8 +204,7 @@ def _flat(names: Any, deepest: int) -> list[str]:
 
 def _digest(path: Path, files: list[Path]) -> str:
     """Return a digest of the data files; a dataset may be large, so each counts by its own digest."""
-    whole = hashlib.sha256((path / "meta" / "info.json").read_bytes())
+    whole = sha256_of(path / "meta" / "info.json")
     for file in files:
-        with open(file, "rb") as opened:
-            whole.update(hashlib.file_digest(opened, "sha256").digest())
+        whole.update(sha256_of(file).digest())
     return whole.hexdigest()

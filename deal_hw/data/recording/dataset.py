@@ -11,7 +11,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
+
+from typing_extensions import Self
 
 from deal_hw.data.files import write_bytes, write_json
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize

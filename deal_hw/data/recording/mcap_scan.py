@@ -242,7 +242,7 @@ def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> Found
         builder = RecordBuilder()
         record.write(builder)
         # The library reads past the end of a record without complaint; only the way back shows it.
-        same = builder.end()[_PREFIX.size :] == body  # type: ignore[no-untyped-call]
+        same = builder.end()[_PREFIX.size :] == body
     except _PARSE_ERRORS as error:
         return _damaged(kind, error)
     return Found(offset, record) if same else _damaged(kind)

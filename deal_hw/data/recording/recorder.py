@@ -12,11 +12,12 @@ import os
 import types
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, Self, cast
+from typing import IO, Any, cast
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from typing_extensions import Self
 
 import deal_hw
 from deal_hw.clock import Clock
@@ -151,7 +152,7 @@ class EpisodeRecorder:
         """
         self._oldest_ns = -1
         try:
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.flush()
         except OSError as error:
             raise self._give_up(error) from error
 
@@ -169,9 +170,9 @@ class EpisodeRecorder:
                 "states": str(self.states),
                 "host_ns": str(self._clock.now_ns()),
             }
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.flush()
             self._writer.add_metadata(END_NAME, end)
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.finish()
             self._file.flush()
             self._file.close()
         except OSError as error:
@@ -193,7 +194,7 @@ class EpisodeRecorder:
 
     def _preamble(self) -> dict[str, str]:
         host_ns = self._clock.now_ns()
-        wall = datetime.datetime.now(datetime.UTC)
+        wall = datetime.datetime.now(datetime.timezone.utc)
         return {
             "format_version": str(FORMAT_VERSION),
             "host_ns": str(host_ns),
@@ -297,4 +298,4 @@ def _ending() -> bytes:
     builder = RecordBuilder()
     DataEnd(0).write(builder)
     Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
-    return bytes(builder.end()) + MCAP0_MAGIC  # type: ignore[no-untyped-call]
+    return bytes(builder.end()) + MCAP0_MAGIC

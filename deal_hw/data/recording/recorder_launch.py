@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from deal_hw.child_process import own_process_group
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.errors import DatasetError
 
@@ -137,7 +138,9 @@ def start_recorder(
     command += ["--path", str(path), "--config-fd", str(config), "--status-fd", str(status_write)]
     try:
         # A process group of its own keeps the terminal's Ctrl-C away even while the interpreter starts.
-        process = subprocess.Popen(command, pass_fds=inherited, stdin=subprocess.DEVNULL, process_group=0)
+        process = subprocess.Popen(
+            command, pass_fds=inherited, stdin=subprocess.DEVNULL, **own_process_group()
+        )
     finally:
         recorder_end.close()
         os.close(config)

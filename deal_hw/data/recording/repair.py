@@ -252,10 +252,10 @@ def _rewrite(data: bytes, findings: _Findings, file: IO[bytes]) -> None:
         for message in messages(item):
             _copy(writer, message, channels)
         if item.contents:
-            writer.flush()  # type: ignore[no-untyped-call]
+            writer.flush()
     lost = {"lost_bytes": str(findings.report.lost_bytes), "report": findings.report.describe()}
     writer.add_metadata(REPAIR_NAME, lost)
-    writer.finish()  # type: ignore[no-untyped-call]
+    writer.finish()
 
 
 def _copy(writer: Writer, message: Message, channels: dict[int, int]) -> None:

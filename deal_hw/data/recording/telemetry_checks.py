@@ -25,12 +25,16 @@ CLIP_TOLERANCE = 1e-5
 """Differences between asked and sent below this are the wire's rounding [m or rad]."""
 
 
-class Severity(enum.StrEnum):
+class Severity(str, enum.Enum):
     """How bad it is."""
 
     OK = "ok"
     WARN = "warn"
     FAIL = "fail"
+
+    def __str__(self) -> str:
+        """Return the word, as format and print do for text."""
+        return str(self.value)
 
 
 @dataclass(frozen=True, slots=True)
