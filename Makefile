@@ -13,6 +13,7 @@ BENCH_ARGS ?= --profile sensor --seeds 0,1 --out runs/bench/loop.json
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
+SOURCES := deal_hw calib drivers policies
 SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw/control/passive.py,deal_hw/control/supervisor.py,deal_hw/control/vigil.py,deal_hw/control/claim.py
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
@@ -28,7 +29,7 @@ setup: $(STAMP) ## make .venv with everything in it (done by the other targets w
 # shows at once. The stamp is touched last: an interrupted set-up is taken up again by the next call.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-	  || { echo "deal-hw needs Python 3.11 or newer; say which: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
+	  || { echo "everything needs Python 3.11 or newer (3.10: base and sim only, by pip); say which: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
 	  || { echo "this Python cannot make a venv; on Debian: apt-get install -y python3-venv" >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
@@ -54,10 +55,12 @@ avr-tools: ## install gcc-avr and simavr
 firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and the memory that it takes
 	@$(BIN)/python -m deal_hw.drivers.cartpole.native build/firmware
 
-check: $(STAMP) typing coverage-safety ## format, lint, types, import order and coverage of the safety module
+check: $(STAMP) typing coverage-safety ## format, lint, types, declared imports, layers, coverage of the safety module, distributions
 	$(BIN)/ruff format --check --output-format concise .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/mypy --python-version 3.10 --no-warn-return-any build/typing/deal_hw
+	$(BIN)/deptry $(SOURCES)
 	$(BIN)/python -m pytest -q tests/house/test_layers.py
 
 # The repository's own coverage settings measure everything; here every line and branch of a few files counts.

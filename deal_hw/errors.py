@@ -33,6 +33,8 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Iterable, Mapping
 
+from deal_hw.install import install_line
+
 QUOTED = 200
 """Most characters of a file's content that a message repeats."""
 SHORT = 60
@@ -104,7 +106,7 @@ class MissingExtraError(DealHwError, ImportError):
     """
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(f"{package} is not installed; install it with: pip install 'deal-hw[{extra}]'")
+        super().__init__(f"{package} is not installed; install it with: {install_line(extra)}")
 
 
 class TransportError(DealHwError, ConnectionError):

@@ -14,6 +14,7 @@ from typing import Final
 
 from deal_hw.control.realtime import FIFO_PRIORITY
 from deal_hw.findings import Finding, Level
+from deal_hw.install import install_line
 
 PACKAGES: Final = (
     ("eclipse-zenoh", ""), ("cyclonedds", "dds"), ("mujoco", "sim"), ("torch", "calib"), ("rerun-sdk", "viz"),
@@ -48,10 +49,10 @@ def _packages() -> Iterator[Finding]:
         if version := _version(name):
             yield Finding("packages", Level.OK, f"{name} {version}")
         elif extra:
-            hint = f"pip install 'deal-hw[{extra}]', if this computer needs it"
+            hint = f"{install_line(extra)}, if this computer needs it"
             yield Finding("packages", Level.NOTE, f"{name} is not installed", hint)
         else:
-            yield Finding("packages", Level.FAIL, f"{name} is not installed", "pip install deal-hw")
+            yield Finding("packages", Level.FAIL, f"{name} is not installed", install_line())
 
 
 def _version(name: str) -> str:

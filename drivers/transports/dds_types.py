@@ -22,6 +22,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from deal_hw.errors import MissingExtraError, VersionMismatchError
+from deal_hw.install import install_line
 
 _GO: Final = "unitree_go::msg::dds_::"
 _API: Final = "unitree_api::msg::dds_::"
@@ -248,5 +249,5 @@ def check_types(types: Mapping[str, Any]) -> None:
         raise VersionMismatchError(
             f"DDS types differ from the robot's (XTypes hashes): {'; '.join(wrong)}. Opening the domain "
             "could crash the robot's DDS process, so it stays closed. Was another cyclonedds installed? "
-            "pip install 'deal-hw[dds]' brings the version that was checked"
+            f"{install_line('dds')} brings the version that was checked"
         )

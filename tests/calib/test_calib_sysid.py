@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import re
 import types
 
 import numpy as np
@@ -16,6 +17,7 @@ from deal_hw.calib.search.resume import Checkpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.install import install_line
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import Episode, align
@@ -151,5 +153,5 @@ def test_positions_must_have_been_measured() -> None:
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without its dependencies the package is empty; the error says what to install."""
     monkeypatch.setattr(importlib, "import_module", lambda _: types.ModuleType("empty"))
-    with pytest.raises(MissingExtraError, match=r"pip install 'deal-hw\[bench\]'"):
+    with pytest.raises(MissingExtraError, match=re.escape(install_line("bench"))):
         require_sysid()

@@ -28,6 +28,7 @@ from deal_hw.control.excitation_plan import ExcitationDesign, make_plan
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
+from deal_hw.install import install_line
 from deal_hw.workflows import shipped
 
 ARM = """
@@ -282,7 +283,7 @@ def test_a_missing_package_names_its_extra(
         if name == package or name.startswith(f"{package}."):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    refused(line, f"pip install 'deal-hw[{extra}]'")
+    refused(line, install_line(extra))
 
 
 def test_a_demo_without_its_policy_says_how_to_make_it(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import socket
 import sys
 import urllib.request
@@ -16,6 +17,7 @@ import pytest
 from PIL import Image
 
 from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.install import install_line
 from deal_hw.viz import palette
 from deal_hw.viz.screenshot import RENDERER_INSTALL, save_screenshot
 from deal_hw.viz.serve import open_window, serve_web
@@ -116,5 +118,5 @@ def test_without_rerun_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     """Where rerun is not installed, the error names the extra."""
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "deal_hw.viz.backend")
-    with pytest.raises(MissingExtraError, match=r"pip install 'deal-hw\[viz\]'"):
+    with pytest.raises(MissingExtraError, match=re.escape(install_line("viz"))):
         importlib.import_module("deal_hw.viz.backend")
