@@ -18,7 +18,7 @@ SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test dds-peer avr-tools firmware check coverage-safety mutation bench typing format clean
+.PHONY: help setup demo test dds-peer avr-tools firmware check dist coverage-safety mutation bench typing format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -62,6 +62,12 @@ check: $(STAMP) typing coverage-safety ## format, lint, types, declared imports,
 	$(BIN)/mypy --python-version 3.10 --no-warn-return-any build/typing/deal_hw
 	$(BIN)/deptry $(SOURCES)
 	$(BIN)/python -m pytest -q tests/house/test_layers.py
+	@$(MAKE) -s dist
+
+dist: $(STAMP) ## build/dist: the wheel, built from the source distribution, and that; both are checked
+	@rm -rf build/dist
+	$(BIN)/python -m build --no-isolation --outdir build/dist >build/dist.log 2>&1 || { cat build/dist.log; exit 1; }
+	$(BIN)/twine check --strict build/dist/*
 
 # The repository's own coverage settings measure everything; here every line and branch of a few files counts.
 coverage-safety: $(STAMP) ## each line and branch of the safety module and of the exit path is tested

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import os
@@ -9,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -197,6 +199,33 @@ def test_command_runs_from_the_wheel(unpacked: Path, tmp_path: Path) -> None:
     done = run_elsewhere(code, unpacked, tmp_path)
     assert done.stdout == f"deal-hw {project()['project']['version']}\n"  # type: ignore[index]
     assert done.returncode == 0
+
+
+def test_the_wheel_calibrates_a_robot_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
+    """Installed by pip beside the packages that it names: a model and a recording give a calibrated one."""
+    from deal_hw.testing.plain_robots import make_robot, write
+
+    where = tmp_path / "clean"
+    subprocess.run([sys.executable, "-m", "venv", where], check=True, capture_output=True, timeout=120)
+    (site,) = where.glob("lib/python*/site-packages")
+    # A path in a .pth file is searched; .pth files there are not read, so the editable install is hidden.
+    (site / "packages.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "COV"))}
+    run = functools.partial(
+        subprocess.run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+    )
+    done = run([where / "bin" / "python", "-m", "pip", "install", "--no-index", "--no-deps", wheel])
+    assert done.returncode == 0, done.stderr
+    model, (recording, *_), other = write(make_robot("pendulum", seed=0), tmp_path / "robot", seconds=8.0)
+    done = run(
+        [where / "bin" / "deal-hw", "calibrate", "--model", model, "--data", recording, "--holdout", other,
+         "--out", "found", "--threads", "1"]
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [path.name for path in (tmp_path / "found").rglob("calibrated.xml")]
+    line = "import deal_hw; print(deal_hw.__file__)"
+    told = run([where / "bin" / "python", "-c", line]).stdout.strip()
+    assert Path(told).is_relative_to(site)
 
 
 def test_versions_agree() -> None:
