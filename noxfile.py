@@ -1,8 +1,8 @@
 """Tests on each Python that this machine has.
 
-`nox` runs all, `nox -s base-3.10` one of them (`nox -l` lists them). 3.11 to 3.13 get everything, 3.10 what a
-robot's own computer needs (Ubuntu 22.04, Jetson): links, recording, safety, deployment and the simulator. pip's
-own settings (PIP_EXTRA_INDEX_URL for PyTorch's CPU builds) apply.
+`nox` runs all, `nox -s base-3.10` one of them (`nox -l` lists them). 3.11 to 3.13 get everything, 3.10 what
+a robot's own computer needs (Ubuntu 22.04, Jetson): links, recording, safety, deployment and the simulator.
+pip's own settings (PIP_EXTRA_INDEX_URL for PyTorch's CPU builds) apply.
 """
 
 import nox
