@@ -1,13 +1,13 @@
 """Output-error fits for recordings of a real robot, which no simulator explains to the noise.
 
 Three questions have no answer there that holds for every robot: how far a prediction may be off, whether a
-search that stops early or a fit that goes on predicts other motion better, and over which horizon to fit. So
+search that stops early or a fit that goes on predicts other motion better, and over which window to fit. So
 
 1. a fit from the model's own values over short windows says what residuals to expect;
 2. the search is run with these;
 3. by cross-validation on the recordings that are fitted, motion by motion, the search's estimate, fits over
-   short and long horizons (robust or not, with a latency or none, held to the model's own values or hardly)
-   and the mean of fits over all horizons predict what they have not seen;
+   short and long windows (robust or not, with a latency or none, held to the model's own values or hardly)
+   and the mean of fits over all window lengths predict what they have not seen;
 4. what predicts best is fitted to all, two halves of the data are compared, and what goes with what is said.
 
 Recordings that are held out take no part in any of this.
@@ -46,7 +46,7 @@ from deal_hw.calib.validation.cross_validation import (
     on_folds,
     time_masks,
 )
-from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_halves
+from deal_hw.calib.validation.split_half import SplitHalf, agreement, widened_by_split_half
 from deal_hw.calib.validation.verdict import Validation, unexplained, with_causes, with_step
 from deal_hw.calibration import Z90, Alarm, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
@@ -59,8 +59,8 @@ class OutputErrorSettings:
     """Settings of :class:`OutputErrorFits`.
 
     Attributes:
-        horizons_s: Windows of the fits, one from where the one before ended [s]. What the model lacks pulls
-            each horizon's fit elsewhere; their mean may be nearer than any of them.
+        windows_s: Windows of the fits, one from where the one before ended [s]. What the model lacks pulls
+            each window's fit elsewhere; their mean may be nearer than any of them.
         priors: How far the model's own values hold, as a share of the range: as far as the range itself, or
             hardly. By what a candidate's name ends with.
         search_s: The search is to find the neighbourhood: so much of the recordings, evenly spread, says
@@ -81,7 +81,7 @@ class OutputErrorSettings:
             which is known by other means.
     """
 
-    horizons_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
+    windows_s: tuple[float, ...] = (0.4, 0.8, 1.2, 2.0)
     priors: Mapping[str, float] = field(default_factory=lambda: {"": Recipe().prior_std, ", wide prior": 1.0})
     search_s: float = 12.0
     stretch_s: float = 2.5
@@ -97,12 +97,12 @@ class OutputErrorSettings:
 
     @property
     def long_s(self) -> float:
-        """The longest horizon [s]."""
-        return self.horizons_s[-1]
+        """The longest window [s]."""
+        return self.windows_s[-1]
 
     @property
     def variants(self) -> Mapping[str, Recipe]:
-        """Fits over the longest horizon in other ways, by name."""
+        """Fits over the longest window in other ways, by name."""
         return {
             "long, robust": Recipe(seconds=self.long_s, robust=True),
             "long, no latency": Recipe(seconds=self.long_s, latency=False),
@@ -153,8 +153,8 @@ class OutputErrorFits(Fits):
         told = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, told, iterations=0, central=True)
         known = _known(problem, fit)
-        halves = self._halves(problem, fit, recipe, known)
-        known = widened_by_halves(problem, known, theta, halves)
+        split = self._split_half(problem, fit, recipe, known)
+        known = widened_by_split_half(problem, known, theta, split)
         if settings.hold_first:
             known = _holding(problem, known, theta, first.theta)
         if settings.force_std:
@@ -186,7 +186,7 @@ class OutputErrorFits(Fits):
             "at_bound": [
                 problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
             ],
-            "split_half": halves.to_json(),
+            "split_half": split.to_json(),
             "confounded": [pair.to_json() for pair in found],
         }
         known = dataclasses.replace(
@@ -250,21 +250,21 @@ class OutputErrorFits(Fits):
             only: Name of the one candidate that is wanted; None for all.
         """
         settings = self.settings
-        horizons_s = settings.horizons_s if run.settings.cross_validation else (settings.long_s,)
+        windows_s = settings.windows_s if run.settings.cross_validation else (settings.long_s,)
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}
         rmse = prediction_rmse(problem, [found["search"], short], settings.compared_s)
         start = list(found.values())[int(np.argmin(np.mean(np.log(rmse), axis=1)))]
         for words, prior_std in settings.priors.items():
             if only is not None and words != settings.prior_of(only):
                 continue
-            horizons = [start]
-            for seconds in horizons_s:
+            windows = [start]
+            for seconds in windows_s:
                 recipe = Recipe(seconds=seconds, prior_std=prior_std, robust=settings.robust)
-                horizons.append(_member(fit_output_error(problem, *horizons[-1], recipe)))
-            for seconds, member in zip(horizons_s[:-1], horizons[1:], strict=False):
+                windows.append(_member(fit_output_error(problem, *windows[-1], recipe)))
+            for seconds, member in zip(windows_s[:-1], windows[1:], strict=False):
                 found[f"{seconds:g} s{words}"] = member
-            found["long" + words] = horizons[-1]
-            found["mean of horizons" + words] = _mean(problem, horizons[1:])
+            found["long" + words] = windows[-1]
+            found["mean of windows" + words] = _mean(problem, windows[1:])
         for name, recipe in settings.variants.items():
             if only in (None, name):
                 theta, latency_s = found["long"]
@@ -272,7 +272,9 @@ class OutputErrorFits(Fits):
                 found[name] = _member(fit_output_error(problem, theta, latency_s, recipe))
         return found
 
-    def _halves(self, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty) -> SplitHalf:
+    def _split_half(
+        self, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
+    ) -> SplitHalf:
         """Fit two halves of the recordings, motion by motion, from the whole's estimate and compare."""
         space, before = problem.space, problem.steps
         estimates, stds, intervals = [], [], []
@@ -315,7 +317,7 @@ def output_error_method(search: CalibrationMethod[Problem] | None = None) -> Cal
 
 
 def local() -> Calibration:
-    """Return `local`: the fits over short and then long horizons alone, from the model's own values.
+    """Return `local`: the fits over short and then long windows alone, from the model's own values.
 
     For a robot whose model is near (within a factor two or so) and in which motion is damped: it costs a
     twentieth of a search. What its residual does not explain it says like `output-error`.
@@ -324,10 +326,17 @@ def local() -> Calibration:
 
 
 GAIT = OutputErrorSettings(
-    horizons_s=(0.2,), compared_s=0.1, mismatch_s=0.0, first=Recipe(seconds=0.1, robust=True, iterations=12),
-    robust=True, fitted_s=9.0, stretch_s=1.5, half_iterations=2, hold_first=True,
+    windows_s=(0.2,),
+    compared_s=0.1,
+    mismatch_s=0.0,
+    first=Recipe(seconds=0.1, robust=True, iterations=12),
+    robust=True,
+    fitted_s=9.0,
+    stretch_s=1.5,
+    half_iterations=2,
+    hold_first=True,
     force_std=0.05,
-)  # fmt: skip
+)
 """Half a step of the gait, and a quarter: shorter windows are ruled by the errors of their start states, in
 longer ones most feet land or slide. A robot that weighs itself by its motors' efforts is taken to be right to
 5 %."""

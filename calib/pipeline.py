@@ -118,10 +118,15 @@ class CalibrationRun:
         if self.progress is not None:
             self.progress(
                 Progress(
-                    stage, 1, 1, f"chi2 {found.chi2:.3g}", estimate=theta, latency_s=found.latency_s,
+                    stage,
+                    1,
+                    1,
+                    f"chi2 {found.chi2:.3g}",
+                    estimate=theta,
+                    latency_s=found.latency_s,
                     values={"chi2": found.chi2},
                 )
-            )  # fmt: skip
+            )
 
 
 class Fits(abc.ABC):
@@ -403,6 +408,9 @@ def from_search(run: CalibrationRun, searched: CalibrationResult) -> Refined:
     """Refine a search's estimate."""
     given = run.problem.fixed_latency_s
     return refine(
-        run.problem, searched.estimate, searched.latency_s if given is None else given,
-        fixed_latency=given is not None, notify=partial(run.offer, "refinement"),
-    )  # fmt: skip
+        run.problem,
+        searched.estimate,
+        searched.latency_s if given is None else given,
+        fixed_latency=given is not None,
+        notify=partial(run.offer, "refinement"),
+    )

@@ -15,7 +15,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
 ACTUATIONS: Final = ("position", "motor")
-"""How actuators take commands: set-points of a P-D position loop, or efforts as a share of the limit."""
+"""How actuators take commands: set-points of a PD position loop, or efforts as a share of the limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +43,7 @@ class LegLimits:
     """What the safety module enforces on a robot with legs, beyond :class:`SafetyLimits`.
 
     Attributes:
-        effort: Largest predicted P-D effort of a command, (A,) [N·m]; targets are moved, in the end gains
+        effort: Largest predicted PD effort of a command, (A,) [N·m]; targets are moved, in the end gains
             lowered, to keep it.
         tilt: Leaning further than this trips, angle between the base's z axis and the vertical [rad];
             infinite for a robot whose base is held.
@@ -130,13 +130,13 @@ class RobotDescription:
         effort_limit: Default effort limit, (A,).
         speed_limit: Default speed limit of the set-point, (A,); infinite without a set-point generator.
         control_rate_hz: Rate of commands.
-        device_rate_hz: Rate of the P-D loop inside the device.
+        device_rate_hz: Rate of the PD loop inside the device.
         state_rate_hz: Rate of state samples.
         repeat_rate_hz: Rate at which the driver sends the command in force again; 0: each is sent once.
         limits: What the safety filter enforces.
         sensor: The nominal sensor model.
         mjcf: The robot's MuJoCo model.
-        actuation: "position": commands are set-points of a P-D loop; "motor": commands are efforts, -1..1 of
+        actuation: "position": commands are set-points of a PD loop; "motor": commands are efforts, -1..1 of
             ``effort_limit``, and stiffness and damping are 0.
         floating_base: Name of the free joint that carries the robot; None for a fixed base. It is not among
             ``joint_names``.
@@ -191,10 +191,14 @@ class RobotDescription:
             )
         J, A = len(self.joint_names), len(self.actuated)
         for name, length in (
-            ("position_units", J), ("default_position", J), ("stiffness", A), ("damping", A),
-            ("effort_limit", A), ("speed_limit", A),
+            ("position_units", J),
+            ("default_position", J),
+            ("stiffness", A),
+            ("damping", A),
+            ("effort_limit", A),
+            ("speed_limit", A),
             ("excitation_range", A if self.excitation_range else 0),
-        ):  # fmt: skip
+        ):
             if len(getattr(self, name)) != length:
                 raise ConfigurationError(
                     f"robot {self.name!r}: {name} has {len(getattr(self, name))} entries, expected {length}"
@@ -219,10 +223,14 @@ class RobotDescription:
         values["sources"] = dict(self.sources)
         # A default stays out: a description written before the field existed keeps its digest.
         for name, default in (
-            ("actuation", "position"), ("floating_base", None), ("repeat_rate_hz", 0.0),
-            ("passive_damping", ()), ("rest_position", ()),
-            ("feet", ()), ("excitation_range", ()),
-        ):  # fmt: skip
+            ("actuation", "position"),
+            ("floating_base", None),
+            ("repeat_rate_hz", 0.0),
+            ("passive_damping", ()),
+            ("rest_position", ()),
+            ("feet", ()),
+            ("excitation_range", ()),
+        ):
             if values[name] == default:
                 del values[name]
         for name, default in (("silence_s", 0.3), ("legs", None)):

@@ -38,5 +38,8 @@ class Finding:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         return {
-            "area": self.area, "level": self.level.value, "message": self.message, "remedy": self.remedy,
-        }  # fmt: skip
+            "area": self.area,
+            "level": self.level.value,
+            "message": self.message,
+            "remedy": self.remedy,
+        }

@@ -69,9 +69,14 @@ class Parameter:
     ) -> Parameter:
         """Return a parameter on a log scale, searched a factor ``ratio`` to either side of its nominal."""
         return cls(
-            name=name, kind=kind, elements=tuple(elements), unit=unit, nominal=nominal,
-            low=nominal / ratio, high=nominal * ratio,
-        )  # fmt: skip
+            name=name,
+            kind=kind,
+            elements=tuple(elements),
+            unit=unit,
+            nominal=nominal,
+            low=nominal / ratio,
+            high=nominal * ratio,
+        )
 
     def __post_init__(self) -> None:
         if self.scale not in get_args(Scale):
@@ -209,16 +214,18 @@ class ParameterSpace:
         """Draw uniformly in the unit cube; returns physical values, (count, K)."""
         return self.unnormalize(rng.random((count, len(self))))
 
-    def with_ratio(self, xi: float) -> ParameterSpace:
-        """Return the space whose log ranges are [nominal / xi, nominal * xi] (BENCHMARK's fixed ratio).
+    def with_ratio(self, range_ratio: float) -> ParameterSpace:
+        """Return the space whose log ranges reach the ratio to either side of the nominal values.
 
         Raises:
-            ConfigurationError: ``xi`` is not above 1.
+            ConfigurationError: ``range_ratio`` is not above 1.
         """
-        if not xi > 1:
-            raise ConfigurationError(f"the ratio xi must be above 1, got {xi:g}")
+        if not range_ratio > 1:
+            raise ConfigurationError(f"the range ratio must be above 1, got {range_ratio:g}")
         return ParameterSpace(
-            dataclasses.replace(p, low=p.nominal / xi, high=p.nominal * xi) if p.scale == "log" else p
+            dataclasses.replace(p, low=p.nominal / range_ratio, high=p.nominal * range_ratio)
+            if p.scale == "log"
+            else p
             for p in self.parameters
         )
 
@@ -291,9 +298,11 @@ class ParameterDistribution:
         """Return the distribution that knows everything (the oracle's)."""
         K = len(space)
         return cls(
-            space=space, mean=np.asarray(theta, dtype=float), covariance=np.zeros((K, K)),
+            space=space,
+            mean=np.asarray(theta, dtype=float),
+            covariance=np.zeros((K, K)),
             latency_s=(latency_s, latency_s),
-        )  # fmt: skip
+        )
 
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Draw physical values, (count, K), inside the range."""

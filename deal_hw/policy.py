@@ -25,9 +25,19 @@ from deal_hw.schema import SHOWN, STRICT, check_members, check_numbers, either, 
 from deal_hw.types import FloatArray
 
 Quantity = Literal[
-    "position", "velocity", "sin_position", "cos_position", "action",
-    "gravity", "heading", "angular_velocity", "linear_velocity", "height", "command", "clock",
-]  # fmt: skip
+    "position",
+    "velocity",
+    "sin_position",
+    "cos_position",
+    "action",
+    "gravity",
+    "heading",
+    "angular_velocity",
+    "linear_velocity",
+    "height",
+    "command",
+    "clock",
+]
 Observation = npt.NDArray[np.float32]
 
 AXES = ("x", "y", "z")
@@ -142,8 +152,10 @@ class PolicySpec:
 
     def __post_init__(self) -> None:
         for name, names in (
-            ("robot", (self.robot,)), ("joint_names", self.joint_names), ("actuated", self.actuated),
-        ):  # fmt: skip
+            ("robot", (self.robot,)),
+            ("joint_names", self.joint_names),
+            ("actuated", self.actuated),
+        ):
             if not 1 <= len(names) <= MAX_JOINTS or not all(names) or len(set(names)) < len(names):
                 allowed = f"1 to {MAX_JOINTS} names, all different and none empty"
                 raise refusal(name, getattr(self, name), allowed)
@@ -249,9 +261,11 @@ class PolicySpec:
         }
         limits = description.limits
         for name, allowed in (
-            ("stiffness", limits.stiffness), ("damping", limits.damping), ("effort_limit", limits.effort),
+            ("stiffness", limits.stiffness),
+            ("damping", limits.damping),
+            ("effort_limit", limits.effort),
             ("speed_limit", limits.speed),
-        ):  # fmt: skip
+        ):
             given = getattr(self, name)
             if len(given) != len(allowed) or any(g > a for g, a in zip(given, allowed, strict=True)):
                 wrong[name] = f"policy asks for {shown(given)}, the robot allows at most {shown(allowed)}"
@@ -437,8 +451,11 @@ def base_features(position: FloatArray, velocity: FloatArray) -> FloatArray:
     down, ahead = (np.broadcast_to(v, turn.shape) for v in (np.array([0.0, 0, -1]), np.array([1.0, 0, 0])))
     return np.concatenate(
         [
-            in_base_frame(turn, down), in_base_frame(turn, ahead), velocity[..., 3:],
-            in_base_frame(turn, velocity[..., :3]), position[..., 2:3],
+            in_base_frame(turn, down),
+            in_base_frame(turn, ahead),
+            velocity[..., 3:],
+            in_base_frame(turn, velocity[..., :3]),
+            position[..., 2:3],
         ],
         axis=-1,
-    )  # fmt: skip
+    )

@@ -112,7 +112,7 @@ class Robot(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def link_errors(self) -> int:
+    def transport_errors(self) -> int:
         """Corrupt frames and gaps in the state's sequence numbers so far."""
 
     @abc.abstractmethod

@@ -186,7 +186,7 @@ class Trajectory:
         command_age_s: Device time since that command was received, (T,) [s]; NaN where none.
         sent_s: Host time of each command, on the time base of ``receive_s``, (C,) [s].
         sent_sequence: Number of each command, (C,).
-        asked_position: Position targets the policy asked for, (C, A).
+        requested_position: Position targets the policy asked for, (C, A).
         position_target: Position targets really sent, (C, A).
         stiffness: (C, A).
         damping: (C, A).
@@ -209,7 +209,7 @@ class Trajectory:
     command_age_s: FloatArray
     sent_s: FloatArray
     sent_sequence: IntArray
-    asked_position: FloatArray
+    requested_position: FloatArray
     position_target: FloatArray
     stiffness: FloatArray
     damping: FloatArray

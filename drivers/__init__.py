@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 ROBOTS: Final = {
     "cartpole": "deal_hw.drivers.cartpole.robot:CartpoleRobot",
     "go2": "deal_hw.drivers.go2.robot:Go2Robot",
-    "go2_hung": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
+    "go2_on_stand": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
 }
 DESCRIPTIONS: Final = {
     "ant": "deal_hw.drivers.ant.description:DESCRIPTION",
@@ -39,7 +39,7 @@ SPACES: Final = {
     "ant": "deal_hw.drivers.ant.description:SPACES",
     "cartpole": "deal_hw.drivers.cartpole.description:SPACES",
     "go2": "deal_hw.drivers.go2.descriptions.floor:SPACES",
-    "go2_hung": "deal_hw.drivers.go2.descriptions.on_stand:SPACES",
+    "go2_on_stand": "deal_hw.drivers.go2.descriptions.on_stand:SPACES",
     "go2_suspended": "deal_hw.drivers.go2.descriptions.on_stand_recording:SPACES",
     "so101": "deal_hw.drivers.so101.description:SPACES",
 }
@@ -71,7 +71,7 @@ CAN_BUSES: Final[Mapping[str, str]] = {
 REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     "cartpole": ("serial", "can", "odrive", "dynamixel"),
     "go2": TOPIC_TRANSPORTS,
-    "go2_hung": TOPIC_TRANSPORTS,
+    "go2_on_stand": TOPIC_TRANSPORTS,
 }
 """Transports that reach each robot; the first is the default."""
 

@@ -99,9 +99,14 @@ class AntEnv(LocomotionEnv):
     ) -> None:
         self.task = task or RunTask()
         super().__init__(
-            description, distribution, run_spec(description, distribution.digest()), count,
-            ticks=self.task.ticks, start_noise=self.task.start_noise_rad, threads=threads,
-        )  # fmt: skip
+            description,
+            distribution,
+            run_spec(description, distribution.digest()),
+            count,
+            ticks=self.task.ticks,
+            start_noise=self.task.start_noise_rad,
+            threads=threads,
+        )
 
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray

@@ -141,9 +141,15 @@ class CartPoleEnv(ServoVectorEnv):
         self.task = task or BalanceTask()
         self.failure_reward = -self.task.fall_cost
         super().__init__(
-            description, distribution, balance_spec(description, self.task, distribution.digest()), count,
-            ticks=self.task.ticks, host_delay_s=self.task.host_delay_s, sensor=sensor, threads=threads,
-        )  # fmt: skip
+            description,
+            distribution,
+            balance_spec(description, self.task, distribution.digest()),
+            count,
+            ticks=self.task.ticks,
+            host_delay_s=self.task.host_delay_s,
+            sensor=sensor,
+            threads=threads,
+        )
 
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
         """Draw starts near upright, at rest."""

@@ -131,14 +131,21 @@ class WalkTask:
 
     def __post_init__(self) -> None:
         check_task(
-            self.ticks, tracking_width=self.tracking_width, turn_width=self.turn_width,
-            swing_m=self.swing_m, physics_step_s=self.physics_step_s, clock_hz=self.clock_hz,
-            command_ticks=self.command_ticks, push_ticks=self.push_ticks,
-        )  # fmt: skip
+            self.ticks,
+            tracking_width=self.tracking_width,
+            turn_width=self.turn_width,
+            swing_m=self.swing_m,
+            physics_step_s=self.physics_step_s,
+            clock_hz=self.clock_hz,
+            command_ticks=self.command_ticks,
+            push_ticks=self.push_ticks,
+        )
         for name, pair in (
             *((f"command_range[{i}]", pair) for i, pair in enumerate(self.command_range)),
-            ("host_delay_s", self.host_delay_s), ("friction", self.friction), ("payload_kg", self.payload_kg),
-        ):  # fmt: skip
+            ("host_delay_s", self.host_delay_s),
+            ("friction", self.friction),
+            ("payload_kg", self.payload_kg),
+        ):
             if not pair[0] <= pair[1]:
                 raise ConfigurationError(f"{name} must be (low, high) with low <= high, got {pair}")
         for name in ("standing", "zeroed", "swing_share"):
@@ -162,9 +169,14 @@ def walk_spec(
     terms += joint_terms(description, 0.05)
     scale = [ACTION_SCALE_RAD[name.split("_")[1]] for name in description.actuated]
     return locomotion_spec(
-        description, terms, scale, trained_under, training,
-        clock_hz=task.clock_hz, command_range=task.command_range,
-    )  # fmt: skip
+        description,
+        terms,
+        scale,
+        trained_under,
+        training,
+        clock_hz=task.clock_hz,
+        command_range=task.command_range,
+    )
 
 
 class Go2Env(LocomotionEnv):
@@ -220,17 +232,27 @@ class Go2Env(LocomotionEnv):
             return np.tile(values, (count, 1))
 
         self._template = JointCommand(
-            position_target=zeros, velocity_target=zeros, effort=zeros,
-            stiffness=every(layout.stiffness), damping=every(layout.damping),
-            effort_limit=every(layout.effort_limit), speed_limit=every(layout.speed_limit),
-        )  # fmt: skip
+            position_target=zeros,
+            velocity_target=zeros,
+            effort=zeros,
+            stiffness=every(layout.stiffness),
+            damping=every(layout.damping),
+            effort_limit=every(layout.effort_limit),
+            speed_limit=every(layout.speed_limit),
+        )
         self._sent, self._cut = zeros.copy(), zeros
         self._sums: dict[str, float] = {}
         super().__init__(
-            description, distribution, layout, count,
-            ticks=task.ticks, start_noise=task.start_noise_rad, host_delay_s=task.host_delay_s,
-            threads=threads, step_s=task.physics_step_s,
-        )  # fmt: skip
+            description,
+            distribution,
+            layout,
+            count,
+            ticks=task.ticks,
+            start_noise=task.start_noise_rad,
+            host_delay_s=task.host_delay_s,
+            threads=threads,
+            step_s=task.physics_step_s,
+        )
         model = self.loop.batch.robot.model
         self._feet = [element_id(model, "geom", name) for name in description.feet]
         self._radius = model.geom_size[self._feet, 0]
@@ -338,10 +360,13 @@ class Go2Env(LocomotionEnv):
         fast = np.square(np.maximum(share - task.calm_share, 0.0)).sum(axis=1)
         reward -= task.speed_weight * fast
         self._note(
-            velocity_error_m_s=np.sqrt(error).mean(), yaw_error_rad_s=np.sqrt(turn).mean(),
+            velocity_error_m_s=np.sqrt(error).mean(),
+            yaw_error_rad_s=np.sqrt(turn).mean(),
             clipped=np.any(np.abs(self._cut) > 1e-9, axis=1).mean(),
-            height_m=seen[:, HEIGHT].mean(), gait=gait.mean(), slip=slip.mean(),
-        )  # fmt: skip
+            height_m=seen[:, HEIGHT].mean(),
+            gait=gait.mean(),
+            slip=slip.mean(),
+        )
         return np.asarray(reward)
 
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
@@ -405,6 +430,13 @@ def _drawn(kind: str, element: str, unit: str, ends: tuple[float, float]) -> Par
     low, high = ends
     room = 0.0 if low < high else 1.0
     return Parameter(
-        name=f"{element}.{kind}", kind=kind, elements=(element,), unit=unit, nominal=0.5 * (low + high),
-        low=low - room, high=high + room, scale="linear", known=low == high,
-    )  # fmt: skip
+        name=f"{element}.{kind}",
+        kind=kind,
+        elements=(element,),
+        unit=unit,
+        nominal=0.5 * (low + high),
+        low=low - room,
+        high=high + room,
+        scale="linear",
+        known=low == high,
+    )

@@ -1,4 +1,4 @@
-"""What the tasks of robots with a floating base share: starts, termination by tilt, specs, judgement."""
+"""What the tasks of robots with a floating base share: starts, termination by tilt, specs, scoring."""
 
 from __future__ import annotations
 
@@ -64,9 +64,15 @@ class LocomotionEnv(ServoVectorEnv):
                 f"robot {description.name!r} has a fixed base; locomotion needs a free one"
             )
         super().__init__(
-            description, distribution, layout, count,
-            ticks=ticks, host_delay_s=host_delay_s, threads=threads, step_s=step_s,
-        )  # fmt: skip
+            description,
+            distribution,
+            layout,
+            count,
+            ticks=ticks,
+            host_delay_s=host_delay_s,
+            threads=threads,
+            step_s=step_s,
+        )
         self._start_noise = start_noise
         self._pool = self._settled(threads)
 

@@ -61,9 +61,17 @@ class PpoConfig:
 
     def __post_init__(self) -> None:
         for name in (
-            "steps", "rollout", "epochs", "batches", "learning_rate", "divergence", "clip", "exploration",
-            "reward_scale", "checkpoint_updates",
-        ):  # fmt: skip
+            "steps",
+            "rollout",
+            "epochs",
+            "batches",
+            "learning_rate",
+            "divergence",
+            "clip",
+            "exploration",
+            "reward_scale",
+            "checkpoint_updates",
+        ):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)!r}")
         for name in ("gamma", "trace"):
@@ -122,9 +130,11 @@ class PpoTrainer:
                 if not learner.is_finite:
                     raise diverged(learner.steps, files.checkpoint)
                 status = TrainingStatus(
-                    steps=min(learner.steps, config.steps), total=config.steps,
-                    mean_return=learner.mean_return, measures=env.measures(),
-                )  # fmt: skip
+                    steps=min(learner.steps, config.steps),
+                    total=config.steps,
+                    mean_return=learner.mean_return,
+                    measures=env.measures(),
+                )
                 log.write(status, losses)
                 if files.checkpoint is not None and learner.updates % config.checkpoint_updates == 0:
                     write_checkpoint(files.checkpoint, learner.checkpoint(), env.layout)
@@ -147,8 +157,10 @@ class _Learner:
         example = self._batch(np.zeros((env.num_envs, O), dtype=np.float32))
         groups = {"actor": ["observation"], "critic": ["observation", "privileged"]}
         spread = {
-            "class_name": "GaussianDistribution", "init_std": config.exploration, "std_type": "log",
-        }  # fmt: skip
+            "class_name": "GaussianDistribution",
+            "init_std": config.exploration,
+            "std_type": "log",
+        }
         hidden = list(config.hidden)
         self._actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
         self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu")
@@ -157,11 +169,18 @@ class _Learner:
             list(self._actor.mlp)[-1].weight.mul_(0.1)
         storage = RolloutStorage("rl", env.num_envs, config.rollout, example, [A])
         self._ppo = PPO(
-            self._actor, self._critic, storage,
-            num_learning_epochs=config.epochs, num_mini_batches=config.batches, clip_param=config.clip,
-            gamma=config.gamma, lam=config.trace, entropy_coef=config.entropy,
-            learning_rate=config.learning_rate, desired_kl=config.divergence,
-        )  # fmt: skip
+            self._actor,
+            self._critic,
+            storage,
+            num_learning_epochs=config.epochs,
+            num_mini_batches=config.batches,
+            clip_param=config.clip,
+            gamma=config.gamma,
+            lam=config.trace,
+            entropy_coef=config.entropy,
+            learning_rate=config.learning_rate,
+            desired_kl=config.divergence,
+        )
         self.steps = self.updates = 0
         self._return = np.zeros(env.num_envs)
         self._recent: collections.deque[float] = collections.deque(maxlen=100)
@@ -215,9 +234,12 @@ class _Learner:
         for i, state in self._ppo.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{name}": value for name, value in state.items()}
         notes = {
-            "trainer": PpoTrainer.name, "steps": self.steps, "updates": self.updates,
-            "learning_rate": self._ppo.learning_rate, "hidden": list(self._config.hidden),
-        }  # fmt: skip
+            "trainer": PpoTrainer.name,
+            "steps": self.steps,
+            "updates": self.updates,
+            "learning_rate": self._ppo.learning_rate,
+            "hidden": list(self._config.hidden),
+        }
         return Checkpoint(tensors=tensors, notes=notes)
 
     def load(self, found: Checkpoint, *, whole: bool) -> None:

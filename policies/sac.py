@@ -137,9 +137,13 @@ class SacTrainer:
         actor = mean.apply(model)
         network = torch.nn.Sequential(*actor.latent_pi, actor.mu, torch.nn.Tanh())
         spec = trained_spec(
-            env, self.name, config, seed,
-            stable_baselines3=stable_baselines3.__version__, torch=str(torch.__version__),
-        )  # fmt: skip
+            env,
+            self.name,
+            config,
+            seed,
+            stable_baselines3=stable_baselines3.__version__,
+            torch=str(torch.__version__),
+        )
         return NetworkPolicy(network, spec)
 
 
@@ -288,9 +292,11 @@ class _Report(BaseCallback):
         if not is_finite(self.model.policy):
             raise diverged(done, self._files.checkpoint)
         status = TrainingStatus(
-            steps=min(done, total), total=total, mean_return=self._adapter.mean_return,
+            steps=min(done, total),
+            total=total,
+            mean_return=self._adapter.mean_return,
             measures=self._adapter.env.measures(),
-        )  # fmt: skip
+        )
         self._log.write(status, _losses(self.model))
         self.keep()
         if self._progress is not None:
@@ -304,8 +310,10 @@ class _Report(BaseCallback):
         model: Any = self.model
         tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
         notes = {
-            "trainer": SacTrainer.name, "steps": self.num_timesteps, "hidden": list(self._config.hidden),
-        }  # fmt: skip
+            "trainer": SacTrainer.name,
+            "steps": self.num_timesteps,
+            "hidden": list(self._config.hidden),
+        }
         found = Checkpoint(tensors={**tensors, "entropy.log": model.log_ent_coef}, notes=notes)
         write_checkpoint(self._files.checkpoint, found, self._adapter.env.layout)
 

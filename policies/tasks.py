@@ -11,14 +11,27 @@ from deal_hw.errors import UnknownNameError
 from deal_hw.policies.trainers import make_trainer
 
 _BALANCE_PPO: Final = {
-    "hidden": (64, 64), "rollout": 32, "gamma": 0.98, "entropy": 0.0, "reward_scale": 0.1,
+    "hidden": (64, 64),
+    "rollout": 32,
+    "gamma": 0.98,
+    "entropy": 0.0,
+    "reward_scale": 0.1,
     "steps": 1_500_000,
-}  # fmt: skip
+}
 _LEGGED_SAC: Final = {
-    "hidden": (128, 128), "gradient_steps": 8, "batch": 256, "learning_rate": 1e-3,
-    "final_learning_rate": 3e-4, "gamma": 0.98, "tau": 0.02, "entropy": 0.1, "warmup": 5_000,
-    "buffer": 500_000, "averaged": 0.05, "steps": 240_000,
-}  # fmt: skip
+    "hidden": (128, 128),
+    "gradient_steps": 8,
+    "batch": 256,
+    "learning_rate": 1e-3,
+    "final_learning_rate": 3e-4,
+    "gamma": 0.98,
+    "tau": 0.02,
+    "entropy": 0.1,
+    "warmup": 5_000,
+    "buffer": 500_000,
+    "averaged": 0.05,
+    "steps": 240_000,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -115,12 +115,22 @@ class TrialPolicy:
             # A session of its own: Ctrl-C in the terminal reaches this process alone, which then kills it.
             self._child = subprocess.Popen(
                 [
-                    sys.executable, "-m", "deal_hw.policies.trial_process", str(fd), str(os.getpid()),
-                    str(settings.memory_bytes), str(settings.processor_s), str(self.path),
+                    sys.executable,
+                    "-m",
+                    "deal_hw.policies.trial_process",
+                    str(fd),
+                    str(os.getpid()),
+                    str(settings.memory_bytes),
+                    str(settings.processor_s),
+                    str(self.path),
                 ],
-                pass_fds=[fd], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._said,
-                start_new_session=True, env={**os.environ, **_ONE_THREAD},
-            )  # fmt: skip
+                pass_fds=[fd],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._said,
+                start_new_session=True,
+                env={**os.environ, **_ONE_THREAD},
+            )
         try:
             self._facts = self._ask()
             self._spec = PolicySpec.from_json(self._facts["spec"])
@@ -259,9 +269,7 @@ def try_policy(
     states = ProbeStates(description)
     rng = np.random.default_rng(settings.seed)
     times: dict[str, list[float]] = {}
-    for probe in (
-        *states.nominal(settings.nominal), *states.extreme(), *states.random(settings.random, rng)
-    ):  # fmt: skip
+    for probe in (*states.nominal(settings.nominal), *states.extreme(), *states.random(settings.random, rng)):
         if probe.fresh:
             behaviour.reset()
         source.wanted = probe.velocity

@@ -97,8 +97,9 @@ class ProbeStates:
             yield self._probe("extreme", f"{end} positions", position=values)
         for sign, word in ((-1.0, "backward"), (1.0, "forward")):
             yield self._probe("extreme", f"top speed {word}", velocity=sign * self._speed)
-            yield self._probe("extreme", f"top speed {word} at the end", position=self._high,
-                              velocity=sign * self._speed)  # fmt: skip
+            yield self._probe(
+                "extreme", f"top speed {word} at the end", position=self._high, velocity=sign * self._speed
+            )
             for i, axis in enumerate("xyz"):
                 unit = sign * np.eye(3)[i]
                 wanted = unit * LARGEST
@@ -138,9 +139,15 @@ class ProbeStates:
         state = RobotState(
             position=self._default if position is None else position,
             velocity=np.zeros(J) if velocity is None else velocity,
-            effort=np.zeros(J), receive_ns=0, device_ns=0, sequence=0, command_sequence=-1, command_age_ns=-1,
-            status=Status.ARMED, body=self._body(turn, gyro) if self._has_base else None,
-        )  # fmt: skip
+            effort=np.zeros(J),
+            receive_ns=0,
+            device_ns=0,
+            sequence=0,
+            command_sequence=-1,
+            command_age_ns=-1,
+            status=Status.ARMED,
+            body=self._body(turn, gyro) if self._has_base else None,
+        )
         return Probe(kind=kind, name=name, state=state, velocity=wanted, fresh=fresh)
 
     def _body(self, turn: FloatArray, gyro: FloatArray) -> BodyState:
@@ -148,8 +155,15 @@ class ProbeStates:
         half = math.sin(angle / 2) * turn / angle if angle > 0 else _REST
         J = len(self._default)
         return BodyState(
-            orientation=np.array([math.cos(angle / 2), *half]), angular_velocity=gyro,
-            acceleration=np.array([0.0, 0.0, 9.81]), foot_force=np.zeros(self._feet),
-            temperature=np.full(J, 30.0), lost=np.zeros(J, dtype=np.int64), battery=1.0, voltage=30.0,
-            current=0.0, sticks=np.zeros(4), buttons=-1,
-        )  # fmt: skip
+            orientation=np.array([math.cos(angle / 2), *half]),
+            angular_velocity=gyro,
+            acceleration=np.array([0.0, 0.0, 9.81]),
+            foot_force=np.zeros(self._feet),
+            temperature=np.full(J, 30.0),
+            lost=np.zeros(J, dtype=np.int64),
+            battery=1.0,
+            voltage=30.0,
+            current=0.0,
+            sticks=np.zeros(4),
+            buttons=-1,
+        )

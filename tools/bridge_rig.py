@@ -69,9 +69,17 @@ class BridgeRig:
         self._events, self._domain, self._prefix = folder / "events.jsonl", str(domain), prefix
         self._events.touch()
         self._robot = VerbProcess(
-            "emulate", "go2", "--port", "lo", "--domain", self._domain,
-            "--events-to", str(self._events), *emulator, prefix=prefix,
-        )  # fmt: skip
+            "emulate",
+            "go2",
+            "--port",
+            "lo",
+            "--domain",
+            self._domain,
+            "--events-to",
+            str(self._events),
+            *emulator,
+            prefix=prefix,
+        )
         self.port = f"tls/{address}:0"
         self.bridge = self._make_bridge()
 
@@ -129,7 +137,20 @@ class BridgeRig:
     def _make_bridge(self) -> VerbProcess:
         options = wire(self.keys, "robot")
         return VerbProcess(
-            "bridge", "go2", "--port", "lo", "--domain", self._domain, "--listen", self.port,
-            "--ca", str(options.ca), "--certificate", str(options.certificate), "--key", str(options.key),
-            *self._options, prefix=self._prefix,
-        )  # fmt: skip
+            "bridge",
+            "go2",
+            "--port",
+            "lo",
+            "--domain",
+            self._domain,
+            "--listen",
+            self.port,
+            "--ca",
+            str(options.ca),
+            "--certificate",
+            str(options.certificate),
+            "--key",
+            str(options.key),
+            *self._options,
+            prefix=self._prefix,
+        )

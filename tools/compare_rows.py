@@ -26,8 +26,8 @@ A cell is a loss where one of these holds. Figures are of the seeds that both fi
                 or below 0.85 (--coverage-least) where the model is right and the method claims intervals. The
                 model is right but for profiles `realistic` and `real` and bench `mismatch`. Methods that
                 claim intervals are `default`, `local`, `output-error` and those that the refinement followed:
-                searches alone, baselines and null rows are compared with OLD only. Without a truth there is
-                no coverage.
+                searches alone, baselines and no-data rows are compared with OLD only. Without a truth there
+                is no coverage.
 
 Alarms (seeds with one) and seconds (median) are shown. Seconds are judged with ``--seconds-limit`` alone, as
 only runs that were timed in turn on one machine can be compared. Where a seed is much worse than it was

@@ -1,7 +1,7 @@
 r"""Turns the public recording of a suspended Unitree Go2 into an NPZ file and its column map.
 
 The recording: iit-DLSLab/sim2real-robot-identification (BSD-3-Clause), datasets/go2/traj_0.pt at commit
-06739ea: the base held in the air, all twelve joints under P-D control by the robot's own drivers (kp 20 and
+06739ea: the base held in the air, all twelve joints under PD control by the robot's own drivers (kp 20 and
 kd 1.5 in that project's configuration), position set-points, 200 samples a second. Its keys: time (T) [s],
 dof_pos and des_dof_pos (T, 12) [rad]; columns leg by leg FL, FR, RL, RR, in each leg hip, thigh, calf (that
 project's collecting script).

@@ -18,7 +18,7 @@ Fetch and convert:
     python tools/convert_so101.py sage/output/real/so101/custom --out so101 --motions multisine
 
 then import for a model with the joint names of mujoco_menagerie (shoulder_pan, ...). Signs and zeros against
-your model are for you to find: under P control gravity makes a joint droop, and must in the model as well.
+your model are for you to find: under P control gravity makes a joint sag, and must in the model as well.
 
     deal-hw data import so101/multisine.npz --columns so101/columns.yaml --model so101.xml \
         --out runs/so101/dataset

@@ -52,9 +52,21 @@ def run(phases: int, domain: int, config: DdsPeerStand) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder, "truth.json")
         options = (
-            "--transport", "dds", "--port", "lo", "--domain", str(domain), "--profile", config.profile,
-            "--seed", str(config.seed), "--duration-s", "120", "--reveal-to", str(truth),
-        )  # fmt: skip
+            "--transport",
+            "dds",
+            "--port",
+            "lo",
+            "--domain",
+            str(domain),
+            "--profile",
+            config.profile,
+            "--seed",
+            str(config.seed),
+            "--duration-s",
+            "120",
+            "--reveal-to",
+            str(truth),
+        )
         with EmulatorProcess("go2", *options) as emulator:
             peer = subprocess.run(
                 [PEER, "stand", str(domain), str(phases)],

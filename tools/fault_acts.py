@@ -159,20 +159,49 @@ def process_cases() -> tuple[Case, ...]:
         Case(name="Ctrl-C", act=signal_run(signal.SIGINT), phases=ANY, codes=(130,)),
         # Before there is a control process, the shell's own stop is all; then the run goes on.
         Case(name="Ctrl-Z, then fg", act=suspend, phases=ANY, codes=(130, 0)),
-        Case(name="the supervisor stands still (SIGSTOP)", act=stop_supervisor, codes=(130,),
-             phases=(TAKING_OVER, ARMING, RISING, RUNNING), within_ms=2000.0, seconds=20.0),
-        Case(name="the supervisor is killed (SIGKILL)", act=signal_run(signal.SIGKILL), phases=connected,
-             codes=(-9,)),
+        Case(
+            name="the supervisor stands still (SIGSTOP)",
+            act=stop_supervisor,
+            codes=(130,),
+            phases=(TAKING_OVER, ARMING, RISING, RUNNING),
+            within_ms=2000.0,
+            seconds=20.0,
+        ),
+        Case(
+            name="the supervisor is killed (SIGKILL)",
+            act=signal_run(signal.SIGKILL),
+            phases=connected,
+            codes=(-9,),
+        ),
         Case(name="the control process stands still (SIGSTOP)", act=stop, codes=(2,), within_ms=1500.0),
         Case(name="the control process is killed (SIGKILL)", act=kill, phases=connected, codes=(2,)),
         Case(name="a policy that hangs", policy="hang", codes=(2,), phases=(), within_ms=1500.0),
-        Case(name="a second run while the first connects, starts or runs", act=second_run(), codes=(130,),
-             phases=(CONNECTING, TAKING_OVER, RISING, RUNNING), seconds=60.0),
-        Case(name="dry run: a policy that hangs", policy="hang", dry=True, expect="untouched", codes=(2,),
-             phases=()),
-        Case(name="dry run: the control process is killed", act=kill_control_sometime, dry=True,
-             policy="hold", expect="untouched", codes=(2,), phases=(CONNECTING,), seconds=6.0),
-    )  # fmt: skip
+        Case(
+            name="a second run while the first connects, starts or runs",
+            act=second_run(),
+            codes=(130,),
+            phases=(CONNECTING, TAKING_OVER, RISING, RUNNING),
+            seconds=60.0,
+        ),
+        Case(
+            name="dry run: a policy that hangs",
+            policy="hang",
+            dry=True,
+            expect="untouched",
+            codes=(2,),
+            phases=(),
+        ),
+        Case(
+            name="dry run: the control process is killed",
+            act=kill_control_sometime,
+            dry=True,
+            policy="hold",
+            expect="untouched",
+            codes=(2,),
+            phases=(CONNECTING,),
+            seconds=6.0,
+        ),
+    )
 
 
 def link_cases(
@@ -189,7 +218,12 @@ def link_cases(
         for when, phases in ((" as the run ends", (ENDING,)), ("", (RISING, RUNNING, LYING_DOWN))):
             for seconds in LINK_S:
                 yield Case(
-                    name=words.format(f"{seconds:g} s") + when, act=make(seconds), phases=phases,
-                    codes=(0, 3) if phases == (ENDING,) else (3,), from_ms=1e3 * seconds,
-                    emulator=("--cut-s", f"{seconds}") if cut else (), within_ms=2500.0, wires=wires,
-                )  # fmt: skip
+                    name=words.format(f"{seconds:g} s") + when,
+                    act=make(seconds),
+                    phases=phases,
+                    codes=(0, 3) if phases == (ENDING,) else (3,),
+                    from_ms=1e3 * seconds,
+                    emulator=("--cut-s", f"{seconds}") if cut else (),
+                    within_ms=2500.0,
+                    wires=wires,
+                )

@@ -30,8 +30,14 @@ UNDER_TEST = os.environ.get("DEAL_HW_PYTHON", sys.executable)
 PATIENCE_S = 75.0
 """A run that has not ended by then hangs [s]."""
 CONNECTING, TAKING_OVER, ARMING, RISING, RUNNING, LYING_DOWN, ENDING = (
-    "connecting", "taking over", "arming", "standing up", "running", "lying down", "ending",
-)  # fmt: skip
+    "connecting",
+    "taking over",
+    "arming",
+    "standing up",
+    "running",
+    "lying down",
+    "ending",
+)
 COMMANDING = (RISING, RUNNING, LYING_DOWN, ENDING)
 ANY = (CONNECTING, TAKING_OVER, ARMING, *COMMANDING)
 _POLL_S = 0.004
@@ -158,9 +164,14 @@ class Rig(ABC):
         moment = f"{self.rng.uniform(0.2, self.longest_s):.3f}"
         options = [word.replace("{t}", moment) for word in self.case.emulator]
         process = EmulatorProcess(
-            self.robot, *self.emulator_options(), "--reveal-to", str(self.folder / "emulator.json"),
-            "--events-to", str(self.folder / "events"), *options,
-        )  # fmt: skip
+            self.robot,
+            *self.emulator_options(),
+            "--reveal-to",
+            str(self.folder / "emulator.json"),
+            "--events-to",
+            str(self.folder / "events"),
+            *options,
+        )
         (self.folder / "events").touch()
         with process, self._before(process):
             yield process
@@ -196,9 +207,13 @@ class Rig(ABC):
         (self.folder / "out").mkdir(exist_ok=True)
         with (self.folder / "out" / out).open("w") as file:
             return subprocess.Popen(
-                self.command(out, port), stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                text=True, process_group=0,
-            )  # fmt: skip
+                self.command(out, port),
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                text=True,
+                process_group=0,
+            )
 
     def start(self) -> None:
         """Start the run."""

@@ -97,10 +97,17 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         if any(word == "{t}" for word in case.emulator) and rig.fault_ns < 0 and case.expect == "passive":
             raise SpoiledError("the run ended before the emulator's fault began")
     return {
-        "phase": rig.phase, "exit_code": rig.run.returncode, **row, **judge(rig, report),
-        "operator": headline(rig.output), "notes": rig.said, "complaints": complaints(rig, report, row),
-        "fault_ns": rig.fault_ns, "start_ns": rig.start_ns, "end_ns": time.monotonic_ns(),
-    }  # fmt: skip
+        "phase": rig.phase,
+        "exit_code": rig.run.returncode,
+        **row,
+        **judge(rig, report),
+        "operator": headline(rig.output),
+        "notes": rig.said,
+        "complaints": complaints(rig, report, row),
+        "fault_ns": rig.fault_ns,
+        "start_ns": rig.start_ns,
+        "end_ns": time.monotonic_ns(),
+    }
 
 
 def recording(folder: Path) -> dict[str, Any]:
@@ -240,10 +247,16 @@ def run_cases(
                     ms = round(longest_ns * 1e-6)
                     found["complaints"].append(f"the whole machine stood still for {ms} ms in that run")
             load.append(round(os.getloadavg()[0], 1))
-            yield summary({
-                "fault": case.name, "wire": wire, "expected": case.expect, "from_return": case.from_ms > 0,
-                "load": [*row["load"], *load], "repetitions": [*row["repetitions"], *done],
-            })  # fmt: skip
+            yield summary(
+                {
+                    "fault": case.name,
+                    "wire": wire,
+                    "expected": case.expect,
+                    "from_return": case.from_ms > 0,
+                    "load": [*row["load"], *load],
+                    "repetitions": [*row["repetitions"], *done],
+                }
+            )
 
 
 def summary(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -259,9 +272,11 @@ def summary(row: Mapping[str, Any]) -> dict[str, Any]:
         "median_ms": round(statistics.median(times), 1) if times else None,
         "worst_ms": worst["passive_ms"] if worst else None,
         "pause_beside_worst_ms": worst["pause_ms"] if worst else None,
-        "count": len(done), "timed": len(times), "went_on": len(went_on),
+        "count": len(done),
+        "timed": len(times),
+        "went_on": len(went_on),
         "as_expected": sum(not r["complaints"] for r in done),
-    }  # fmt: skip
+    }
 
 
 # Pages and programs.
@@ -343,8 +358,14 @@ def main(
     )
     parser.add_argument("--list", action="store_true", help="list the rows")
     parser.add_argument("--out", type=Path, default=None, help="results; repetitions in it count")
-    parser.add_argument("--table", type=Path, nargs="+", default=None, metavar="FILE",
-                        help="write a page (first) from results (others), and measure nothing")  # fmt: skip
+    parser.add_argument(
+        "--table",
+        type=Path,
+        nargs="+",
+        default=None,
+        metavar="FILE",
+        help="write a page (first) from results (others), and measure nothing",
+    )
     given = parser.parse_args()
     if given.table is not None:
         results = [json.loads(path.read_text(encoding="utf-8")) for path in given.table[1:]]

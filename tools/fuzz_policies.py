@@ -46,11 +46,51 @@ NETWORK_S = 20.0
 """Most that a network may take in the worker, its imports included [s]."""
 SETTINGS = TrialSettings(processor_s=5, nominal=2, random=5)
 ODD: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, 10**9, 10**400, 0.0, -0.0, 1e-320, 1e300, float("nan"), float("inf"),
-    float("-inf"), "", "1", "nan", "cart", "pole", "x", "z", "position", "velocity", "action", "gravity",
-    "height", "command", "torque", "FL_hip_joint", "\x00", "\ud800", "x" * 10_000, [], {}, [0.0], [[]],
-    [None], {"a": 1}, [1.0] * 2, [1.0] * 12, ["x"] * 300, ["cart", "pole"], [0.0] * 100_000,
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    10**9,
+    10**400,
+    0.0,
+    -0.0,
+    1e-320,
+    1e300,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    "",
+    "1",
+    "nan",
+    "cart",
+    "pole",
+    "x",
+    "z",
+    "position",
+    "velocity",
+    "action",
+    "gravity",
+    "height",
+    "command",
+    "torque",
+    "FL_hip_joint",
+    "\x00",
+    "\ud800",
+    "x" * 10_000,
+    [],
+    {},
+    [0.0],
+    [[]],
+    [None],
+    {"a": 1},
+    [1.0] * 2,
+    [1.0] * 12,
+    ["x"] * 300,
+    ["cart", "pole"],
+    [0.0] * 100_000,
+)
 OPERATORS = (
     b"Relu",
     b"Tanh",
@@ -171,8 +211,13 @@ def damaged_network(seed: int, number: int) -> tuple[str, bytes]:
     data = bytearray(Path(str(shipped_policy(robot))).read_bytes())
     for _ in range(rng.choice((1, 1, 2, 4, 16))):
         # Graph and metadata are short, and stand at both ends; between them are weights.
-        at = rng.choice((rng.randrange(min(800, len(data))), -1 - rng.randrange(min(8000, len(data))),
-                         rng.randrange(len(data)))) % len(data)  # fmt: skip
+        at = rng.choice(
+            (
+                rng.randrange(min(800, len(data))),
+                -1 - rng.randrange(min(8000, len(data))),
+                rng.randrange(len(data)),
+            )
+        ) % len(data)
         how = rng.randrange(6)
         if how == 0:
             data[at] ^= 1 << rng.randrange(8)

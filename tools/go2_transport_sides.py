@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.cadence import Cadence, Spread
+from deal_hw.control.loop_timing import LoopTiming, Spread
 from deal_hw.control.realtime import become_realtime, die_with_parent
 from deal_hw.drivers import make_topic_transport
 from deal_hw.drivers.go2.messages.topics import LOW_COMMAND, LOW_STATE
@@ -53,7 +53,7 @@ def read_mark(topic: str, payload: bytes) -> tuple[int, int]:
 
 @dataclass(slots=True)
 class Arrivals:
-    """What arrived of a numbered stream; number 0 is a greeting and does not count.
+    """What arrived of a numbered stream; number 0 is a hello and does not count.
 
     Attributes:
         count: Messages that arrived, each number once.
@@ -129,7 +129,7 @@ class Controller:
 
     def __init__(self, transport: TopicTransport, clock: Clock, rate_hz: float, freeze: Freeze) -> None:
         self._transport, self._clock, self._freeze = transport, clock, freeze
-        self._cadence = Cadence(clock, rate_hz)
+        self._loop_timing = LoopTiming(clock, rate_hz)
         self._states = Arrivals()
         self._quiet, self._frozen = _Cycles(), _Cycles()
         self._touched = [0, 0]
@@ -145,7 +145,7 @@ class Controller:
             self._cycle(number)
         wall_ns = self._clock.now_ns() - begun_ns
         return {
-            "cadence": self._cadence.report().to_json(),
+            "loop_timing": self._loop_timing.report().to_json(),
             "period_error": _plain(Spread.of(self._period_errors)),
             "quiet": self._quiet.to_json(),
             "frozen": self._frozen.to_json() if self._freeze.first else None,
@@ -165,10 +165,10 @@ class Controller:
         raise TransportTimeoutError(f"controller and robot did not find each other within {_MEETING_S:g} s")
 
     def _cycle(self, number: int) -> None:
-        self._cadence.begin()
+        self._loop_timing.begin()
         begun_ns = self._clock.now_ns()
         if self._begun_ns:
-            self._period_errors.append(abs(begun_ns - self._begun_ns - self._cadence.period_ns))
+            self._period_errors.append(abs(begun_ns - self._begun_ns - self._loop_timing.period_ns))
         self._begun_ns = begun_ns
         self._freeze.act(number)
         lost = self._drain()
@@ -180,7 +180,7 @@ class Controller:
         done_ns = self._clock.now_ns()
         suffers = self._freeze.first and self._freeze.first <= number <= self._freeze.settled
         part = self._frozen if suffers else self._quiet
-        part.note(begun_ns - self._cadence.late_ns, done_ns)
+        part.note(begun_ns - self._loop_timing.late_ns, done_ns)
         part.works.append(done_ns - begun_ns)
         if self._states.newest_sent_ns:
             part.ages.append(sent_ns - self._states.newest_sent_ns)
@@ -237,7 +237,7 @@ class RobotSide:
 
     def __init__(self, transport: TopicTransport, clock: Clock, rate_hz: float) -> None:
         self._transport, self._clock = transport, clock
-        self._cadence = Cadence(clock, rate_hz)
+        self._loop_timing = LoopTiming(clock, rate_hz)
         self._commands = Arrivals()
         self._stopped = False
 
@@ -254,15 +254,15 @@ class RobotSide:
         cpu_ns, begun_ns = time.process_time_ns(), self._clock.now_ns()
         number = 0
         while not self._stopped:
-            self._cadence.begin()
+            self._loop_timing.begin()
             number += 1
             sent_ns = self._clock.now_ns()
             with contextlib.suppress(TransportError):
                 self._transport.send(Message(LOW_STATE, mark(LOW_STATE, number, sent_ns), 0))
-            self._listen(self._cadence.deadline_ns)
+            self._listen(self._loop_timing.deadline_ns)
         wall_ns = max(1, self._clock.now_ns() - begun_ns)
         return {
-            "cadence": self._cadence.report().to_json(),
+            "loop_timing": self._loop_timing.report().to_json(),
             "sent": number,
             "commands": self._commands.to_json(),
             "cpu_share": (time.process_time_ns() - cpu_ns) / wall_ns,

@@ -114,10 +114,22 @@ def _latency(path: str, config: MeasureBridge, keys: Path) -> dict[str, Any]:
             own = wire(keys, "robot")
             running.enter_context(
                 VerbProcess(
-                    "bridge", "go2", "--port", "lo", "--domain", domain, "--listen", end_point,
-                    "--ca", str(own.ca), "--certificate", str(own.certificate), "--key", str(own.key),
+                    "bridge",
+                    "go2",
+                    "--port",
+                    "lo",
+                    "--domain",
+                    domain,
+                    "--listen",
+                    end_point,
+                    "--ca",
+                    str(own.ca),
+                    "--certificate",
+                    str(own.certificate),
+                    "--key",
+                    str(own.key),
                 )
-            )  # fmt: skip
+            )
         client_wire = "dds" if path == "dds" else "zenoh"
         controller = running.enter_context(_side("controller", client_wire, end_point, config, keys))
         there, _ = controller.communicate(timeout=config.seconds + 60.0)
@@ -140,9 +152,12 @@ def _side(
         own = wire(keys, name)
         options = WireOptions(listen=name == "robot", ca=own.ca, certificate=own.certificate, key=own.key)
     orders = {
-        "transport": link, "port": end_point if link == "zenoh" else "lo", "wire": options.to_json(),
-        "seconds": config.seconds, "parent_pid": os.getpid(),
-    }  # fmt: skip
+        "transport": link,
+        "port": end_point if link == "zenoh" else "lo",
+        "wire": options.to_json(),
+        "seconds": config.seconds,
+        "parent_pid": os.getpid(),
+    }
     with subprocess.Popen(
         [sys.executable, str(SIDES), name, json.dumps(orders)], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -273,9 +288,11 @@ def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
                 admitted += client.status["admitted"]
                 rig.await_commands([*told, "damping"])
     return {
-        "from": "start of the new process to the first damping at the robot", **_spread(delays),
-        "old_stream_refused": refused, "old_stream_admitted": admitted,
-    }  # fmt: skip
+        "from": "start of the new process to the first damping at the robot",
+        **_spread(delays),
+        "old_stream_refused": refused,
+        "old_stream_admitted": admitted,
+    }
 
 
 def refuse(config: MeasureBridge, folder: Path) -> dict[str, Any]:

@@ -21,9 +21,16 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 SECONDS = 1.2
 HOMING, ARMED, IDLE, HELD = "homing", "armed", "idle", "held"
 BY_ITSELF = (
-    "gone", "cut", "frozen", "bus-off", "transmit buffer full", "node lost", "belt servo restarts",
-    "overload", "pole servo absent",
-)  # fmt: skip
+    "gone",
+    "cut",
+    "frozen",
+    "bus-off",
+    "transmit buffer full",
+    "node lost",
+    "belt servo restarts",
+    "overload",
+    "pole servo absent",
+)
 CAN = ("can", "odrive")
 DYNAMIXEL = ("dynamixel",)
 STOPPED = "stopped"
@@ -120,20 +127,37 @@ def after(option: str) -> tuple[str, ...]:
 CASES = (
     Case(name="none", expect="goes on", codes=(0,)),
     *process_cases(),
-    Case(name="both processes are killed (SIGKILL); the device's watchdog stops the motor", act=kill_both,
-         codes=(-9,), phases=(RUNNING,)),
+    Case(
+        name="both processes are killed (SIGKILL); the device's watchdog stops the motor",
+        act=kill_both,
+        codes=(-9,),
+        phases=(RUNNING,),
+    ),
     *link_cases({"the cable is cut for {}": freeze_link}, cut=True),
-    *(Case(name=f"the cable is pulled, and put back after {seconds:g} s", codes=(3, 0),
-           emulator=(*after("--vanish-after-s"), "--return-after-s", f"{seconds}"))
-      for seconds in LINK_S),
+    *(
+        Case(
+            name=f"the cable is pulled, and put back after {seconds:g} s",
+            codes=(3, 0),
+            emulator=(*after("--vanish-after-s"), "--return-after-s", f"{seconds}"),
+        )
+        for seconds in LINK_S
+    ),
     Case(name="5 % of the frames lost", emulator=("--drop", "0.05"), expect="goes on", codes=(0,)),
     Case(name="60 % of the frames corrupt", emulator=("--corrupt", "0.6"), codes=(2, 3)),
     Case(name="the firmware hangs", emulator=after("--freeze-after-s")),
-    *(Case(name=f"bus-off for {seconds:g} s", wires=CAN,
-           emulator=(*after("--bus-off-after-s"), "--bus-off-s", f"{seconds}"))
-      for seconds in (0.1, 1.5)),
-    Case(name="the adapter's transmit buffer is full for 0.3 s", wires=CAN,
-         emulator=(*after("--tx-full-after-s"), "--tx-full-s", "0.3")),
+    *(
+        Case(
+            name=f"bus-off for {seconds:g} s",
+            wires=CAN,
+            emulator=(*after("--bus-off-after-s"), "--bus-off-s", f"{seconds}"),
+        )
+        for seconds in (0.1, 1.5)
+    ),
+    Case(
+        name="the adapter's transmit buffer is full for 0.3 s",
+        wires=CAN,
+        emulator=(*after("--tx-full-after-s"), "--tx-full-s", "0.3"),
+    ),
     Case(name="the node is lost, the adapter stays", emulator=after("--lost-node-after-s"), wires=CAN),
     Case(name="two devices under one node number", emulator=("--duplicate-node",), codes=(2,), wires=CAN),
     Case(name="a DBC of another version", emulator=("--dbc-version", "2"), codes=(2,), wires=CAN),
@@ -142,14 +166,22 @@ CASES = (
     Case(name="the belt servo reports overload", emulator=after("--servo-overload-after-s"), wires=DYNAMIXEL),
     Case(name="the pole servo falls silent", emulator=after("--servo-absent-after-s"), wires=DYNAMIXEL),
     Case(name="two servos with one id", emulator=("--servo-duplicate-id",), codes=(2,), wires=DYNAMIXEL),
-    Case(name="a servo in another operating mode", emulator=("--servo-wrong-mode",), codes=(2,),
-         wires=DYNAMIXEL),
+    Case(
+        name="a servo in another operating mode",
+        emulator=("--servo-wrong-mode",),
+        codes=(2,),
+        wires=DYNAMIXEL,
+    ),
     Case(name="a servo with protocol 1.0", emulator=("--servo-protocol", "1"), codes=(2,), wires=DYNAMIXEL),
-    Case(name="servos of another baud rate", emulator=("--servo-baud-rate", "57600"), codes=(2,),
-         wires=DYNAMIXEL),
+    Case(
+        name="servos of another baud rate",
+        emulator=("--servo-baud-rate", "57600"),
+        codes=(2,),
+        wires=DYNAMIXEL,
+    ),
     Case(name="the policy answers NaN", policy="nan"),
     Case(name="the policy takes over 100 ms", policy="late"),
-)  # fmt: skip
+)
 TITLE = "Cart-pole: from a fault to a motor without torque"
 WORDS = (
     "By `tools/measure_cartpole_faults.py` on the emulated cart-pole, profile `sensor`, over a",

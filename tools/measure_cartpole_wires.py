@@ -52,7 +52,7 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
         with robot, priority(50, children=True):
             robot.home(20.0)
             robot.arm(2.0)
-            errors = robot.link_errors
+            errors = robot.transport_errors
             period_ns = round(1e9 / rate_hz)
             begin_ns = clock.now_ns() + period_ns
             for cycle in range(round(seconds * rate_hz)):
@@ -70,38 +70,48 @@ def measure(transport: str, rate_hz: int, seconds: float) -> dict[str, Any]:
                 robot.send_command(command)
                 open_at[robot.last_sequence] = now_ns
             robot.passive()
-            errors = robot.link_errors - errors
+            errors = robot.transport_errors - errors
         out, said = emulator.stop()
     return {
-        "transport": transport, "rate_hz": rate_hz, "seconds": seconds, "commands": len(late),
-        "named": len(trips), "round_trip_ms": spread(trips), "late_ms": spread(late), "link_errors": errors,
-        "wire_ms": WIRE_MS.get(transport), "emulator": (out + said).strip().splitlines()[-1],
-    }  # fmt: skip
+        "transport": transport,
+        "rate_hz": rate_hz,
+        "seconds": seconds,
+        "commands": len(late),
+        "named": len(trips),
+        "round_trip_ms": spread(trips),
+        "late_ms": spread(late),
+        "transport_errors": errors,
+        "wire_ms": WIRE_MS.get(transport),
+        "emulator": (out + said).strip().splitlines()[-1],
+    }
 
 
 def spread(values: list[float]) -> dict[str, float]:
     """Return p50, p99 and max."""
     array = np.array(values or [np.nan])
     return {
-        "p50": round(float(np.percentile(array, 50)), 3), "p99": round(float(np.percentile(array, 99)), 3),
+        "p50": round(float(np.percentile(array, 50)), 3),
+        "p99": round(float(np.percentile(array, 99)), 3),
         "max": round(float(array.max()), 3),
-    }  # fmt: skip
+    }
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the rows as Markdown."""
     lines = [
         "| wire | commands a second | seconds | round trip p50 / p99 / max [ms] | "
-        "cycle late p50 / p99 / max [ms] | command, state on the wire [ms] | link errors |",
+        "cycle late p50 / p99 / max [ms] | command, state on the wire [ms] | transport errors |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        trip, late = (" / ".join(f"{row[name][k]:.2f}" for k in ("p50", "p99", "max")) for name in
-                      ("round_trip_ms", "late_ms"))  # fmt: skip
+        trip, late = (
+            " / ".join(f"{row[name][k]:.2f}" for k in ("p50", "p99", "max"))
+            for name in ("round_trip_ms", "late_ms")
+        )
         wire = ", ".join(f"{value:.2f}" for value in row["wire_ms"] or ())
         lines.append(
             f"| {row['transport']} | {row['rate_hz']} | {row['seconds']:g} | {trip} | {late} | {wire} | "
-            f"{row['link_errors']} |"
+            f"{row['transport_errors']} |"
         )
     return "\n".join(lines)
 

@@ -82,10 +82,14 @@ def measure(
     wire_bytes = QUESTION_BYTES + bus.answer_bytes(len(servos), BLOCK_BYTES, not absent)
     p50, p99 = np.percentile(trips, [50, 99])
     return {
-        "rate_hz": rate_hz, "questions": count, "missed": missed, "p50_ms": round(float(p50), 3),
-        "p99_ms": round(float(p99), 3), "max_ms": round(max(trips), 3),
+        "rate_hz": rate_hz,
+        "questions": count,
+        "missed": missed,
+        "p50_ms": round(float(p50), 3),
+        "p99_ms": round(float(p99), 3),
+        "max_ms": round(max(trips), 3),
         "wire_ms": round(1e4 * wire_bytes / settings.baud_rate, 3),
-    }  # fmt: skip
+    }
 
 
 @contextlib.contextmanager

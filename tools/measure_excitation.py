@@ -1,8 +1,8 @@
 """Does an excitation help the calibration itself: error and interval width on emulated cart-poles.
 
-Each robot is recorded once with each excitation, and calibrated by the default method; K9, xi 5.
+Each robot is recorded once with each excitation, and calibrated by the default method; K9, range ratio 5.
 
-    deal-hw excite cartpole --out excitation.json
+    deal-hw design-excitation cartpole --out excitation.json
     python tools/measure_excitation.py --seeds 0,1,2 --excite rich,multisine,excitation.json --out rows.json
 """
 
@@ -27,7 +27,7 @@ from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
 from deal_hw.workflows.shipped import shipped_policy
 
-XI = 5.0
+RANGE_RATIO = 5.0
 
 
 def plan_of(name: str, seconds: float, seed: int) -> RunPlan:
@@ -41,21 +41,32 @@ def plan_of(name: str, seconds: float, seed: int) -> RunPlan:
 
 def measure(profile: str, seed: int, name: str, seconds: float, threads: int | None) -> dict[str, Any]:
     """Record one robot with one excitation, calibrate, compare with the truth."""
-    truth = draw_truth(profile, seed, xi=XI)
-    space = k9_space().with_ratio(XI)
+    truth = draw_truth(profile, seed, range_ratio=RANGE_RATIO)
+    space = k9_space().with_ratio(RANGE_RATIO)
     plan = plan_of(name, seconds, seed)
     run = VirtualCartpole(truth).run(make_behaviour(plan, DESCRIPTION), plan.seconds)
     row: dict[str, Any] = {
-        "profile": profile, "seed": seed, "excite": name, "seconds_recorded": plan.seconds,
-        "outcome": run.report.outcome.value, "reason": run.report.reason, "clipped": dict(run.report.clipped),
-    }  # fmt: skip
+        "profile": profile,
+        "seed": seed,
+        "excite": name,
+        "seconds_recorded": plan.seconds,
+        "outcome": run.report.outcome.value,
+        "reason": run.report.reason,
+        "clipped": dict(run.report.clipped),
+    }
     if run.report.outcome.value != "finished":
         return row
     begin = time.perf_counter()
     result = calibrate_episodes(
-        load_model(DESCRIPTION), space, [align(run.trajectory, DESCRIPTION)], [], method="default",
-        budget=Budget(), rng=np.random.default_rng(seed), threads=threads,
-    )  # fmt: skip
+        load_model(DESCRIPTION),
+        space,
+        [align(run.trajectory, DESCRIPTION)],
+        [],
+        method="default",
+        budget=Budget(),
+        rng=np.random.default_rng(seed),
+        threads=threads,
+    )
     theta = np.array([truth.parameters[p] for p in space.names])
     error = np.abs(result.estimate / theta - 1)
     width = np.log(result.interval[:, 1] / result.interval[:, 0])

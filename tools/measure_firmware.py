@@ -19,10 +19,15 @@ def armed_chip() -> Chip:
     """Return a chip that was homed and armed by hand."""
     chip = Chip(eeprom(Settings(65536, 65536, 65536, 65536, 1, 0), 16.0))
     plan: list[tuple[int, bytes, int, int, bool]] = [
-        (20, b"", 0, 0, False), (10, b"\0" + protocol.encode(protocol.Home(1)), 0, 0, False),
-        (10, b"", 0, 0, True), (395, b"", 40, 0, False), (50, b"", 0, 0, False), (128, b"", 0, 16, False),
-        (400, b"", 0, 0, False), (10, protocol.encode(protocol.Arm(2)), 0, 0, False),
-    ]  # fmt: skip
+        (20, b"", 0, 0, False),
+        (10, b"\0" + protocol.encode(protocol.Home(1)), 0, 0, False),
+        (10, b"", 0, 0, True),
+        (395, b"", 40, 0, False),
+        (50, b"", 0, 0, False),
+        (128, b"", 0, 16, False),
+        (400, b"", 0, 0, False),
+        (10, protocol.encode(protocol.Arm(2)), 0, 0, False),
+    ]
     for ticks, data, cart, pole, left in plan:
         for _ in range(ticks):
             chip.tick(cart, pole, (left, False), data)

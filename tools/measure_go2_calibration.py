@@ -67,8 +67,17 @@ def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
             run, row["collect"], row["failed_recordings"] = recorded(options, seed, Path(folder))
             row["collect_s"] = round(time.monotonic() - began, 1)
             # The first episode is fitted, the second only judges.
-            verb("calibrate", str(run / "dataset"), "--holdout", "1", "--no-report", "--no-advise",
-                 "--out", str(run), *options.calibrate.split())  # fmt: skip
+            verb(
+                "calibrate",
+                str(run / "dataset"),
+                "--holdout",
+                "1",
+                "--no-report",
+                "--no-advise",
+                "--out",
+                str(run),
+                *options.calibrate.split(),
+            )
             result = json.loads((run / "calibration" / "result.json").read_text(encoding="utf-8"))
             truth = Truth.from_json(json.loads((run / "truth.json").read_text(encoding="utf-8")))
             row |= judge(result, truth)
@@ -106,15 +115,34 @@ def record(options: argparse.Namespace, seed: int, run: Path) -> list[str]:
     )
     said = []
     with EmulatorProcess(
-        "go2", *wire, "--port", PORTS[options.transport], "--suspended", "--profile", options.profile,
-        "--seed", str(seed), "--reveal-to", str(run / "truth.json"),
-    ) as emulator:  # fmt: skip
+        "go2",
+        *wire,
+        "--port",
+        PORTS[options.transport],
+        "--on-stand",
+        "--profile",
+        options.profile,
+        "--seed",
+        str(seed),
+        "--reveal-to",
+        str(run / "truth.json"),
+    ) as emulator:
         for excite, seconds in (("multisine", options.seconds), (options.heldout, options.heldout_seconds)):
             plan = excite
             if excite not in ("multisine", "chirp"):
                 plan = str(run / "heldout.json")
-                verb("excite", DESCRIPTION.name, "--family", excite, "--seconds", str(seconds),
-                     "--seed", str(seed), "--out", plan)  # fmt: skip
+                verb(
+                    "design-excitation",
+                    DESCRIPTION.name,
+                    "--family",
+                    excite,
+                    "--seconds",
+                    str(seconds),
+                    "--seed",
+                    str(seed),
+                    "--out",
+                    plan,
+                )
             words = ("--excite", plan, "--seconds", str(seconds), "--seed", str(seed), "--out", str(run))
             report = verb("collect", DESCRIPTION.name, *wire, "--port", emulator.port, *words)
             said.append(report.replace(str(run), "RUN"))

@@ -152,23 +152,54 @@ WIRE = after("--wire-after-s")
 CASES = (
     Case(name="none", expect="goes on", codes=(0,)),
     *process_cases(),
-    Case(name="both processes are killed (SIGKILL)", act=kill_both, expect="stiff", codes=(-9,),
-         phases=(RISING, RUNNING, LYING_DOWN)),
-    Case(name="a second run by another address, as from another computer", act=second_run(elsewhere=True),
-         codes=(130,), phases=(CONNECTING, TAKING_OVER, RISING, RUNNING), seconds=60.0, wires=("zenoh",)),
-    Case(name="killed while taking over from sport mode, which stands", act=signal_control(signal.SIGKILL),
-         phases=(TAKING_OVER,), emulator=("--start", "standing"), expect="unhomed", codes=(2,)),
-    *(case for wire, kinds, cut in (
-        ("zenoh", {"the link freezes for {}": freeze_link, "the link is reset for {}": reset_link}, False),
-        ("dds", {"the link is cut for {}": freeze_link}, True),
-    ) for case in link_cases(kinds, cut, (wire,))),
+    Case(
+        name="both processes are killed (SIGKILL)",
+        act=kill_both,
+        expect="stiff",
+        codes=(-9,),
+        phases=(RISING, RUNNING, LYING_DOWN),
+    ),
+    Case(
+        name="a second run by another address, as from another computer",
+        act=second_run(elsewhere=True),
+        codes=(130,),
+        phases=(CONNECTING, TAKING_OVER, RISING, RUNNING),
+        seconds=60.0,
+        wires=("zenoh",),
+    ),
+    Case(
+        name="killed while taking over from sport mode, which stands",
+        act=signal_control(signal.SIGKILL),
+        phases=(TAKING_OVER,),
+        emulator=("--start", "standing"),
+        expect="unhomed",
+        codes=(2,),
+    ),
+    *(
+        case
+        for wire, kinds, cut in (
+            (
+                "zenoh",
+                {"the link freezes for {}": freeze_link, "the link is reset for {}": reset_link},
+                False,
+            ),
+            ("dds", {"the link is cut for {}": freeze_link}, True),
+        )
+        for case in link_cases(kinds, cut, (wire,))
+    ),
     Case(name="5 % of the states lost", emulator=(*WIRE, "--drop", "0.05"), expect="goes on", codes=(0,)),
-    Case(name="5 % of the states twice", emulator=(*WIRE, "--duplicate", "0.05"), expect="goes on",
-         codes=(0,)),
-    Case(name="5 % of the states after their successor", emulator=(*WIRE, "--reorder", "0.05"),
-         expect="goes on", codes=(0,)),
-    Case(name="5 % of the states corrupt", emulator=(*WIRE, "--corrupt", "0.05"), expect="goes on",
-         codes=(0,)),
+    Case(
+        name="5 % of the states twice", emulator=(*WIRE, "--duplicate", "0.05"), expect="goes on", codes=(0,)
+    ),
+    Case(
+        name="5 % of the states after their successor",
+        emulator=(*WIRE, "--reorder", "0.05"),
+        expect="goes on",
+        codes=(0,),
+    ),
+    Case(
+        name="5 % of the states corrupt", emulator=(*WIRE, "--corrupt", "0.05"), expect="goes on", codes=(0,)
+    ),
     Case(name="60 % of the states corrupt", emulator=(*WIRE, "--corrupt", "0.6")),
     Case(name="the robot falls silent", emulator=after("--freeze-after-s")),
     Case(name="the same state again and again", emulator=after("--stale-after-s")),
@@ -183,7 +214,7 @@ CASES = (
     Case(name="the policy answers NaN", policy="nan"),
     Case(name="the policy takes over 100 ms", policy="late"),
     Case(name="a second controller", act=second_controller, phases=(RISING, RUNNING), expect="contested"),
-)  # fmt: skip
+)
 TITLE = "Go2: from a fault to damping"
 WORDS = (
     "By `tools/measure_go2_faults.py` on the emulated robot, profile `sensor`, over real wires.",

@@ -55,10 +55,14 @@ def measure(policy: OnnxPolicy, profile: str, seed: int | None, rounds: int) -> 
     truth = nominal_truth(profile) if seed is None else draw_truth(profile, seed)
     done = walk(truth, policy, Rounds(), rounds * PROFILE_S, record=False)
     row: dict[str, Any] = {
-        "profile": profile, "seed": seed, "seconds": rounds * PROFILE_S,
-        "outcome": done.report.outcome.value, "reason": done.report.reason, "clipped": done.report.clipped,
+        "profile": profile,
+        "seed": seed,
+        "seconds": rounds * PROFILE_S,
+        "outcome": done.report.outcome.value,
+        "reason": done.report.reason,
+        "clipped": done.report.clipped,
         "cycles": done.report.cycles_sent,
-    }  # fmt: skip
+    }
     error = None if done.wanted is None else velocity_error(done.track, done.wanted)
     if error is not None:
         columns = ("velocity_error", "yaw_error", "ahead", "left", "turn")

@@ -43,10 +43,23 @@ REFINED = "default, refined"
 """What `deal-hw calibrate` does without options."""
 
 SEARCHES = (
-    "eki", "deal", "deal-paper", "deal-paper-literal", "deal-paper-fn", "deal-paper-pn", "deal-paper-flat",
-    "deal-paper-replay", "easi-log", "bo-critic",
-    "easi", "bo", "cma", "gauss-newton", "ekf", "random",
-)  # fmt: skip
+    "eki",
+    "deal",
+    "deal-paper",
+    "deal-paper-literal",
+    "deal-paper-fn",
+    "deal-paper-pn",
+    "deal-paper-flat",
+    "deal-paper-replay",
+    "easi-log",
+    "bo-critic",
+    "easi",
+    "bo",
+    "cma",
+    "gauss-newton",
+    "ekf",
+    "random",
+)
 """Methods with generations; a generation of `ekf` is a pass along the recording."""
 
 WHOLES = ("least-squares", "least-squares-multistart", "mujoco-sysid", "local", "output-error", REFINED)
@@ -78,10 +91,18 @@ class MallocInfo(ctypes.Structure):
     _fields_ = [
         (name, ctypes.c_size_t)
         for name in (
-            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks",
+            "arena",
+            "ordblks",
+            "smblks",
+            "hblks",
+            "hblkhd",
+            "usmblks",
+            "fsmblks",
+            "uordblks",
+            "fordblks",
             "keepcost",
         )
-    ]  # fmt: skip
+    ]
 
 
 def heap_reader() -> Callable[[], float] | None:

@@ -34,11 +34,18 @@ def cycle(number: int, start_ns: int, rng: np.random.Generator) -> CycleRecord:
 
     states = tuple(
         RobotState(
-            noise(2), noise(2), noise(2), start_ns - (3 - i) * SAMPLE_NS, (4 * number + i) * SAMPLE_NS,
-            4 * number + i, number - 1, 1000, Status.ARMED,
+            noise(2),
+            noise(2),
+            noise(2),
+            start_ns - (3 - i) * SAMPLE_NS,
+            (4 * number + i) * SAMPLE_NS,
+            4 * number + i,
+            number - 1,
+            1000,
+            Status.ARMED,
         )
         for i in range(4)
-    )  # fmt: skip
+    )
     command = JointCommand(*(noise(1) for _ in range(7)))
     wire = tuple(Message("rx", rng.bytes(45), state.receive_ns) for state in states)
     wire += (Message("tx", rng.bytes(30), start_ns),)

@@ -86,9 +86,14 @@ def make_arm(joints: int, seed: int) -> tuple[PlainRobot, str]:
         for hidden in (False, True)
     }
     robot = PlainRobot(
-        kind=f"arm-{joints}", model=texts[False], robot=texts[True], truth=truth,
-        delay_s=STEP_S * int(rng.integers(1, MOST_LATE_STEPS)), fault=None, seed=seed,
-    )  # fmt: skip
+        kind=f"arm-{joints}",
+        model=texts[False],
+        robot=texts[True],
+        truth=truth,
+        delay_s=STEP_S * int(rng.integers(1, MOST_LATE_STEPS)),
+        fault=None,
+        seed=seed,
+    )
     return robot, _parameters(list(truth))
 
 
@@ -160,9 +165,21 @@ def write_arm(folder: Path, joints: int, seed: int, seconds: float) -> tuple[Pla
         text = record(robot, number, round(length_s * RATE_HZ) / RATE_HZ)
         (folder / f"{name}.csv").write_text(text, encoding="utf-8")
     return robot, [
-        "calibrate", "--model", "robot.xml", "--parameters", "params.yaml", "--data", "fit1.csv", "fit2.csv",
-        "--holdout", "held-out.csv", "--heldout-window", "2", "--out", "out",
-    ]  # fmt: skip
+        "calibrate",
+        "--model",
+        "robot.xml",
+        "--parameters",
+        "params.yaml",
+        "--data",
+        "fit1.csv",
+        "fit2.csv",
+        "--holdout",
+        "held-out.csv",
+        "--heldout-window",
+        "2",
+        "--out",
+        "out",
+    ]
 
 
 def measure(
@@ -182,10 +199,16 @@ def measure(
         folder = Path(name)
         robot, arguments = write_arm(folder, joints, seed, seconds)
         row: dict[str, Any] = {
-            "bench": "size", "joints": joints, "parameters": len(robot.truth), "seed": seed,
-            "fitted_s": seconds, "limit_s": limit_s, "options": list(more), "error": "",
+            "bench": "size",
+            "joints": joints,
+            "parameters": len(robot.truth),
+            "seed": seed,
+            "fitted_s": seconds,
+            "limit_s": limit_s,
+            "options": list(more),
+            "error": "",
             "load_before": os.getloadavg()[0],
-        }  # fmt: skip
+        }
         program = ["-m", "deal_hw"]
         if profile is not None:
             program = ["-m", "cProfile", "-o", str(profile.resolve()), *program]
@@ -207,9 +230,13 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
     began, said = time.monotonic(), []
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        command,
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    ) as process:  # fmt: skip
+    ) as process:
         limit = threading.Timer(limit_s, process.send_signal, [signal.SIGINT])
         limit.start()
         try:

@@ -51,31 +51,41 @@ def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[s
         for kind in ("rich", "chirp"):
             collect(
                 Collect(
-                    robot="cartpole", port=emulator.port, link=LinkOptions(transport=transport), out=run,
-                    profile=kind, seed=seed,
+                    robot="cartpole",
+                    port=emulator.port,
+                    link=LinkOptions(transport=transport),
+                    out=run,
+                    profile=kind,
+                    seed=seed,
                 )
-            )  # fmt: skip
+            )
     truth = json.loads(truth_file.read_text(encoding="utf-8"))
     found = calibrate(
         Calibrate(dataset=run / "dataset", out=run, seed=seed, quiet=True, report=False, advise=False)
     ).result
     parameters = {
         p.name: {
-            "truth": truth["parameters"][p.name], "estimate": float(found.estimate[k]),
-            "low": float(found.interval[k, 0]), "high": float(found.interval[k, 1]),
+            "truth": truth["parameters"][p.name],
+            "estimate": float(found.estimate[k]),
+            "low": float(found.interval[k, 0]),
+            "high": float(found.interval[k, 1]),
         }
         for k, p in enumerate(found.space)
         if p.name not in NOT_THERE.get(transport, ())
-    }  # fmt: skip
+    }
     off = [abs(v["estimate"] / v["truth"] - 1) for v in parameters.values()]
     half = [np.log(v["high"] / v["low"]) / 2 for v in parameters.values()]
     held = [v["low"] <= v["truth"] <= v["high"] for v in parameters.values()]
     return {
-        "error_percent": 100 * float(np.mean(off)), "median_percent": 100 * float(np.median(off)),
-        "interval_percent": 100 * float(np.median(half)), "coverage90": float(np.mean(held)),
-        "chi2": found.chi2, "latency_error_ms": 1e3 * (found.latency_s - truth["latency_s"]),
-        "alarms": [str(alarm) for alarm in found.alarms], "parameters": parameters,
-    }  # fmt: skip
+        "error_percent": 100 * float(np.mean(off)),
+        "median_percent": 100 * float(np.median(off)),
+        "interval_percent": 100 * float(np.median(half)),
+        "coverage90": float(np.mean(held)),
+        "chi2": found.chi2,
+        "latency_error_ms": 1e3 * (found.latency_s - truth["latency_s"]),
+        "alarms": [str(alarm) for alarm in found.alarms],
+        "parameters": parameters,
+    }
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -30,9 +30,12 @@ class SideProcess:
         # A session of its own: Ctrl-C in the terminal is this process's to handle.
         self._process = subprocess.Popen(
             [sys.executable, str(_SIDES), name],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            start_new_session=True, bufsize=0,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+            bufsize=0,
+        )
         with _pipe(self._process.stdin) as orders_pipe:
             orders_pipe.write(json.dumps(orders).encode())
         self._process.stdin = None  # Or communicate() would flush it.

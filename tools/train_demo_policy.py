@@ -136,9 +136,14 @@ def main() -> None:
         return
     files = TrainingFiles(checkpoint=args.checkpoint, resume=args.resume)
     train(
-        args.robot, path, seed=args.seed, steps=args.steps, members=args.members, judged=args.judged,
+        args.robot,
+        path,
+        seed=args.seed,
+        steps=args.steps,
+        members=args.members,
+        judged=args.judged,
         files=files,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ CHANGING = frozenset({"critic"})
 class ScoredStepper(Stepper):
     """A run whose members are told one number each.
 
-    The settings name the fitness and say how it scores; its horizon is also that of the residual that the
+    The settings name the fitness and say how it scores; its window is also that of the residual that the
     result states.
     """
 
@@ -72,7 +72,7 @@ class ScoredStepper(Stepper):
         return self.log.result(
             centre,
             population,
-            chi2=explained(self.problem, centre, self.settings.scoring.horizon_ticks),
+            chi2=explained(self.problem, centre, self.settings.scoring.window_ticks),
             alarms=(alarm,) if lost > 0.5 * scored else (),
             extra={"interval": self.INTERVAL, **self.facts()},
         )

@@ -50,7 +50,7 @@ class FitnessSettings:
     """Settings of a fitness; each kind reads its own.
 
     Attributes:
-        horizon_ticks: Window length of `trajectory` in control periods.
+        window_ticks: Window length of `trajectory` in control periods.
         ticks: Most transitions of a rollout (the DEAL paper's Table 4: 200); `critic`, `energy`, `mmd`.
         replay: Roll out with the recorded commands, not with the policy in closed loop (Algorithm 1, line 3).
         difference: Score (s, a, s' - s) instead of the paper's (s, a, s'): the same information, but a first
@@ -68,7 +68,7 @@ class FitnessSettings:
         torch_threads: Threads of the critic's arithmetic.
     """
 
-    horizon_ticks: int = 10
+    window_ticks: int = 10
     ticks: int = 200
     replay: bool = False
     difference: bool = False
@@ -79,7 +79,7 @@ class FitnessSettings:
     torch_threads: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("horizon_ticks", "ticks", "torch_threads"):
+        for name in ("window_ticks", "ticks", "torch_threads"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.replay_generations is not None and self.replay_generations < 1:
@@ -161,7 +161,7 @@ class FlatFitness(Fitness):
 
 
 class TrajectoryFitness(Fitness):
-    """Prediction error at a horizon: minus the logarithm of the mean squared whitened window innovation.
+    """Prediction error in windows: minus the logarithm of the mean squared whitened window innovation.
 
     The logarithm, because errors of far members span many decades: a softmax of the errors themselves would
     see nothing among the good ones. The metric is that of the range's midpoint for all members and
@@ -169,7 +169,7 @@ class TrajectoryFitness(Fitness):
     """
 
     def _prepare(self, rng: np.random.Generator) -> None:
-        self._windows = cut(self._problem, self._settings.horizon_ticks)
+        self._windows = cut(self._problem, self._settings.window_ticks)
         coordinates = Coordinates(self._problem)
         self._midpoint = coordinates.members(np.full((1, coordinates.count), 0.5))
         # Made on first use and kept: a small population's call costs less than its metric.

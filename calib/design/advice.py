@@ -111,18 +111,25 @@ def menu_designs(
     top = min(5.0, description.control_rate_hz / 6)
     designs = [
         ExcitationDesign(
-            family=family, seconds=settings.seconds, balance_s=balance_s, amplitude=amplitude, high_hz=top,
-            split=1.0, effort=effort, speed=speed, seed=settings.seed,
+            family=family,
+            seconds=settings.seconds,
+            balance_s=balance_s,
+            amplitude=amplitude,
+            high_hz=top,
+            split=1.0,
+            effort=effort,
+            speed=speed,
+            seed=settings.seed,
         )
         for family in ("multisine", "chirp", "steps")
         for amplitude in settings.amplitudes
         for effort, speed in _variants(description, settings)
-    ]  # fmt: skip
+    ]
     return {words(design): design for design in designs}
 
 
 def options(design: ExcitationDesign) -> str:
-    """Return the options of `deal-hw excite` that make a design of the menu."""
+    """Return the options of `deal-hw design-excitation` that make a design of the menu."""
     effort, speed = design.effort[0], design.speed[0]
     limits = f" --effort {effort:.3g} --speed {speed:.3g} --split 0" if (effort, speed) != (1.0, 1.0) else ""
     return (
@@ -384,7 +391,7 @@ def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]
     found = [f"record {best}: {helped}"]
     if robot and groups[best][0].get("command"):
         found += [
-            f"    deal-hw excite {robot} {groups[best][0]['command']} --out next.json",
+            f"    deal-hw design-excitation {robot} {groups[best][0]['command']} --out next.json",
             f"    deal-hw collect {robot} --excite next.json",
         ]
     if hopeless:

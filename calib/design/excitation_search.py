@@ -132,7 +132,7 @@ def search_excitation(
         reasons = ", ".join(f"{n} x {why}" for why, n in tripped.items())
         raise CalibrationError(
             f"none of {tried} excitations keeps {description.name!r} inside its limits ({reasons}); "
-            "draw from narrower ranges (--xi, --calibration), or try more (--candidates)"
+            "draw from narrower ranges (--range-ratio, --calibration), or try more (--candidates)"
         )
     best, design = finals[0]
     trace = [score(best, wanted)]
@@ -154,7 +154,7 @@ def search_excitation(
         if not best.usable:
             raise CalibrationError(
                 f"what suits {len(experiment.scenario)} draws of {description.name!r} trips on one of "
-                f"{len(confirmation.scenario)} others ({best.tripped}); give narrower ranges (--xi, "
+                f"{len(confirmation.scenario)} others ({best.tripped}); give narrower ranges (--range-ratio, "
                 "--calibration) or more draws (--draws)"
             )
     judge = experiment if confirmation is None else confirmation
@@ -200,11 +200,17 @@ class _Designer:
         balance_s = min(0.6, 0.25 * self._seconds) if self._balances else 0.0
         return [
             ExcitationDesign(
-                family=family, seconds=self._seconds, amplitude=amplitude, high_hz=min(4.0, self._top_hz),
-                low_hz=0.3, balance_s=balance_s, effort=(1.0, low), speed=(1.0, fast),
+                family=family,
+                seconds=self._seconds,
+                amplitude=amplitude,
+                high_hz=min(4.0, self._top_hz),
+                low_hz=0.3,
+                balance_s=balance_s,
+                effort=(1.0, low),
+                speed=(1.0, fast),
             )
             for family, amplitude in fair
-        ]  # fmt: skip
+        ]
 
     def draw(self, rng: np.random.Generator) -> ExcitationDesign:
         """Return a random design."""

@@ -196,8 +196,8 @@ class Experiment:
         if len(kept) < draws:
             raise CalibrationError(
                 f"only {len(kept)} of {len(drawn)} draws from the parameters' ranges keep the limits of "
-                f"{self.robot.description.name!r} when nothing is asked of it; give narrower ranges (--xi), "
-                "a calibration, or a policy that balances"
+                f"{self.robot.description.name!r} when nothing is asked of it; give narrower ranges "
+                "(--range-ratio), a calibration, or a policy that balances"
             )
         self.refused = (kept[-1] + 1) - draws
         return drawn.part(kept)

@@ -47,14 +47,25 @@ class ChartSettings:
 SETTINGS = ChartSettings()
 
 INK, FAINT, REAL, NOMINAL, CALIBRATED, MINUS, PAPER = (
-    "#010101", "#020202", "#030303", "#040404", "#050505", "#060606", "#070707",
-)  # fmt: skip
+    "#010101",
+    "#020202",
+    "#030303",
+    "#040404",
+    "#050505",
+    "#060606",
+    "#070707",
+)
 """Colours to draw with: stand-ins, each of which becomes a variable of the page's style sheet."""
 
 _VARIABLES = {
-    INK: "ink", FAINT: "faint", REAL: "real", NOMINAL: "nominal", CALIBRATED: "calibrated", MINUS: "minus",
+    INK: "ink",
+    FAINT: "faint",
+    REAL: "real",
+    NOMINAL: "nominal",
+    CALIBRATED: "calibrated",
+    MINUS: "minus",
     PAPER: "paper",
-}  # fmt: skip
+}
 
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
@@ -157,9 +168,13 @@ def grid(
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     inch = 1.0 / (rows * row_height)
     figure.subplots_adjust(
-        left=0.62 / width, right=1 - 0.15 / width, bottom=0.42 * inch, top=1 - 0.28 * inch,
-        hspace=gap / (row_height - gap), wspace=0.75 * columns / max(width - 0.8 * columns, 1.0),
-    )  # fmt: skip
+        left=0.62 / width,
+        right=1 - 0.15 / width,
+        bottom=0.42 * inch,
+        top=1 - 0.28 * inch,
+        hspace=gap / (row_height - gap),
+        wspace=0.75 * columns / max(width - 0.8 * columns, 1.0),
+    )
     return figure, axes
 
 
@@ -207,9 +222,10 @@ def overlay(shown: Overlay, panels: int = SETTINGS.panels) -> Markup:
                 axis.set_visible(False)
                 continue
             for values, colour, style in (
-                (shown.real, REAL, "-"), (shown.nominal, NOMINAL, (0, (3, 2))),
+                (shown.real, REAL, "-"),
+                (shown.nominal, NOMINAL, (0, (3, 2))),
                 (shown.calibrated, CALIBRATED, "-"),
-            ):  # fmt: skip
+            ):
                 width = 2.4 if colour == REAL else 1.1
                 x, y = envelope(shown.time_s, values[:, m], buckets)
                 axis.plot(x, y, color=colour, linestyle=style, linewidth=width)

@@ -101,7 +101,7 @@ def render(inputs: ReportInputs) -> str:
         heldout_window_s=float(heldout.get("window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
-        halves=_mapping(_mapping(provenance.get("split_half")).get("parameters")),
+        split=_mapping(_mapping(provenance.get("split_half")).get("parameters")),
         residuals=drawn,
         advice=advice_rows(result),
         scan=charts.latency_scan(scan, inputs.tick_s),

@@ -157,7 +157,7 @@ def uncertainty(
     timing_std_s: float = 0.0,
     kinks: float = SETTINGS.kinks,
 ) -> Uncertainty:
-    """Turn normal equations into statements.
+    """Turn normal equations into intervals.
 
     Args:
         space: The parameters.
@@ -257,7 +257,7 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
     """Return by how much clustering widens each standard deviation, (P,); at least 1.
 
     Few blocks give a noisy variance. So it is drawn towards the uniform inflation, which counts like some
-    blocks, and only heeded where it is greater than chance makes it.
+    blocks, and only used where it is greater than chance makes it.
     """
     if cluster is None:
         return np.ones(1)
@@ -265,8 +265,8 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
     ratio = cluster.ratio * inflation / uniform
     drawn = (SETTINGS.prior_blocks * inflation + degrees * ratio) / (SETTINGS.prior_blocks + degrees)
     quantile = t_law.ppf(0.95, SETTINGS.prior_blocks + degrees) / Z90
-    heeded = cluster.ratio / uniform > chi2_law.ppf(0.95, degrees) / degrees
-    factor = np.where(heeded, np.sqrt(drawn / inflation) * quantile, 1.0)
+    used = cluster.ratio / uniform > chi2_law.ppf(0.95, degrees) / degrees
+    factor = np.where(used, np.sqrt(drawn / inflation) * quantile, 1.0)
     return np.asarray(np.maximum(factor, 1.0))
 
 
@@ -340,10 +340,13 @@ def _alarms(
         )
     ended = ended_at_bound(space, theta)
     for which, means in (
-        (pressed, "The data ask for a value outside the range, or the model is wrong. The intervals of the "
-         "other parameters hold for this value."),
+        (
+            pressed,
+            "The data ask for a value outside the range, or the model is wrong. The intervals of the "
+            "other parameters hold for this value.",
+        ),
         (~pressed, "The search ended there, but the data do not press the value to that end."),
-    ):  # fmt: skip
+    ):
         names = [
             f"{space.names[k]} ({theta[k]:.4g} {space.free[k].unit})" for k in np.flatnonzero(ended & which)
         ]

@@ -101,9 +101,13 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
             continue
         pinned = np.concatenate([vectors[:, k], np.zeros(K)])[None]
         solved = linprog(
-            cost, A_ub=below, b_ub=np.zeros(2 * K), A_eq=pinned, b_eq=[1.0],
+            cost,
+            A_ub=below,
+            b_ub=np.zeros(2 * K),
+            A_eq=pinned,
+            b_eq=[1.0],
             bounds=[(None, None)] * D + [(0, None)] * K,
-        )  # fmt: skip
+        )
         if solved.success and solved.x is not None:
             vector = solved.x[:D] @ vectors
             largest = np.max(np.abs(vector))

@@ -203,12 +203,18 @@ def find_play(problem: Problem, refined: Refined) -> Finding | None:
     span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
     plays = [
         Parameter(
-            name=f"{name}.play", kind="servo_play", elements=(name,), unit="-", nominal=0.0, low=0.0,
-            high=SETTINGS.most_play * float(most), scale="linear",
+            name=f"{name}.play",
+            kind="servo_play",
+            elements=(name,),
+            unit="-",
+            nominal=0.0,
+            low=0.0,
+            high=SETTINGS.most_play * float(most),
+            scale="linear",
         )
         for name, most in zip(names, span, strict=True)
         if most > 0
-    ]  # fmt: skip
+    ]
     wide = problem.with_more(plays)
     fixed = problem.fixed_latency_s is not None
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)

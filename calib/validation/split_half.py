@@ -26,7 +26,7 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplitHalfSettings:
-    """Settings of :func:`compare_halves`.
+    """Settings of :func:`check_split_half`.
 
     Attributes:
         iterations: Most iterations of each half's fit.
@@ -185,15 +185,15 @@ def agreement(
     return SplitHalf(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
 
 
-def widened_by_halves(
-    problem: Problem, known: Uncertainty, theta: FloatArray, halves: SplitHalf
+def widened_by_split_half(
+    problem: Problem, known: Uncertainty, theta: FloatArray, split: SplitHalf
 ) -> Uncertainty:
     """Return what is known, flagged parameters' intervals holding the estimates of both halves."""
-    if not halves.flagged:
+    if not split.flagged:
         return known
-    flagged = np.array([name in halves.flagged for name in problem.space.names])
-    wider = widened_to(problem, known, theta, np.where(flagged, halves.reach / Z90, 0.0))
-    return dataclasses.replace(wider, alarms=(*wider.alarms, *halves.alarms(problem.space)))
+    flagged = np.array([name in split.flagged for name in problem.space.names])
+    wider = widened_to(problem, known, theta, np.where(flagged, split.reach / Z90, 0.0))
+    return dataclasses.replace(wider, alarms=(*wider.alarms, *split.alarms(problem.space)))
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:

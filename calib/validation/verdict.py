@@ -14,7 +14,7 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.uncertainty.intervals import MISMATCH, Uncertainty, correlation_time, ended_at_bound
 from deal_hw.calib.uncertainty.time_steps import check_step, counted, step_alarm
 from deal_hw.calib.validation.diagnosis import diagnose
-from deal_hw.calib.validation.split_half import check_split_half, widened_by_halves
+from deal_hw.calib.validation.split_half import check_split_half, widened_by_split_half
 from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
@@ -132,9 +132,9 @@ def judge(
     if settings.physics_step:
         known, facts["physics_step"] = with_step(problem, refined, known, refined.theta)
     if settings.split_half:
-        halves = check_split_half(problem, refined, known)
-        known = widened_by_halves(problem, known, refined.theta, halves)
-        facts["split_half"] = halves.to_json()
+        split = check_split_half(problem, refined, known)
+        known = widened_by_split_half(problem, known, refined.theta, split)
+        facts["split_half"] = split.to_json()
     if settings.diagnosis and unexplained(refined):
         known, facts["diagnosis"] = with_causes(problem, refined, known)
     return known, facts
@@ -228,9 +228,11 @@ def trust(result: CalibrationResult) -> Trust:
         )
     if math.isnan(result.chi2):
         return Trust(
-            "amber", gain, "No test was made of whether the model explains the recordings.",
+            "amber",
+            gain,
+            "No test was made of whether the model explains the recordings.",
             f"Compare the held-out error with what your task can bear. {record}".strip(),
-        )  # fmt: skip
+        )
     untold = result.verdicts.count("not identifiable")
     if result.null_directions or untold:
         return Trust(

@@ -1,6 +1,7 @@
 """The calibration benches: methods against hidden truths, one row a cell.
 
-- honest: each seed's truth lies off the centre of a fixed range whose midpoint is the wrong nominal model.
+- fixed-range: each seed's truth lies off the middle of a fixed range whose midpoint is the wrong nominal
+  model.
 - mismatch: the same on robots that do what no simulator here does (profile ``realistic``).
 - paper: ranges [theta / xi, xi theta] on a linear scale around the truth itself, as DEAL's tables have it. A
   searcher that ignores the data and returns the midpoint of the log range scores 0 there.
@@ -18,9 +19,9 @@ from deal_hw.bench.rows import Cells, Row
 from deal_hw.bench.tasks import TASKS, make_case
 from deal_hw.errors import DealHwError, UnknownNameError
 
-Protocol = Literal["honest", "mismatch", "paper"]
+Protocol = Literal["fixed-range", "mismatch", "paper"]
 PAPER_NOTE = "centred target: a searcher that ignores the data scores 0 here"
-KEY = ("task", "space", "profile", "demonstration", "method", "refined", "xi", "seed")
+KEY = ("task", "space", "profile", "demonstration", "method", "refined", "range_ratio", "seed")
 """What names a cell."""
 
 
@@ -36,7 +37,7 @@ class Cell:
         demonstration: "excite" or "policy".
         method: Name of the method.
         refined: Whether the refinement follows.
-        xi: Ratio of the search range.
+        range_ratio: Ratio of the search range.
         seed: Decides everything.
     """
 
@@ -47,7 +48,7 @@ class Cell:
     demonstration: str
     method: str
     refined: bool
-    xi: float
+    range_ratio: float
     seed: int
 
     @property
@@ -61,7 +62,7 @@ def make_cells(
     tasks: Sequence[str],
     profile: str,
     methods: Sequence[str],
-    xis: Sequence[float],
+    range_ratios: Sequence[float],
     seeds: Sequence[int],
     *,
     space: str = "",
@@ -82,11 +83,18 @@ def make_cells(
         check_method(method)
     return [
         Cell(
-            protocol=protocol, task=task, space=space, profile=profile, demonstration=demonstration,
-            method=method, refined=refine_all or method == "default", xi=xi, seed=seed,
+            protocol=protocol,
+            task=task,
+            space=space,
+            profile=profile,
+            demonstration=demonstration,
+            method=method,
+            refined=refine_all or method == "default",
+            range_ratio=range_ratio,
+            seed=seed,
         )
-        for task, xi, seed, method in itertools.product(tasks, xis, seeds, methods)
-    ]  # fmt: skip
+        for task, range_ratio, seed, method in itertools.product(tasks, range_ratios, seeds, methods)
+    ]
 
 
 def cells(chosen: Sequence[Cell], *, population: int | None, generations: int, threads: int | None) -> Cells:
@@ -112,9 +120,14 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
     budget = usual_budget(cell.method, population, generations, refine=cell.refined)
     try:
         case = make_case(
-            cell.task, cell.profile, cell.seed, cell.xi, cell.space,
-            centred=cell.protocol == "paper", by_policy=cell.demonstration == "policy",
-        )  # fmt: skip
+            cell.task,
+            cell.profile,
+            cell.seed,
+            cell.range_ratio,
+            cell.space,
+            centred=cell.protocol == "paper",
+            by_policy=cell.demonstration == "policy",
+        )
         part, _ = calibration_row(case, cell.method, budget, threads)
         row |= part
     except DealHwError as err:

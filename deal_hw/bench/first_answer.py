@@ -152,10 +152,14 @@ def _so101(ask: _Ask) -> Calibrate:
     parameters = ask.folder / "so101.yaml"
     parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
     recordings = Recordings(
-        model=DESCRIPTION.mjcf, data=tuple(files[: len(fitted)]), parameters=parameters,
-        columns=files[0].with_name("columns.yaml"), leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
-        fit_seconds=30.0, physics_step=0.004,
-    )  # fmt: skip
+        model=DESCRIPTION.mjcf,
+        data=tuple(files[: len(fitted)]),
+        parameters=parameters,
+        columns=files[0].with_name("columns.yaml"),
+        leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
+        fit_seconds=30.0,
+        physics_step=0.004,
+    )
     return Calibrate(recordings=recordings, holdout=tuple(files[len(fitted) :]), quiet=True)
 
 
@@ -167,9 +171,12 @@ def _go2(ask: _Ask) -> Calibrate:
     parameters = ask.folder / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
     recordings = Recordings(
-        model=DESCRIPTION.mjcf, data=tuple(files), parameters=parameters,
-        columns=files[0].with_name("columns.yaml"), window=0.2,
-    )  # fmt: skip
+        model=DESCRIPTION.mjcf,
+        data=tuple(files),
+        parameters=parameters,
+        columns=files[0].with_name("columns.yaml"),
+        window=0.2,
+    )
     return Calibrate(recordings=recordings, quiet=True)
 
 
@@ -300,9 +307,16 @@ def _compared(
             shown.append(_Shown(progress.stage, *since.passed(), progress.estimate.copy(), latency_s))
 
     result = calibrate_episodes(
-        work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget,
-        rng=np.random.default_rng(seed), threads=threads, progress=watch,
-    )  # fmt: skip
+        work.robot,
+        work.space,
+        work.episodes,
+        work.holdout,
+        method=method,
+        budget=budget,
+        rng=np.random.default_rng(seed),
+        threads=threads,
+        progress=watch,
+    )
     shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s))
 
     since = _Stopwatch.start()

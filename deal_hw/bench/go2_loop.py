@@ -65,8 +65,12 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
         threads: Simulation threads.
     """
     row: Row = {
-        "bench": "go2-loop", "profile": profile, "seed": seed, "steps": steps if train else 0, "error": "",
-    }  # fmt: skip
+        "bench": "go2-loop",
+        "profile": profile,
+        "seed": seed,
+        "steps": steps if train else 0,
+        "error": "",
+    }
     try:
         truth, out = draw_truth(profile, seed), folder / f"{profile}_{seed}"
         out.mkdir(parents=True, exist_ok=True)
@@ -74,10 +78,17 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
         dataset = recorded(truth, out)
         found = calibrate(
             Calibrate(
-                dataset=dataset, out=out, space="walk", holdout=(1,), seed=seed, threads=threads,
-                report=False, advise=False, quiet=True,
+                dataset=dataset,
+                out=out,
+                space="walk",
+                holdout=(1,),
+                seed=seed,
+                threads=threads,
+                report=False,
+                advise=False,
+                quiet=True,
             )
-        )  # fmt: skip
+        )
         row |= calibration_part(found.result, truth)
         row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
         row |= policies_part(found.result, truth, steps, out, train=train)

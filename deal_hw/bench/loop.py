@@ -33,9 +33,9 @@ SEARCHES = ("deal", "eki", "deal-paper-replay", "deal-paper-flat", "midpoint")
 """Run without the refinement, beside the default with everything."""
 
 
-def demonstrate(profile: str, seed: int, xi: float) -> Case:
+def demonstrate(profile: str, seed: int, range_ratio: float) -> Case:
     """Draw a truth and record one ``rich`` demonstration and one ``chirp`` from its robot."""
-    return make_case("cartpole", profile, seed, xi)
+    return make_case("cartpole", profile, seed, range_ratio)
 
 
 def calibration_row(
@@ -50,9 +50,16 @@ def calibration_row(
 
     d = case
     result = calibrate_episodes(
-        d.robot, d.space, [d.fit], [], method=method, budget=budget, rng=np.random.default_rng(d.seed),
-        threads=threads, policy=d.policy,
-    )  # fmt: skip
+        d.robot,
+        d.space,
+        [d.fit],
+        [],
+        method=method,
+        budget=budget,
+        rng=np.random.default_rng(d.seed),
+        threads=threads,
+        policy=d.policy,
+    )
     coverage, width = _intervals(d, result, threads)
     truth = d.heldout_truth[:, d.heldout.channels[d.heldout.channels < d.heldout_truth.shape[1]]]
     held_out = HeldOut(d.robot, d.space, [d.heldout], threads=threads, truth=[truth])
@@ -81,7 +88,7 @@ def calibration_row(
         "null_directions": list(result.null_directions),
         "per_parameter": per_parameter(result, d.theta),
         "refused_truths": d.refused,
-        "vigors": list(d.vigors),
+        "excitation_levels": list(d.excitation_levels),
     }
     return row, result
 
@@ -154,7 +161,7 @@ def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[st
 def cells(
     profile: str,
     methods: Sequence[str],
-    xi: float,
+    range_ratio: float,
     seeds: Sequence[int],
     *,
     train: bool,
@@ -170,17 +177,26 @@ def cells(
         check_method(method)
 
     def make(seed: int, method: str) -> Callable[[], Row]:
-        return lambda: loop_row(profile, seed, method, xi, train=train, folder=folder, threads=threads)
+        return lambda: loop_row(
+            profile, seed, method, range_ratio, train=train, folder=folder, threads=threads
+        )
 
     runs = [
-        ((profile, seed, method, xi), make(seed, method))
+        ((profile, seed, method, range_ratio), make(seed, method))
         for seed, method in itertools.product(seeds, methods)
     ]
-    return Cells(names=("profile", "seed", "method", "xi"), runs=runs)
+    return Cells(names=("profile", "seed", "method", "range_ratio"), runs=runs)
 
 
 def loop_row(
-    profile: str, seed: int, method: str, xi: float, *, train: bool, folder: Path, threads: int | None
+    profile: str,
+    seed: int,
+    method: str,
+    range_ratio: float,
+    *,
+    train: bool,
+    folder: Path,
+    threads: int | None,
 ) -> dict[str, Any]:
     """Run one cell; an error is kept in the row, so that the other cells still run.
 
@@ -188,7 +204,7 @@ def loop_row(
         profile: Profile of the emulated robot.
         seed: Seed of its truth.
         method: "default" is refined and, where asked, trained and deployed; the others are not.
-        xi: Ratio of the search range.
+        range_ratio: Ratio of the search range.
         train: Whether the default trains and deploys policies.
         folder: Where policies go.
         threads: Simulation threads.
@@ -196,11 +212,17 @@ def loop_row(
     folder.mkdir(parents=True, exist_ok=True)
     refine = method == "default"
     row: dict[str, Any] = {
-        "bench": "loop", "task": "cartpole", "profile": profile, "method": method, "refined": refine,
-        "xi": xi, "seed": seed, "error": "",
-    }  # fmt: skip
+        "bench": "loop",
+        "task": "cartpole",
+        "profile": profile,
+        "method": method,
+        "refined": refine,
+        "range_ratio": range_ratio,
+        "seed": seed,
+        "error": "",
+    }
     try:
-        demonstration = demonstrate(profile, seed, xi)
+        demonstration = demonstrate(profile, seed, range_ratio)
         part, result = calibration_row(demonstration, method, Budget(refine=refine), threads)
         row |= part
         if refine and train:

@@ -30,7 +30,7 @@ from deal_hw.workflows.calibration.run import (
 )
 from deal_hw.workflows.say import aloud, silent
 
-KEY = ("task", "split", "method", "refined", "xi", "seed")
+KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
 METHODS = ("nominal", "output-error", "eki", "mujoco-sysid", "least-squares-multistart")
 """Rows where nothing else is asked for."""
 
@@ -41,7 +41,7 @@ UNTOLD = frozenset({"nominal", "output-error"})
 def prepare(
     recordings: Recordings,
     holdout: Sequence[Path],
-    xi: float | None,
+    range_ratio: float | None,
     std: Sequence[str],
     *,
     threads: int | None,
@@ -58,7 +58,7 @@ def prepare(
             "bench real needs --model robot.xml --data rec.csv ... (docs/any-robot.md), and --holdout "
             "other.csv or a part of each recording (--holdout-part)"
         )
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=xi)
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=range_ratio)
     return prepare_model(
         recordings,
         holdout,
@@ -102,7 +102,7 @@ def cells(
     *,
     methods: Sequence[str],
     seeds: Sequence[int],
-    xi: float,
+    range_ratio: float,
     std: Sequence[str],
     refine_all: bool,
     budget: Budget,
@@ -121,20 +121,29 @@ def cells(
         check_method(method)
     task = Path(recordings.model or "").stem
     # A file of parameters has ranges of its own.
-    ratio = xi if recordings.parameters is None else None
+    ratio = range_ratio if recordings.parameters is None else None
     work = prepare(recordings, holdout, ratio, std, threads=threads, quiet=quiet)
     split, expected = split_name(recordings, holdout), expected_std(work, std, threads)
 
     def make(method: str, seed: int, refine: bool) -> Callable[[], Row]:
         return lambda: run_cell(
-            work, task, split, method, seed, xi, refine=refine, std=expected(method), threads=threads,
-            budget=budget, window_s=window_s,
-        )  # fmt: skip
+            work,
+            task,
+            split,
+            method,
+            seed,
+            range_ratio,
+            refine=refine,
+            std=expected(method),
+            threads=threads,
+            budget=budget,
+            window_s=window_s,
+        )
 
     runs = []
     for seed, method in itertools.product(seeds, methods):
         refine = method == "default" or refine_all
-        runs.append(((task, split, method, refine, xi, seed), make(method, seed, refine)))
+        runs.append(((task, split, method, refine, range_ratio, seed), make(method, seed, refine)))
     return Cells(names=KEY, runs=runs)
 
 
@@ -144,7 +153,7 @@ def run_cell(
     split: str,
     method: str,
     seed: int,
-    xi: float,
+    range_ratio: float,
     *,
     refine: bool,
     budget: Budget,
@@ -160,7 +169,7 @@ def run_cell(
         split: What is held out.
         method: Name of the method.
         seed: Of everything random.
-        xi: Ratio of the search range, for the row.
+        range_ratio: Ratio of the search range, for the row.
         refine: Whether the refinement follows.
         budget: What the search may use.
         std: What a prediction may be off, (2 C,); None: the sensor noise, or what the method finds itself.
@@ -168,18 +177,31 @@ def run_cell(
         threads: Simulation threads.
     """
     row: dict[str, Any] = {
-        "bench": "real", "task": task, "split": split, "profile": "real", "method": method,
-        "refined": refine, "xi": xi, "seed": seed, "error": "",
-    }  # fmt: skip
+        "bench": "real",
+        "task": task,
+        "split": split,
+        "profile": "real",
+        "method": method,
+        "refined": refine,
+        "range_ratio": range_ratio,
+        "seed": seed,
+        "error": "",
+    }
     try:
         result = calibrate_episodes(
-            work.robot, work.space, work.episodes, work.holdout, method=method,
+            work.robot,
+            work.space,
+            work.episodes,
+            work.holdout,
+            method=method,
             budget=dataclasses.replace(budget, refine=refine),
-            rng=np.random.default_rng(seed), threads=threads, heldout_window_s=window_s,
+            rng=np.random.default_rng(seed),
+            threads=threads,
+            heldout_window_s=window_s,
             known_std=std,
             # A model that nobody calibrated has no latency.
             latency_s=0.0 if method == "nominal" else None,
-        )  # fmt: skip
+        )
     except DealHwError as err:
         row["error"] = f"{type(err).__name__}: {err}"
         return row

@@ -64,6 +64,10 @@ def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], No
     return rows
 
 
+RENAMED = {"xi": "range_ratio", "honest": "fixed-range"}
+"""Fields and benches by the names that older files have."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Rows:
     """What the file of a bench holds."""
@@ -83,7 +87,10 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     found = read_json(path, _Rows, "rows of a bench", "name another file")
     if found.format != FORMAT:
         raise DatasetError(f"{path} has format {shown(found.format)}, not {FORMAT!r}; name another file")
-    return list(found.rows)
+    return [
+        {RENAMED.get(name, name): RENAMED.get(str(value), value) for name, value in row.items()}
+        for row in found.rows
+    ]
 
 
 def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -98,9 +98,20 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 
     table = Table(title="median over seeds (worst)")
     for name in (
-        "task", "profile", "xi", "method", "seeds", "error %", "log error x100", "coverage90", "width90",
-        "held-out / nominal", "latency error ms", "flagged", "seconds",
-    ):  # fmt: skip
+        "task",
+        "profile",
+        "range_ratio",
+        "method",
+        "seeds",
+        "error %",
+        "log error x100",
+        "coverage90",
+        "width90",
+        "held-out / nominal",
+        "latency error ms",
+        "flagged",
+        "seconds",
+    ):
         table.add_column(name, justify="left" if name in ("task", "profile", "method") else "right")
     for group in dict.fromkeys(_group(row) for row in rows):
         part = [row for row in rows if _group(row) == group]
@@ -130,4 +141,4 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a line of the summary stands for."""
     method = row["method"] + (" + refinement" if row.get("refined") and row["method"] != "default" else "")
-    return row.get("task", "cartpole"), row["profile"], f"{row['xi']:g}", method
+    return row.get("task", "cartpole"), row["profile"], f"{row['range_ratio']:g}", method

@@ -13,7 +13,7 @@ import numpy as np
 from deal_hw.calib.data.problem import PopulationPolicy
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.cli.virtual import VirtualCartpole, demonstrate
-from deal_hw.control.vigor import ATTEMPTS
+from deal_hw.control.excitation_level import ATTEMPTS
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.oracle import draw_truth
@@ -57,7 +57,7 @@ class Case:
         refused: Truths that were drawn and could not demonstrate.
         truth: The emulated robot's truth, where there is an emulator.
         policy: What moved the robot all through the demonstration; None where that was no policy alone.
-        vigors: How lively each attempt at a demonstration was; the one in use moves best.
+        excitation_levels: How strong each attempt at a demonstration was; the one in use moves best.
     """
 
     task: str
@@ -75,14 +75,14 @@ class Case:
     refused: int
     truth: Truth | None = None
     policy: PopulationPolicy | None = None
-    vigors: tuple[float, ...] = (0.0,)
+    excitation_levels: tuple[float, ...] = (0.0,)
 
 
 @dataclass(frozen=True, slots=True)
 class _Ask:
     profile: str
     seed: int
-    xi: float
+    range_ratio: float
     space: str
     centred: bool
     by_policy: bool
@@ -91,7 +91,7 @@ class _Ask:
         """Return the parameter set with its search ranges."""
         if self.space and self.space not in table:
             raise UnknownNameError("parameter set", self.space, table)
-        space = table[self.space or next(iter(table))]().with_ratio(self.xi)
+        space = table[self.space or next(iter(table))]().with_ratio(self.range_ratio)
         if not self.centred:
             return space
         return ParameterSpace(replace(p, scale="linear") for p in space.parameters)
@@ -101,7 +101,7 @@ def make_case(
     task: str,
     profile: str,
     seed: int,
-    xi: float,
+    range_ratio: float,
     space: str = "",
     *,
     centred: bool = False,
@@ -113,7 +113,7 @@ def make_case(
         task: A name in `TASKS`.
         profile: "ideal", "sensor" or, for the cart-pole, "realistic".
         seed: Decides everything.
-        xi: Ratio of the search range.
+        range_ratio: Ratio of the search range.
         space: Name of the parameter set; the task's default.
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
         by_policy: The robot is demonstrated by its shipped policy, as in the paper, instead of by motions
@@ -123,7 +123,7 @@ def make_case(
         ConfigurationError: There is no such profile or parameter set for this task.
         CalibrationError: No drawn truth could demonstrate.
     """
-    return TASKS[task](_Ask(profile, seed, xi, space, centred, by_policy))
+    return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy))
 
 
 def _cartpole(ask: _Ask) -> Case:
@@ -134,13 +134,16 @@ def _cartpole(ask: _Ask) -> Case:
         preset = {p.name: p.nominal for p in space.parameters}
         truth = replace(truth, parameters={**truth.parameters, **preset})
     else:
-        truth = draw_truth(profile, seed, xi=ask.xi)
+        truth = draw_truth(profile, seed, range_ratio=ask.range_ratio)
     virtual = VirtualCartpole(truth)
     plan = RunPlan(
-        robot="cartpole", profile="balance" if ask.by_policy else "rich", seconds=DEMONSTRATION_S, seed=seed,
+        robot="cartpole",
+        profile="balance" if ask.by_policy else "rich",
+        seconds=DEMONSTRATION_S,
+        seed=seed,
         policy=str(shipped_policy("cartpole") or ""),
-    )  # fmt: skip
-    # A balanced pole is no livelier the second time.
+    )
+    # A balanced pole is no stronger the second time.
     shown, search = demonstrate(virtual, plan, 1 if ask.by_policy else ATTEMPTS)
     chirp = replace(plan, profile="chirp")
     recordings = (shown, virtual.run(make_behaviour(chirp, DESCRIPTION), DEMONSTRATION_S))
@@ -148,14 +151,23 @@ def _cartpole(ask: _Ask) -> Case:
     # The truth is of K9; what else may be searched has its nominal value.
     values = space.known | {p.name: p.nominal for p in space} | dict(truth.parameters)
     return Case(
-        task="cartpole", profile=profile, seed=seed, robot=load_model(DESCRIPTION), space=space,
-        theta=np.array([values[name] for name in space.names]), latency_s=truth.latency_s, fit=fit,
-        heldout=heldout, fit_truth=recordings[0].true_states(fit),
+        task="cartpole",
+        profile=profile,
+        seed=seed,
+        robot=load_model(DESCRIPTION),
+        space=space,
+        theta=np.array([values[name] for name in space.names]),
+        latency_s=truth.latency_s,
+        fit=fit,
+        heldout=heldout,
+        fit_truth=recordings[0].true_states(fit),
         heldout_truth=recordings[1].true_states(heldout)[0],
-        channel_std=find_profile(profile).sensor.position_std, refused=truth.refused, truth=truth,
+        channel_std=find_profile(profile).sensor.position_std,
+        refused=truth.refused,
+        truth=truth,
         policy=_population("cartpole", DESCRIPTION) if ask.by_policy else None,
-        vigors=tuple(attempt.vigor for attempt in search.attempts),
-    )  # fmt: skip
+        excitation_levels=tuple(attempt.level for attempt in search.attempts),
+    )
 
 
 def _ant(ask: _Ask) -> Case:
@@ -181,9 +193,12 @@ def _go2(ask: _Ask) -> Case:
         raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
     robot = load_model(floor.DESCRIPTION)
     sensing = Sensing(
-        joint_std=floor.DESCRIPTION.sensor.noise, joint_resolution=floor.DESCRIPTION.sensor.resolution,
-        orientation_std=floor.ORIENTATION_NOISE_RAD, gyro_std=floor.GYRO_NOISE_RAD_S, feet=FEET,
-    )  # fmt: skip
+        joint_std=floor.DESCRIPTION.sensor.noise,
+        joint_resolution=floor.DESCRIPTION.sensor.resolution,
+        orientation_std=floor.ORIENTATION_NOISE_RAD,
+        gyro_std=floor.GYRO_NOISE_RAD_S,
+        feet=FEET,
+    )
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
         fast = sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
@@ -234,11 +249,17 @@ def _target(
         try:
             fit, heldout = (
                 record_target(
-                    robot, space, theta, motion, seconds=DEMONSTRATION_S, latency_s=latency_s,
-                    sensing=sensing, rng=rng,
+                    robot,
+                    space,
+                    theta,
+                    motion,
+                    seconds=DEMONSTRATION_S,
+                    latency_s=latency_s,
+                    sensing=sensing,
+                    rng=rng,
                 )
                 for motion in motions(rng)
-            )  # fmt: skip
+            )
         except CalibrationError:
             continue
         if all(_stands(task, r) for r in (fit, heldout)):
@@ -246,15 +267,26 @@ def _target(
     else:
         what = "the preset's robot falls" if ask.centred else f"all of {draws} robots that were drawn fall"
         raise CalibrationError(
-            f"{task}, seed {seed}: {what}, so that there is no demonstration; use another --space or --xi"
+            f"{task}, seed {seed}: {what}, so that there is no demonstration; use another --space "
+            "or --range-ratio"
         )
     std = None if sensing is None else _channel_std(robot, sensing)
     return Case(
-        task=task, profile=ask.profile, seed=seed, robot=robot, space=space, theta=theta, latency_s=latency_s,
-        fit=fit.episode, heldout=heldout.episode, fit_truth=(fit.position, fit.velocity),
-        heldout_truth=heldout.position, channel_std=std, refused=refused,
+        task=task,
+        profile=ask.profile,
+        seed=seed,
+        robot=robot,
+        space=space,
+        theta=theta,
+        latency_s=latency_s,
+        fit=fit.episode,
+        heldout=heldout.episode,
+        fit_truth=(fit.position, fit.velocity),
+        heldout_truth=heldout.position,
+        channel_std=std,
+        refused=refused,
         policy=_population(task, robot.description) if ask.by_policy else None,
-    )  # fmt: skip
+    )
 
 
 LOWEST_M = {"ant": 0.0, "go2": 0.12}

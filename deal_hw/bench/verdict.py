@@ -90,9 +90,15 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             work = prepare(config)
             method = usual_method(config, work)
             result = calibrate_episodes(
-                work.robot, work.space, work.episodes, work.holdout, method=method, budget=budget,
-                rng=np.random.default_rng(seed), threads=threads,
-            )  # fmt: skip
+                work.robot,
+                work.space,
+                work.episodes,
+                work.holdout,
+                method=method,
+                budget=budget,
+                rng=np.random.default_rng(seed),
+                threads=threads,
+            )
         except DealHwError as err:
             # Refused before any work: as good as red, if it says why.
             return row | {"colour": "refused", "named": names(fault, [], [str(err)]), "refusal": str(err)}

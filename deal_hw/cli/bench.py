@@ -27,12 +27,20 @@ class Bench:
 
     bench: tyro.conf.Positional[
         Literal[
-            "loop", "go2-loop", "honest", "mismatch", "paper", "real", "verdict", "first-answer", "go2-codec"
+            "loop",
+            "go2-loop",
+            "fixed-range",
+            "mismatch",
+            "paper",
+            "real",
+            "verdict",
+            "first-answer",
+            "go2-codec",
         ]
     ]
     """loop: collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows.
     go2-loop: the same with emulated Go2 that walk; the shipped policy is fine-tuned.
-    honest: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
+    fixed-range: calibrate off-centre truths in a fixed range. mismatch: the same on robots that do what no
     simulator here does. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings
     of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
     without deliberate faults: is a right model called right, and a wrong one wrong? first-answer:
@@ -77,7 +85,7 @@ class Bench:
     methods: str = ""
     """Methods, comma separated; by default the default with training, and each search without refinement."""
 
-    xi: str = "5"
+    range_ratio: str = "5"
     """Ratios of the search range, comma separated (loop: one)."""
 
     refine_all: bool = False
@@ -111,7 +119,7 @@ class Bench:
     def __post_init__(self) -> None:
         check_ranges(self)
         parse_seeds(self.seeds)
-        parse_ratios(self.xi)
+        parse_ratios(self.range_ratio)
         if self.bench != "real":
             options = given(self.recordings, Recordings())
             options += given(self, Bench, ("holdout", "heldout_window", "residual_std"))
@@ -161,8 +169,10 @@ def parse_ratios(text: str) -> tuple[float, ...]:
     try:
         ratios = tuple(float(part) for part in text.split(","))
     except ValueError as err:
-        raise ConfigurationError(f"--xi {text!r}: give numbers above 1, such as 5 or 3,5,10,20") from err
-    Ratio.check("--xi", ratios)
+        raise ConfigurationError(
+            f"--range-ratio {text!r}: give numbers above 1, such as 5 or 3,5,10,20"
+        ) from err
+    Ratio.check("--range-ratio", ratios)
     return ratios
 
 
@@ -222,9 +232,12 @@ def _first_answer(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import first_answer
 
     cells = first_answer.cells(
-        _names(config.problems) or tuple(first_answer.PROBLEMS), parse_seeds(config.seeds), real=config.real,
-        budget=_budget(config), threads=config.threads,
-    )  # fmt: skip
+        _names(config.problems) or tuple(first_answer.PROBLEMS),
+        parse_seeds(config.seeds),
+        real=config.real,
+        budget=_budget(config),
+        threads=config.threads,
+    )
     return _Table(
         cells=cells, line=first_answer.line, summary=lambda rows: print("\n".join(first_answer.summary(rows)))
     )
@@ -244,11 +257,16 @@ def _draw(out: Path, rows: Sequence[Row]) -> None:
 def _loop(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import loop, tables
 
-    (xi,) = parse_ratios(config.xi)[:1]
+    (range_ratio,) = parse_ratios(config.range_ratio)[:1]
     cells = loop.cells(
-        config.profile, _methods(config, ("default", *loop.SEARCHES)), xi, parse_seeds(config.seeds),
-        train=config.train, folder=out.parent / f"{out.stem}_policies", threads=config.threads,
-    )  # fmt: skip
+        config.profile,
+        _methods(config, ("default", *loop.SEARCHES)),
+        range_ratio,
+        parse_seeds(config.seeds),
+        train=config.train,
+        folder=out.parent / f"{out.stem}_policies",
+        threads=config.threads,
+    )
     return _Table(cells=cells, line=tables.line, summary=tables.print_summary, draw=_draw)
 
 
@@ -256,9 +274,13 @@ def _go2_loop(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import go2_loop
 
     cells = go2_loop.cells(
-        config.profile, parse_seeds(config.seeds), config.steps, train=config.train,
-        folder=out.parent / f"{out.stem}_runs", threads=config.threads,
-    )  # fmt: skip
+        config.profile,
+        parse_seeds(config.seeds),
+        config.steps,
+        train=config.train,
+        folder=out.parent / f"{out.stem}_runs",
+        threads=config.threads,
+    )
     return _Table(
         cells=cells, line=go2_loop.line, summary=lambda rows: print("\n".join(go2_loop.summary(rows)))
     )
@@ -273,7 +295,7 @@ def _calibration(config: Bench, out: Path) -> _Table:
         [task.strip() for task in config.task.split(",")],
         "realistic" if protocol == "mismatch" else config.profile,
         _methods(config, ("default",)),
-        parse_ratios(config.xi),
+        parse_ratios(config.range_ratio),
         parse_seeds(config.seeds),
         space=config.space,
         refine_all=config.refine_all,
@@ -288,12 +310,20 @@ def _calibration(config: Bench, out: Path) -> _Table:
 def _real(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import real, tables
 
-    (xi,) = parse_ratios(config.xi)[:1]
+    (range_ratio,) = parse_ratios(config.range_ratio)[:1]
     cells = real.cells(
-        config.recordings, config.holdout, methods=_methods(config, real.METHODS),
-        seeds=parse_seeds(config.seeds), xi=xi, std=config.residual_std, refine_all=config.refine_all,
-        budget=_budget(config), window_s=config.heldout_window, threads=config.threads, quiet=config.quiet,
-    )  # fmt: skip
+        config.recordings,
+        config.holdout,
+        methods=_methods(config, real.METHODS),
+        seeds=parse_seeds(config.seeds),
+        range_ratio=range_ratio,
+        std=config.residual_std,
+        refine_all=config.refine_all,
+        budget=_budget(config),
+        window_s=config.heldout_window,
+        threads=config.threads,
+        quiet=config.quiet,
+    )
     return _Table(cells=cells, line=tables.line, summary=tables.print_real)
 
 

@@ -107,9 +107,13 @@ def bridge(config: Bridge) -> int:
         options = WireOptions(domain=config.domain)
         with LocalClaim(f"bridge of go2, {claim_name('dds', config.port, options)}"):
             made = Go2Bridge(
-                DdsTransport(config.port, clock, options), _network(config, port), clock, config.rules,
-                state_check=config.state_check, tell=_tell,
-            )  # fmt: skip
+                DdsTransport(config.port, clock, options),
+                _network(config, port),
+                clock,
+                config.rules,
+                state_check=config.state_check,
+                tell=_tell,
+            )
             # The transports' threads inherit the priority that holds when they are opened.
             with priority(FIFO_PRIORITY, children=True, lock=True), _switching():
                 if os.sched_getscheduler(0) != os.SCHED_FIFO:

@@ -48,8 +48,12 @@ if TYPE_CHECKING:
     pass
 
 __all__ = [
-    "Calibrate", "CalibrateReport", "calibrate", "calibrate_episodes", "calibrate_or_write_parameters",
-]  # fmt: skip
+    "Calibrate",
+    "CalibrateReport",
+    "calibrate",
+    "calibrate_episodes",
+    "calibrate_or_write_parameters",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,10 +107,10 @@ class Calibrate(Checked):
     range: Annotated[tuple[tuple[str, float, float], ...], Range(-1e12, 1e12)] = ()
     """Other search ranges, as NAME LOW HIGH (SI)."""
 
-    xi: Annotated[float | None, Ratio] = None
-    """Search each parameter within a factor XI to either side of its nominal value. By default as its
-    parameter set says, mostly 5; with --model 20 for dry friction (docs/parameters.md), and with --parameters
-    the ranges of that file."""
+    range_ratio: Annotated[float | None, Ratio] = None
+    """Search each parameter within a factor RANGE-RATIO to either side of its nominal value. By default as
+    its parameter set says, mostly 5; with --model 20 for dry friction (docs/parameters.md), and with
+    --parameters the ranges of that file."""
 
     latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
@@ -242,7 +246,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         )
     settings: dict[str, Any] = {
         "seed": config.seed,
-        "xi": config.xi,
+        "range_ratio": config.range_ratio,
         "heldout_window_s": config.heldout_window,
         "latency_range_s": None if config.latency is not None else list(config.latency_range),
     }
@@ -295,8 +299,10 @@ def _run_folder(config: Calibrate) -> Path:
     return Path("runs") / Path(config.recordings.model or "model").stem
 
 
-def _overrides(config: Calibrate, xi: float | None) -> SpaceOverrides:
-    return SpaceOverrides(free=config.free, known=dict(config.known), ranges=config.range, xi=xi)
+def _overrides(config: Calibrate, range_ratio: float | None) -> SpaceOverrides:
+    return SpaceOverrides(
+        free=config.free, known=dict(config.known), ranges=config.range, range_ratio=range_ratio
+    )
 
 
 def _prepare_model(config: Calibrate) -> CalibrationInputs:
@@ -308,7 +314,7 @@ def _prepare_model(config: Calibrate) -> CalibrationInputs:
     return prepare_model(
         config.recordings,
         holdout,
-        _overrides(config, config.xi),
+        _overrides(config, config.range_ratio),
         std=lambda robot: residual_std(config.residual_std, robot),
         spikes=SpikeSettings(ratio=config.spike_ratio),
         threads=config.threads,
@@ -337,7 +343,9 @@ def prepare_recorded(config: Calibrate) -> CalibrationInputs:
         sample_hz=config.sample_hz,
         spikes=SpikeSettings(ratio=config.spike_ratio),
     )
-    return prepare_dataset(source, config.space, _overrides(config, config.xi), config.method, _say(config))
+    return prepare_dataset(
+        source, config.space, _overrides(config, config.range_ratio), config.method, _say(config)
+    )
 
 
 def _say(config: Calibrate) -> Say:

@@ -59,9 +59,13 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
 
     table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
     for name, align in (
-        ("parameter", "left"), ("unit", "left"), ("nominal", "right"), ("estimate", "right"),
-        ("90 % interval", "left"), ("verdict", "left"),
-    ):  # fmt: skip
+        ("parameter", "left"),
+        ("unit", "left"),
+        ("nominal", "right"),
+        ("estimate", "right"),
+        ("90 % interval", "left"),
+        ("verdict", "left"),
+    ):
         table.add_column(name, justify="right" if align == "right" else "left")
     for k, p in enumerate(result.space):
         low, high = result.interval[k]

@@ -1,4 +1,4 @@
-"""``deal-hw collect``: record the robot while it moves in a way that tells much."""
+"""``deal-hw collect``: record the robot while it moves with an informative motion."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from deal_hw.cli.link import RunOptions, plan_options
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import dataset_folder, run_episodes
 from deal_hw.control.excitation import RichConfig
+from deal_hw.control.excitation_level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
-from deal_hw.control.vigor import ATTEMPTS, GENTLEST, LIVELIEST
 from deal_hw.workflows.options import Range, RunSeconds, Seed, given, refuse
 from deal_hw.workflows.shipped import shipped_policy
 
@@ -28,7 +28,7 @@ SHORT_S = 1.5 * SHORTEST_S
 
 @dataclass(frozen=True, kw_only=True)
 class Collect(RunOptions):
-    """Record the robot while it moves in a way that tells much."""
+    """Record the robot while it moves with an informative motion."""
 
     robot: tyro.conf.Positional[str]
     """The robot, such as cartpole."""
@@ -39,7 +39,7 @@ class Collect(RunOptions):
 
     excite: str = ""
     """Play this instead of a profile: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
-    file that `deal-hw excite` wrote, which says how long it is."""
+    file that `deal-hw design-excitation` wrote, which says how long it is."""
 
     policy: Path | None = None
     """Policy that balances (.onnx); by default the one shipped for the robot."""
@@ -50,12 +50,12 @@ class Collect(RunOptions):
     episodes: Annotated[int, Range(1, 10_000)] = 1
     """How many episodes."""
 
-    vigor: Annotated[float, Range(GENTLEST, LIVELIEST)] = 0.0
-    """Start profile rich livelier (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
+    excitation_level: Annotated[float, Range(LOWEST_LEVEL, HIGHEST_LEVEL)] = 0.0
+    """Start profile rich stronger (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
     the safety limits."""
 
     attempts: Annotated[int, Range(1, 100)] = ATTEMPTS
-    """How often an episode of profile rich is recorded at most: one that hardly moves is repeated livelier.
+    """How often an episode of profile rich is recorded at most: one that hardly moves is repeated stronger.
     After a trip nothing is repeated; look at the robot first."""
 
     seed: Seed = 0
@@ -88,7 +88,7 @@ def collect(config: Collect) -> RunReport:
         seconds=seconds,
         seed=config.seed,
         rich=config.rich,
-        vigor=config.vigor,
+        excitation_level=config.excitation_level,
         excite=excite,
     )
     return run_episodes(
@@ -112,7 +112,9 @@ def _refuse_ignored(config: Collect) -> None:
     if config.excite:
         refuse(given(config, default, ["profile"]), "--excite plays its own motion; leave one of the two out")
     if config.excite or config.profile != "rich":
-        refuse(given(config, default, ["vigor", "attempts"]), "only --profile rich can be livelier")
+        refuse(
+            given(config, default, ["excitation_level", "attempts"]), "only --profile rich can be stronger"
+        )
     if not config.excite and config.profile in ("chirp", "hold"):
         refuse(given(config, default, ["policy"]), f"--profile {config.profile} runs no policy")
 
@@ -128,16 +130,20 @@ def _excitation(config: Collect) -> tuple[str, float]:
             refuse(["--seconds"], f"{path} says that it is {plan.seconds:g} s long; leave it out")
         return str(path), plan.seconds
     # Only here: the rest of this verb runs on computers without the extras.
-    from deal_hw.cli.excite import Excite, excite
+    from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
 
     folder = dataset_folder(config.out, config.dataset)
     if folder is None:
         raise RuntimeError("unreachable: dataset_folder() raises where neither folder was given")
     path = folder.parent / EXCITATION_FILE
-    report = excite(
-        Excite(
-            robot=config.robot, out=path, seconds=config.seconds, policy=config.policy, seed=config.seed,
+    report = design_excitation(
+        DesignExcitation(
+            robot=config.robot,
+            out=path,
+            seconds=config.seconds,
+            policy=config.policy,
+            seed=config.seed,
             quiet=config.quiet,
         )
-    )  # fmt: skip
+    )
     return str(path), report.plan.seconds

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.handover import LOADING, RecordSender, StatusSender
+from deal_hw.control.process_channel import LOADING, RecordSender, StatusSender
 from deal_hw.control.realtime import (
     PARENT_DIED,
     Granted,
@@ -128,14 +128,22 @@ def _run(
     granted = become_realtime() if plan.realtime else Granted("default", ())
     passive = PassiveConfig(timeout_s=plan.passive_timeout_s)
     loop = ControlLoop(
-        robot, behaviour, Safety(robot.description), clock, sink,
+        robot,
+        behaviour,
+        Safety(robot.description),
+        clock,
+        sink,
         LoopConfig(
-            duration_s=plan.total_s, dry_run=plan.dry_run, home=plan.home, record_wire=plan.record_wire,
-            hand_back=plan.hand_back, passive=passive,
+            duration_s=plan.total_s,
+            dry_run=plan.dry_run,
+            home=plan.home,
+            record_wire=plan.record_wire,
+            hand_back=plan.hand_back,
+            passive=passive,
         ),
         progress=progress,
         scheduling=granted.scheduling,
-    )  # fmt: skip
+    )
     for warning in granted.warnings:
         loop.note("warning", warning)
     stopper.loop, stopper.passive_s = loop, passive.timeout_s

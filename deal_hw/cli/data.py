@@ -165,10 +165,16 @@ def _dataset_table(dataset: Dataset) -> Table:
     for episode in dataset.episodes:
         offset, drift = _clock_texts(episode)
         table.add_row(
-            Text(episode.file), Text(episode.purpose), Text(episode.wall_utc[:19]),
+            Text(episode.file),
+            Text(episode.purpose),
+            Text(episode.wall_utc[:19]),
             f"{episode.duration_s:.2f}",
-            str(episode.states), str(episode.commands), offset, drift, _worst(episode),
-        )  # fmt: skip
+            str(episode.states),
+            str(episode.commands),
+            offset,
+            drift,
+            _worst(episode),
+        )
     return table
 
 

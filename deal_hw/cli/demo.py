@@ -54,7 +54,7 @@ class Demo(Checked):
     firmware: Literal["python", "host", "avr"] = "python"
     """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
 
-    hung: bool = False
+    on_stand: bool = False
     """Go2: calibrate from a recording with its body on a stand instead of from its walk."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
@@ -63,7 +63,7 @@ class Demo(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        own = {"cartpole": ("firmware",), "go2": ("hung",)}
+        own = {"cartpole": ("firmware",), "go2": ("on_stand",)}
         for robot, options in own.items():
             if robot != self.robot:
                 refuse(given(self, Demo, options), f"only the demo of {robot} takes that")
@@ -189,7 +189,7 @@ def demo(config: Demo) -> DemoReport:
     clear(config.folder)
     folder, stages = RunFolder(config.folder), Stages()
     with folder:
-        settings = ("robot", "transport", "profile", "episodes", "steps", "hung")
+        settings = ("robot", "transport", "profile", "episodes", "steps", "on_stand")
         folder.start(
             {"kind": "demo", **{name: getattr(config, name) for name in settings}}, {"demo": config.seed}
         )
@@ -242,8 +242,8 @@ def _cpu_seconds() -> float:
 
 def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
     result, beside = done.found.result, done.beside
-    cadence = done.run.episodes[-1].cadence
-    values = cadence.to_json() if cadence is not None else {}
+    loop_timing = done.run.episodes[-1].loop_timing
+    values = loop_timing.to_json() if loop_timing is not None else {}
     periods = {f"period_{key}": values["period"][f"{key}_s"] for key in ("p50", "p99", "max") if values}
     return {
         "parameters": {
@@ -267,7 +267,7 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
         "latency_s": {"true": done.latency_s, "found": result.latency_s},
         **{m.name: {policy: float(v.mean()) for policy, v in m.values.items()} for m in done.measures},
         **{m.std_name: {policy: float(v.std()) for policy, v in m.values.items()} for m in done.measures},
-        "cadence": periods | values,
+        "loop_timing": periods | values,
         "alarms": [str(alarm) for alarm in result.alarms],
         "seconds": stages.seconds,
         "cpu_seconds": stages.cpu_seconds,
@@ -287,15 +287,24 @@ def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
     for name, row in summary["parameters"].items():
         inside = row["low"] <= row["truth"] <= row["high"]
         table.add_row(
-            name, row["unit"], f"{row['nominal']:.4g}", *(f"{row[done.beside_name]:.4g}" for _ in beside),
-            f"{row['estimate']:.4g}", f"{row['low']:.4g} .. {row['high']:.4g}",
+            name,
+            row["unit"],
+            f"{row['nominal']:.4g}",
+            *(f"{row[done.beside_name]:.4g}" for _ in beside),
+            f"{row['estimate']:.4g}",
+            f"{row['low']:.4g} .. {row['high']:.4g}",
             f"{row['truth']:.4g}" + ("" if inside else " (outside)"),
-        )  # fmt: skip
+        )
     latency = summary["latency_s"]
     table.add_row(
-        "latency", "ms", "0", *("" for _ in beside), f"{1e3 * latency['found']:.1f}", "",
+        "latency",
+        "ms",
+        "0",
+        *("" for _ in beside),
+        f"{1e3 * latency['found']:.1f}",
+        "",
         f"{1e3 * latency['true']:.1f}",
-    )  # fmt: skip
+    )
     console.print(table)
     for name, row in summary["known"].items():
         console.print(f"{name}, not fitted: {row['value']:.4g}, truth {row['truth']:.4g}")

@@ -32,9 +32,17 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     out, transport, episodes = config.folder, config.transport or "serial", config.episodes or EPISODES
     truth_file = out / "truth.json"
     options = (
-        "--transport", transport, "--profile", config.profile, "--seed", str(config.seed),
-        "--firmware", config.firmware, "--reveal-to", str(truth_file),
-    )  # fmt: skip
+        "--transport",
+        transport,
+        "--profile",
+        config.profile,
+        "--seed",
+        str(config.seed),
+        "--firmware",
+        config.firmware,
+        "--reveal-to",
+        str(truth_file),
+    )
     link = LinkOptions(transport=transport)
     with EmulatorProcess("cartpole", *options) as emulator:
         port = emulator.port
@@ -42,42 +50,54 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
         with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
             for kind in ("rich", "chirp"):
                 collect(
-                    Collect(
-                        robot="cartpole", port=port, link=link, out=out, profile=kind, seed=config.seed
-                    )
-                )  # fmt: skip
+                    Collect(robot="cartpole", port=port, link=link, out=out, profile=kind, seed=config.seed)
+                )
         with stages.stage("calibrate", "search, refinement, latency, intervals"):
             found = calibrate(Calibrate(dataset=folder.dataset, out=out, seed=config.seed))
         with stages.stage("calibrate deal", "the adversarial search alone, to compare with"):
             beside = calibrate(
                 Calibrate(
-                    dataset=folder.dataset, out=out / "deal", method="deal", refine=False, seed=config.seed,
+                    dataset=folder.dataset,
+                    out=out / "deal",
+                    method="deal",
+                    refine=False,
+                    seed=config.seed,
                     quiet=True,
                 )
-            )  # fmt: skip
+            )
         policy = folder.policies / "calibrated.onnx"
         with stages.stage("train", "a policy under what is now known of the robot"):
             train(
                 Train(
-                    robot="cartpole", distribution=found.files["distribution.json"], out=policy,
-                    steps=config.steps, seed=config.seed,
+                    robot="cartpole",
+                    distribution=found.files["distribution.json"],
+                    out=policy,
+                    steps=config.steps,
+                    seed=config.seed,
                 )
-            )  # fmt: skip
+            )
         runs: dict[str, RunReport] = {}
         for name, file in (("udr", udr), ("retrained", policy)):
             with stages.stage(f"deploy {name}", f"{episodes} times 10 s over the port"):
                 runs[name] = deploy(
                     Deploy(
-                        robot="cartpole", port=port, link=link, policy=file, dataset=out / f"deploy_{name}",
-                        episodes=episodes, task="balance",
+                        robot="cartpole",
+                        port=port,
+                        link=link,
+                        policy=file,
+                        dataset=out / f"deploy_{name}",
+                        episodes=episodes,
+                        task="balance",
                     )
-                )  # fmt: skip
+                )
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
         rrd = show_first_episode(folder)
     truth = read_truth(truth_file)
     scores = {name: task_scores(out / f"deploy_{name}", episodes) for name in runs}
     return Demonstrated(
-        found=found, truth=truth["parameters"], latency_s=truth["latency_s"],
+        found=found,
+        truth=truth["parameters"],
+        latency_s=truth["latency_s"],
         measures=[
             Measure(
                 name=name, unit=unit, heading=heading, values={p: score[:, i] for p, score in scores.items()}
@@ -92,8 +112,9 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
         comparison="policies on the robot, mean ± std over deployments (the paper's Table 2)",
         run=runs["retrained"],
         paths={"rrd": str(rrd), "mjcf": str(found.files["calibrated.xml"]), "policy": str(policy)},
-        beside=beside.result, beside_name="deal",
-    )  # fmt: skip
+        beside=beside.result,
+        beside_name="deal",
+    )
 
 
 def task_scores(dataset: Path, episodes: int) -> FloatArray:

@@ -78,19 +78,23 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
     with _emulated(config, "before") as robot:
         with stages.stage("walk udr", f"stand up, walk {PROFILE_S:g} s, lie down; {episodes} times"):
             walks["udr"] = robot.whole_walk(udr, profile, PROFILE_S, folder.dataset, episodes)
-        if not config.hung:
+        if not config.on_stand:
             with stages.stage("walk held-out", f"{HELDOUT_S:g} s of other velocities, to judge by"):
                 judge = robot.whole_walk(udr, heldout, HELDOUT_S, folder.dataset, 1)
-    if config.hung:
+    if config.on_stand:
         found, distribution = _on_stand(config, folder, stages)
     else:
         with stages.stage("calibrate", "gains and friction from joints, feet and IMU; payload from efforts"):
             found = calibrate(
                 Calibrate(
-                    dataset=folder.dataset, out=out, space="walk", episodes=walks["udr"].numbers,
-                    holdout=judge.numbers, seed=config.seed,
+                    dataset=folder.dataset,
+                    out=out,
+                    space="walk",
+                    episodes=walks["udr"].numbers,
+                    holdout=judge.numbers,
+                    seed=config.seed,
                 )
-            )  # fmt: skip
+            )
         distribution = found.files["distribution.json"]
     policies = _fine_tuned(config, folder, stages, distribution, udr)
     with _emulated(config, "after") as robot:
@@ -98,19 +102,22 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
             with stages.stage(f"walk {name}", "the same velocities again"):
                 walks[name] = robot.walk(policy, profile, PROFILE_S, out / f"walk_{name}", episodes)
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
-        rrd = show_first_episode(folder, out / "dataset_hung" if config.hung else None)
+        rrd = show_first_episode(folder, out / "dataset_on_stand" if config.on_stand else None)
     truth = read_truth(out / "truth_after.json")
-    true = truth["parameters_at_kp20_kd1.5" if config.hung else "walk_parameters"]
+    true = truth["parameters_at_kp20_kd1.5" if config.on_stand else "walk_parameters"]
     return Demonstrated(
-        found=found, truth=true, latency_s=1e-3 * truth["latency_ms"],
+        found=found,
+        truth=true,
+        latency_s=1e-3 * truth["latency_ms"],
         measures=_measures(walks),
         comparison="policies on the robot, mean ± std over walks, by the emulator's truth",
         run=walks["calibrated"].report,
         paths={
-            "rrd": str(rrd), "mjcf": str(found.files["calibrated.xml"]),
+            "rrd": str(rrd),
+            "mjcf": str(found.files["calibrated.xml"]),
             "policy": str(policies["calibrated"]),
         },
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,10 +145,17 @@ class _Emulated:
         """Let it walk."""
         report = deploy(
             Deploy(
-                robot="go2", port=self.port, link=self.link, legs=LegOptions(velocity=str(script)),
-                policy=policy, seconds=seconds, dataset=dataset, episodes=times, task="walk",
+                robot="go2",
+                port=self.port,
+                link=self.link,
+                legs=LegOptions(velocity=str(script)),
+                policy=policy,
+                seconds=seconds,
+                dataset=dataset,
+                episodes=times,
+                task="walk",
             )
-        )  # fmt: skip
+        )
         return _Walked(report=report, track=self.track)
 
     def whole_walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
@@ -168,10 +182,21 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
     out, transport = config.folder, _transport(config)
     track = out / f"truth_track_{name}.csv"
     with EmulatorProcess(
-        "go2", "--transport", transport, "--port", PORTS[transport], "--profile", config.profile,
-        "--seed", str(config.seed), "--reveal-to", str(out / f"truth_{name}.json"), "--track-to", str(track),
+        "go2",
+        "--transport",
+        transport,
+        "--port",
+        PORTS[transport],
+        "--profile",
+        config.profile,
+        "--seed",
+        str(config.seed),
+        "--reveal-to",
+        str(out / f"truth_{name}.json"),
+        "--track-to",
+        str(track),
         *options,
-    ) as emulator:  # fmt: skip
+    ) as emulator:
         print(f"an emulated Go2 ({config.profile}) with hidden physics is on {emulator.port}")
         # The raw bytes are nobody's need here, and half of the recorder's work.
         link = LinkOptions(transport=transport, record_wire=False)
@@ -191,16 +216,21 @@ def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[Calibrat
     Returns:
         The calibration, and the file of what it says of the robot on the floor.
     """
-    out, dataset = config.folder, config.folder / "dataset_hung"
-    with _emulated(config, "hung", "--suspended") as robot:
+    out, dataset = config.folder, config.folder / "dataset_on_stand"
+    with _emulated(config, "on_stand", "--on-stand") as robot:
         with stages.stage("collect on a stand", "10 s of a multisine, and 8 s of a sweep to judge by"):
             for excite, seconds in (("multisine", 10.0), ("chirp", 8.0)):
                 collect(
                     Collect(
-                        robot="go2_hung", port=robot.port, link=robot.link, dataset=dataset, excite=excite,
-                        seconds=seconds, seed=config.seed,
+                        robot="go2_on_stand",
+                        port=robot.port,
+                        link=robot.link,
+                        dataset=dataset,
+                        excite=excite,
+                        seconds=seconds,
+                        seed=config.seed,
                     )
-                )  # fmt: skip
+                )
     with stages.stage("calibrate", "gains, friction and armature of each joint"):
         found = calibrate(
             Calibrate(
@@ -223,11 +253,15 @@ def _fine_tuned(
         with stages.stage(f"train {name}", "the shipped policy, some steps more"):
             train(
                 Train(
-                    robot="go2", distribution=distribution, udr=distribution is None,
-                    start=udr.with_suffix(".safetensors"), out=policy, steps=config.steps or STEPS,
+                    robot="go2",
+                    distribution=distribution,
+                    udr=distribution is None,
+                    start=udr.with_suffix(".safetensors"),
+                    out=policy,
+                    steps=config.steps or STEPS,
                     seed=config.seed,
                 )
-            )  # fmt: skip
+            )
     return policies
 
 
@@ -265,16 +299,22 @@ def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
     falls = {name: np.array([float(fell) for _, fell in found]) for name, found in true.items()}
     return [
         Measure(
-            name="velocity_error_m_s", unit="m_s", heading="velocity error [m/s]",
+            name="velocity_error_m_s",
+            unit="m_s",
+            heading="velocity error [m/s]",
             values=each(judged, "velocity_m_s"),
         ),
         Measure(
-            name="yaw_error_rad_s", unit="rad_s", heading="yaw rate error [rad/s]",
+            name="yaw_error_rad_s",
+            unit="rad_s",
+            heading="yaw rate error [rad/s]",
             values=each(judged, "yaw_rad_s"),
         ),
         Measure(
-            name="estimated_velocity_error_m_s", unit="m_s", heading="its own estimate [m/s]",
+            name="estimated_velocity_error_m_s",
+            unit="m_s",
+            heading="its own estimate [m/s]",
             values=each(own, "velocity_m_s"),
         ),
         Measure(name="falls", heading="falls", values=falls),
-    ]  # fmt: skip
+    ]

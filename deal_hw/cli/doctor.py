@@ -23,7 +23,7 @@ from deal_hw.drivers import (
     default_transport,
     make_robot,
     make_topic_transport,
-)  # fmt: skip
+)
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
@@ -114,9 +114,13 @@ def _wrapped(lead: str, text: str) -> str:
     """Return a text after its lead, in lines that the terminal holds."""
     width = shutil.get_terminal_size().columns
     return textwrap.fill(
-        text, max(width, 60), initial_indent=lead, subsequent_indent=" " * len(lead), break_long_words=False,
+        text,
+        max(width, 60),
+        initial_indent=lead,
+        subsequent_indent=" " * len(lead),
+        break_long_words=False,
         break_on_hyphens=False,
-    )  # fmt: skip
+    )
 
 
 def _examine(config: Doctor) -> Iterator[Finding]:

@@ -57,33 +57,40 @@ def listen_to_bus(transport: CanTransport, clock: Clock, seconds: float, *nodes:
     if not frames:
         trouble = f" ({transport.trouble})" if transport.trouble else ""
         yield Finding(
-            "can", Level.WARN, f"{transport.port}: no frame within {seconds:g} s{rate}{trouble}",
+            "can",
+            Level.WARN,
+            f"{transport.port}: no frame within {seconds:g} s{rate}{trouble}",
             "is the device powered, is it this bit rate, are CAN-H and CAN-L the right way round, is there a "
             "resistor of 120 ohm at both ends?",
-        )  # fmt: skip
+        )
         return
     share = bits / seconds / address.bitrate
     busy = share > _BUSY
     yield Finding(
-        "can", Level.WARN if busy else Level.OK,
+        "can",
+        Level.WARN if busy else Level.OK,
         f"{transport.port}: {sum(frames.values()) / seconds:.0f} frames a second{rate}, "
         f"at least {share:.0%} of {address.bitrate} bit/s",
         "use a higher bit rate, or take other devices off the bus" if busy else "",
-    )  # fmt: skip
+    )
     if foreign := sorted(set(frames) - set(nodes)):
         told = ", ".join(f"{node} ({frames[node] / seconds:.0f} frames a second)" for node in foreign[:8])
         yield Finding("can", Level.NOTE, f"other nodes on the bus: {told}", "they are filtered out")
     if missing := sorted(set(nodes) - set(frames)):
         heard = ", ".join(map(str, sorted(frames)))
         yield Finding(
-            "can", Level.WARN, f"nothing comes from node {', '.join(map(str, missing))}; heard: {heard}",
+            "can",
+            Level.WARN,
+            f"nothing comes from node {', '.join(map(str, missing))}; heard: {heard}",
             f"give the number in the port: {transport.port.partition('?')[0]}?node=NUMBER",
-        )  # fmt: skip
+        )
     if transport.error_frames:
         yield Finding(
-            "can", Level.WARN, f"{transport.error_frames} errors on the bus; the last: {transport.trouble}",
+            "can",
+            Level.WARN,
+            f"{transport.error_frames} errors on the bus; the last: {transport.trouble}",
             "check wiring, termination and bit rate",
-        )  # fmt: skip
+        )
 
 
 def _ip_details() -> dict[str, dict[str, Any]]:

@@ -17,9 +17,15 @@ from deal_hw.findings import Finding, Level
 from deal_hw.install import install_line
 
 PACKAGES: Final = (
-    ("eclipse-zenoh", ""), ("cyclonedds", "dds"), ("mujoco", "sim"), ("torch", "calib"), ("rerun-sdk", "viz"),
-    ("onnxruntime", ""), ("python-can", ""), ("cantools", ""),
-)  # fmt: skip
+    ("eclipse-zenoh", ""),
+    ("cyclonedds", "dds"),
+    ("mujoco", "sim"),
+    ("torch", "calib"),
+    ("rerun-sdk", "viz"),
+    ("onnxruntime", ""),
+    ("python-can", ""),
+    ("cantools", ""),
+)
 """Distribution, extra that installs it ("": the base install)."""
 _LEAST_LOCK_BYTES: Final = 512 << 20
 _COARSE_S: Final = 1e-5

@@ -34,7 +34,7 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
     """
     with robot:
         yield Finding("link", Level.OK, f"{name} answers{_told(getattr(robot, 'info', None))}")
-        errors = robot.link_errors
+        errors = robot.transport_errors
         host_ns: list[int] = []
         device_ns: list[int] = []
         end_ns = clock.now_ns() + round(seconds * 1e9)
@@ -46,21 +46,24 @@ def examine_robot(name: str, robot: Robot, clock: Clock, seconds: float) -> Iter
                 return
             host_ns.append(state.receive_ns)
             device_ns.append(state.device_ns)
-        errors = robot.link_errors - errors
+        errors = robot.transport_errors - errors
     wanted_hz = robot.description.state_rate_hz
     rate_hz = (len(host_ns) - 1) / max((host_ns[-1] - host_ns[0]) * 1e-9, 1e-9)
     slow = rate_hz < _SLOW * wanted_hz
     yield Finding(
-        "states", Level.WARN if slow else Level.OK, f"{rate_hz:.0f} states a second of {wanted_hz:.0f}",
+        "states",
+        Level.WARN if slow else Level.OK,
+        f"{rate_hz:.0f} states a second of {wanted_hz:.0f}",
         "another cable or a less busy computer" if slow else "",
-    )  # fmt: skip
+    )
     share = errors / (errors + len(host_ns))
     bad = share > _FEW_ERRORS
     yield Finding(
-        "states", Level.WARN if bad else Level.OK,
+        "states",
+        Level.WARN if bad else Level.OK,
         f"{errors} of {errors + len(host_ns)} states corrupt or lost ({share:.1%})",
         "check cable, connectors and grounding" if bad else "",
-    )  # fmt: skip
+    )
     yield judge_clock(np.array(host_ns), np.array(device_ns))
 
 

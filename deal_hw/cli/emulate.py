@@ -19,7 +19,7 @@ from deal_hw.cli.emulate_common import (
     signalled,
 )
 from deal_hw.cli.emulate_go2 import emulate_go2
-from deal_hw.cli.emulate_settings import CARTPOLE_EMULATORS, CARTPOLE_XI, ON_CAN, Emulate
+from deal_hw.cli.emulate_settings import CARTPOLE_EMULATORS, CARTPOLE_RANGE_RATIO, ON_CAN, Emulate
 from deal_hw.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -110,7 +110,11 @@ def _truth(config: Emulate) -> Truth:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
         return read_truth(config.truth_from, Truth.from_json)
-    return draw_truth(config.profile, config.seed, xi=CARTPOLE_XI if config.xi is None else config.xi)
+    return draw_truth(
+        config.profile,
+        config.seed,
+        range_ratio=CARTPOLE_RANGE_RATIO if config.range_ratio is None else config.range_ratio,
+    )
 
 
 def _hazards(config: Emulate) -> Hazards:

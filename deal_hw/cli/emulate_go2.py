@@ -183,13 +183,17 @@ def free_port(port: str) -> str:
 
 
 def _truth(config: Emulate) -> Truth:
-    from deal_hw.drivers.go2.emulator.truth import DEFAULT_XI, Truth, draw_truth, nominal_truth
+    from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Truth, draw_truth, nominal_truth
 
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
         return read_truth(config.truth_from, Truth.from_json)
-    return draw_truth(config.profile, config.seed, xi=DEFAULT_XI if config.xi is None else config.xi)
+    return draw_truth(
+        config.profile,
+        config.seed,
+        range_ratio=DEFAULT_RANGE_RATIO if config.range_ratio is None else config.range_ratio,
+    )
 
 
 def _device(config: Emulate, truth: Truth) -> Go2Device:
@@ -198,15 +202,24 @@ def _device(config: Emulate, truth: Truth) -> Go2Device:
 
     own = config.go2
     plan = FaultPlan(
-        drop=config.drop, duplicate=config.duplicate, corrupt=config.corrupt,
-        freeze_after_s=config.freeze_after_s, cut_after_s=config.cut_after_s, cut_s=config.cut_s,
+        drop=config.drop,
+        duplicate=config.duplicate,
+        corrupt=config.corrupt,
+        freeze_after_s=config.freeze_after_s,
+        cut_after_s=config.cut_after_s,
+        cut_s=config.cut_s,
         **asdict(own.faults),
-    )  # fmt: skip
+    )
     if own.no_remote and own.remote_script is not None:
         raise ConfigurationError("--no-remote and --remote-script exclude each other")
     script = () if own.remote_script is None else read_remote_script(own.remote_script)
     return Go2Device(
-        truth, on_stand=own.suspended, start=own.start, sport="" if own.sport == "off" else own.sport,
-        sport_on_wire=not own.sport_silent, plan=plan, remote=None if own.no_remote else script,
+        truth,
+        on_stand=own.on_stand,
+        start=own.start,
+        sport="" if own.sport == "off" else own.sport,
+        sport_on_wire=not own.sport_silent,
+        plan=plan,
+        remote=None if own.no_remote else script,
         tick_ms=own.tick_start_ms,
-    )  # fmt: skip
+    )

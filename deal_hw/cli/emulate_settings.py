@@ -21,7 +21,7 @@ DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 class Go2Options:
     """Options of ``emulate go2`` alone."""
 
-    suspended: bool = False
+    on_stand: bool = False
     """The base is held in the air: no floor, no contact."""
 
     start: Literal["lying", "standing"] = "lying"
@@ -73,9 +73,14 @@ class Go2Options:
     def wire(self, transport: str) -> WireOptions:
         """Return how the emulator joins the wire."""
         return WireOptions(
-            domain=self.domain, listen=transport == "zenoh" and self.mode == "peer", mode=self.mode,
-            insecure=self.insecure, ca=self.ca, certificate=self.certificate, key=self.key,
-        )  # fmt: skip
+            domain=self.domain,
+            listen=transport == "zenoh" and self.mode == "peer",
+            mode=self.mode,
+            insecure=self.insecure,
+            ca=self.ca,
+            certificate=self.certificate,
+            key=self.key,
+        )
 
     def given(self) -> list[str]:
         """Return the flags of options that differ from their defaults."""
@@ -167,7 +172,7 @@ ON_CAN = ("can", "odrive")
 """Wires of the cart-pole with a CAN bus."""
 TRANSPORTS = {"cartpole": tuple(CARTPOLE_EMULATORS), "go2": tuple(DEFAULT_PORTS)}
 """Robots to emulate and the wires that each speaks on; the first is the default."""
-CARTPOLE_XI = 5.0
+CARTPOLE_RANGE_RATIO = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +197,7 @@ class Emulate:
     seed: Seed = 0
     """Decides the hidden parameters, the noise and the start angles."""
 
-    xi: Annotated[float | None, Ratio] = None
+    range_ratio: Annotated[float | None, Ratio] = None
     """Hidden parameters lie within this ratio of the nominal ones; 5 for the cart-pole, 2 for the Go2."""
 
     nominal: bool = False

@@ -32,8 +32,15 @@ class VerbProcess:
     def __init__(self, verb: str, *arguments: str, what: str = "", prefix: Sequence[str] = ()) -> None:
         self._what = what or f"deal-hw {verb}"
         self._command = [
-            *prefix, sys.executable, "-m", "deal_hw", verb, "--parent", str(os.getpid()), *arguments,
-        ]  # fmt: skip
+            *prefix,
+            sys.executable,
+            "-m",
+            "deal_hw",
+            verb,
+            "--parent",
+            str(os.getpid()),
+            *arguments,
+        ]
         self._process: subprocess.Popen[bytes] | None = None
         self.port = ""
 

@@ -14,8 +14,16 @@ from deal_hw.cli.episode_report import EpisodeReport
 from deal_hw.cli.keyboard import keys
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.handover import CONNECTING, HANDING_BACK, HOMING, LOADING, MAKING_PASSIVE, STARTING, Beat
 from deal_hw.control.passive import PassiveConfig, make_passive
+from deal_hw.control.process_channel import (
+    CONNECTING,
+    HANDING_BACK,
+    HOMING,
+    LOADING,
+    MAKING_PASSIVE,
+    STARTING,
+    Beat,
+)
 from deal_hw.control.supervisor import OPERATOR, Supervisor
 from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.recording.excitation import Excitation
@@ -63,7 +71,7 @@ class Episode:
             "excite": plan.excite,
             "seed": plan.seed,
             "seconds": plan.seconds,
-            "vigor": plan.vigor,
+            "excitation_level": plan.excitation_level,
             "attempt": attempt,
             "dry_run": plan.dry_run,
             "velocity": plan.velocity,

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.cli.episode_report import EpisodeReport
-from deal_hw.control.cadence import CadenceReport
 from deal_hw.control.loop import Outcome
+from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd
 
 _LINK_WARNING = 0.01
@@ -34,11 +34,11 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
             "(damping), then its switch"
         )
         warnings.append(f"the robot did not confirm that it is passive: switch it off by hand. {cut}")
-    cadence = CadenceReport.from_json(result["cadence"]) if result.get("cadence") else None
-    if cadence is not None and cadence.link_errors > _LINK_WARNING * max(cadence.states, 1):
-        share = cadence.link_errors / (cadence.states + cadence.link_errors)
+    loop_timing = LoopTimingReport.from_json(result["loop_timing"]) if result.get("loop_timing") else None
+    if loop_timing is not None and loop_timing.transport_errors > _LINK_WARNING * max(loop_timing.states, 1):
+        share = loop_timing.transport_errors / (loop_timing.states + loop_timing.transport_errors)
         warnings.append(
-            f"{cadence.link_errors} link errors, {share:.0%} of the state frames: "
+            f"{loop_timing.transport_errors} transport errors, {share:.0%} of the state frames: "
             "check cable, connectors and grounding"
         )
     if end.recorder is not None and not end.recorder.complete:
@@ -51,7 +51,7 @@ def account(end: ChildEnd, path: Path | None, watchdog_s: float) -> EpisodeRepor
         outcome=outcome,
         reason=reason,
         passive_confirmed=end.passive_confirmed,
-        cadence=cadence,
+        loop_timing=loop_timing,
         clipped=dict(result.get("clipped", {})),
         cycles_sent=int(result.get("cycles_sent", 0)),
         states_recorded=end.recorder.states if end.recorder is not None else 0,

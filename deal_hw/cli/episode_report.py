@@ -11,9 +11,9 @@ from typing import Any
 
 from deal_hw import errors
 from deal_hw.cli.seconds_bar import seconds_bar
-from deal_hw.control.cadence import CadenceReport
-from deal_hw.control.handover import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.control.loop import Outcome
+from deal_hw.control.loop_timing import LoopTimingReport
+from deal_hw.control.process_channel import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.control.velocity_error import VelocityError
 from deal_hw.data.recording.excitation import Excitation
 
@@ -29,7 +29,7 @@ class EpisodeReport:
         outcome: How it ended.
         reason: In words.
         passive_confirmed: Whether the robot itself confirmed that it is passive.
-        cadence: How regular the control loop was; None where it never ran or was killed.
+        loop_timing: How regular the control loop was; None where it never ran or was killed.
         clipped: Cycles in which each limit changed a command, by limit.
         cycles_sent: Commands sent.
         states_recorded: State samples in the file.
@@ -44,7 +44,7 @@ class EpisodeReport:
     outcome: Outcome
     reason: str
     passive_confirmed: bool
-    cadence: CadenceReport | None
+    loop_timing: LoopTimingReport | None
     clipped: dict[str, int]
     cycles_sent: int
     states_recorded: int
@@ -56,11 +56,16 @@ class EpisodeReport:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         return {
-            "outcome": self.outcome.value, "reason": self.reason, "passive_confirmed": self.passive_confirmed,
-            "cadence": self.cadence.to_json() if self.cadence is not None else None, "clipped": self.clipped,
-            "cycles_sent": self.cycles_sent, "states_recorded": self.states_recorded,
-            "warnings": list(self.warnings), "error": self.error,
-        }  # fmt: skip
+            "outcome": self.outcome.value,
+            "reason": self.reason,
+            "passive_confirmed": self.passive_confirmed,
+            "loop_timing": self.loop_timing.to_json() if self.loop_timing is not None else None,
+            "clipped": self.clipped,
+            "cycles_sent": self.cycles_sent,
+            "states_recorded": self.states_recorded,
+            "warnings": list(self.warnings),
+            "error": self.error,
+        }
 
     def raise_error(self) -> None:
         """Raise the error that ended the episode, as the class that it was in the control process."""
@@ -101,8 +106,8 @@ class RunReport:
 def print_report(report: EpisodeReport) -> None:
     """Print an account for the operator."""
     print(f"{report.outcome.value}: {report.reason}")
-    if report.cadence is not None:
-        print("\n".join("  " + line for line in report.cadence.lines()))
+    if report.loop_timing is not None:
+        print("\n".join("  " + line for line in report.loop_timing.lines()))
     for limit, cycles in report.clipped.items():
         print(f"  clipped by the safety filter: {limit} in {cycles} cycles")
     if report.path is not None:

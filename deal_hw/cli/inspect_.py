@@ -104,9 +104,15 @@ def inspect(config: Inspect) -> InspectReport:
             rrd = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="deal-hw-"))) / "episode.rrd"
         _prepare(rrd)
         write_episode(
-            rrd, episode.trajectory, description, cycles=episode.cycles, overlay=overlay, result=result,
-            name=f"{config.episode.parent.parent.name}/{config.episode.stem}", note=note,
-        )  # fmt: skip
+            rrd,
+            episode.trajectory,
+            description,
+            cycles=episode.cycles,
+            overlay=overlay,
+            result=result,
+            name=f"{config.episode.parent.parent.name}/{config.episode.stem}",
+            note=note,
+        )
         if config.screenshot:
             save_screenshot(rrd, config.screenshot, at_s=_moment(config, overlay))
         _show(config, rrd)

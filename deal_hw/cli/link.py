@@ -34,7 +34,7 @@ class LegOptions:
     L2+B)."""
 
     support_check: bool = True
-    """Refuse a Go2 on a stand, and a go2_hung on the floor. Leave it out only to try a policy in the air."""
+    """Refuse a go2 on a stand and a go2_on_stand on the floor. Leave out only to try a policy in the air."""
 
     posture: PostureConfig = field(default_factory=PostureConfig)
     """How long standing up and lying down take."""

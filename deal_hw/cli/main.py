@@ -57,10 +57,11 @@ class Verb:
 def _verb(
     name: str, *, help: str, example: str, extra: str = "", module: str = "", function: str = ""
 ) -> Verb:
+    plain = name.replace("-", "_")
     return Verb(
-        module=f"deal_hw.cli.{module or name}",
-        config=name.capitalize(),
-        function=function or name,
+        module=f"deal_hw.cli.{module or plain}",
+        config="".join(part.capitalize() for part in name.split("-")),
+        function=function or plain,
         help=help,
         example=example,
         extra=extra,
@@ -71,7 +72,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
     {
         "collect": _verb(
             "collect",
-            help="record the robot while it moves in a way that tells much",
+            help="record the robot while it moves with an informative motion",
             example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
         ),
         "calibrate": _verb(
@@ -111,10 +112,10 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             example="demo --out runs/demo",
             extra="all",
         ),
-        "excite": _verb(
-            "excite",
+        "design-excitation": _verb(
+            "design-excitation",
             help="compute what to play on a robot so that a recording tells most",
-            example="excite cartpole --out runs/first/excitation.json",
+            example="design-excitation cartpole --out runs/first/excitation.json",
             extra="calib",
         ),
         "emulate": _verb(

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour, ReplayBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
+from deal_hw.control.excitation_level import with_excitation_level
 from deal_hw.control.excitation_plan import (
     FAMILIES,
     ExcitationBehaviour,
@@ -25,7 +26,6 @@ from deal_hw.control.excitation_plan import (
 )
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.velocity import BoundedSource, VelocitySource, limited_axes, make_source
-from deal_hw.control.vigor import with_vigor
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.policy import VERDICT, Policy
@@ -54,8 +54,9 @@ class RunPlan:
         dry_run: Whether to compute everything and send nothing.
         home: Whether to bring the robot to its start pose first.
         rich: Settings of the profile `rich`; its length is ``seconds``.
-        vigor: Steps that the profile `rich` is livelier, or gentler where negative.
-        excite: What the profile `excite` plays: `chirp`, `multisine`, or a file of `deal-hw excite`.
+        excitation_level: Steps that the profile `rich` is stronger, or gentler where negative.
+        excite: What the profile `excite` plays: `chirp`, `multisine`, or a file of
+            `deal-hw design-excitation`.
         port: Where the robot is, for transports without a descriptor to inherit.
         wire: More about a transport of topics.
         velocity: Where a walking policy's wanted velocity comes from; see
@@ -83,7 +84,7 @@ class RunPlan:
     dry_run: bool = False
     home: bool = True
     rich: RichConfig = field(default_factory=RichConfig)
-    vigor: float = 0.0
+    excitation_level: float = 0.0
     excite: str = ""
     port: str = ""
     wire: WireOptions = field(default_factory=WireOptions)
@@ -227,7 +228,7 @@ def _inner_behaviour(
         balance = PolicyBehaviour(policy(), description) if excitation.balance_s > 0 else None
         return ExcitationBehaviour(excitation, description, balance)
     if plan.profile == "rich":
-        config = with_vigor(plan.rich, plan.vigor, description)
+        config = with_excitation_level(plan.rich, plan.excitation_level, description)
         config = dataclasses.replace(config, duration_s=plan.seconds)
         balance = PolicyBehaviour(policy(), description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)

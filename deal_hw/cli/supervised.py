@@ -17,9 +17,9 @@ from deal_hw.cli.episode_report import EpisodeReport, RunReport, print_report, p
 from deal_hw.cli.keyboard import check_terminal
 from deal_hw.cli.run_plan import RunPlan, check_plan
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.handover import Beat
+from deal_hw.control.excitation_level import ExcitationLevelSearch, shortfalls
 from deal_hw.control.loop import Outcome
-from deal_hw.control.vigor import VigorSearch, shortfalls
+from deal_hw.control.process_channel import Beat
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
 
@@ -90,8 +90,8 @@ def run_episodes(
         task: For the metadata.
         quiet: Whether to print nothing.
         on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
-        attempts: How often an episode of the profile `rich` is recorded at most, livelier each time, until it
-            moves enough; see :mod:`deal_hw.control.vigor`.
+        attempts: How often an episode of the profile `rich` is recorded at most, stronger each time, until it
+            moves enough; see :mod:`deal_hw.control.excitation_level`.
 
     Raises:
         DealHwError: What made it fail, after the robot was made passive and the recording closed.
@@ -103,11 +103,16 @@ def run_episodes(
     if plan.velocity == "keyboard":
         check_terminal()
     robot = make_robot(
-        plan.robot, plan.transport, port, MonotonicClock(), plan.wire, plan.robot_settings,
+        plan.robot,
+        plan.transport,
+        port,
+        MonotonicClock(),
+        plan.wire,
+        plan.robot_settings,
         can_send=not plan.dry_run,
-    )  # fmt: skip
+    )
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
-    VigorSearch(plan.vigor, attempts)
+    ExcitationLevelSearch(plan.excitation_level, attempts)
     plan = check_plan(plan, robot.description)
     reports: list[EpisodeReport] = []
     if not robot.watchdog_s and not plan.dry_run and not quiet:
@@ -127,10 +132,10 @@ def run_episodes(
             last = number == episodes - 1
             episode = dataclasses.replace(plan, seed=plan.seed + number, hand_back=plan.hand_back and last)
             title = f"{purpose} {plan.robot} {number + 1}/{episodes}"
-            search = VigorSearch(plan.vigor, attempts, rearm=False)
+            search = ExcitationLevelSearch(plan.excitation_level, attempts, rearm=False)
             again = True
             while again:
-                episode = dataclasses.replace(episode, vigor=search.vigor)
+                episode = dataclasses.replace(episode, excitation_level=search.level)
                 run = Episode(episode, robot, port, store, purpose, task, len(search.attempts), claim)
                 with contextlib.nullcontext(_ignore) if quiet else progress(title, plan.total_s) as show:
                     reports.append(run.run(_both(show, on_beat)))
@@ -160,9 +165,9 @@ def _suspended_last() -> Iterator[None]:
 
 
 def _to_repeat(
-    search: VigorSearch, plan: RunPlan, report: EpisodeReport, description: RobotDescription
+    search: ExcitationLevelSearch, plan: RunPlan, report: EpisodeReport, description: RobotDescription
 ) -> bool:
-    """Say whether an episode is recorded again, at the search's new vigor; its words tell why."""
+    """Say whether an episode is recorded again, at the search's new excitation level; its words tell why."""
     judged = report.outcome in (Outcome.FINISHED, Outcome.TRIPPED) and report.motion is not None
     if plan.profile != "rich" or not judged or plan.dry_run or description.floating_base is not None:
         return False

@@ -96,13 +96,24 @@ def train(config: Train) -> OnnxPolicy:
         from deal_hw.training import TrainingFiles
 
         files = TrainingFiles(
-            checkpoint=checkpoint, start=config.start, resume=config.resume,
-            log=path.with_name(path.stem + "_tensorboard"), stop=lambda: bool(stopped),
-        )  # fmt: skip
+            checkpoint=checkpoint,
+            start=config.start,
+            resume=config.resume,
+            log=path.with_name(path.stem + "_tensorboard"),
+            stop=lambda: bool(stopped),
+        )
         policy = train_policy(
-            config.robot, distribution, path, trainer=config.trainer, seed=config.seed, steps=config.steps,
-            members=config.members, progress=_follow(bar), files=files, verdict=_verdict(config),
-        )  # fmt: skip
+            config.robot,
+            distribution,
+            path,
+            trainer=config.trainer,
+            seed=config.seed,
+            steps=config.steps,
+            members=config.members,
+            progress=_follow(bar),
+            files=files,
+            verdict=_verdict(config),
+        )
     print(f"policy: {path}")
     print(f"record: {path.with_suffix('.json')}")
     print(f"checkpoint: {checkpoint}")
@@ -198,8 +209,10 @@ def _spent(record: Path) -> dict[str, float]:
 
 def _distribution(config: Train) -> ParameterDistribution:
     wanted = {
-        "--distribution": config.distribution is not None, "--udr": config.udr, "--nominal": config.nominal,
-    }  # fmt: skip
+        "--distribution": config.distribution is not None,
+        "--udr": config.udr,
+        "--nominal": config.nominal,
+    }
     given = [name for name, is_given in wanted.items() if is_given]
     if len(given) > 1:
         raise ConfigurationError(f"{' and '.join(given)} exclude each other: leave one of them")
@@ -291,10 +304,15 @@ def _stopped_by_signal() -> Iterator[list[int]]:
 
 def _progress_bar(quiet: bool) -> Progress:
     return Progress(
-        TextColumn("training"), BarColumn(), TextColumn("{task.completed}/{task.total} steps"),
-        TextColumn("return {task.fields[recent]:.1f} {task.fields[measures]}"), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(), disable=quiet,
-    )  # fmt: skip
+        TextColumn("training"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} steps"),
+        TextColumn("return {task.fields[recent]:.1f} {task.fields[measures]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        disable=quiet,
+    )
 
 
 def _follow(bar: Progress) -> TrainingProgress:
@@ -303,8 +321,11 @@ def _follow(bar: Progress) -> TrainingProgress:
     def follow(status: TrainingStatus) -> None:
         shown = [f"{name} {value:.2f}" for name, value in status.measures.items()][:SHOWN_MEASURES]
         bar.update(
-            row, completed=status.steps, total=status.total, recent=status.mean_return,
+            row,
+            completed=status.steps,
+            total=status.total,
+            recent=status.mean_return,
             measures=", ".join(shown),
-        )  # fmt: skip
+        )
 
     return follow

@@ -14,9 +14,9 @@ import numpy as np
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import Behaviour
+from deal_hw.control.excitation_level import ATTEMPTS, ExcitationLevelSearch, shortfalls
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome
 from deal_hw.control.safety import Safety
-from deal_hw.control.vigor import ATTEMPTS, VigorSearch, shortfalls
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord
@@ -108,22 +108,24 @@ class VirtualCartpole:
 
 def demonstrate(
     virtual: VirtualCartpole, plan: RunPlan, attempts: int = ATTEMPTS
-) -> tuple[VirtualEpisode, VigorSearch]:
-    """Record the profile `rich`, again and livelier or gentler until it is whole and moves.
+) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
+    """Record the profile `rich`, again and stronger or gentler until it is whole and moves.
 
     Args:
         virtual: The robot.
-        plan: The run; how lively it starts is its ``vigor``.
+        plan: The run; how strong it starts is its ``excitation_level``.
         attempts: Most recordings.
 
     Returns:
         The best recording, and how the search for it went.
     """
-    search = VigorSearch(plan.vigor, attempts)
+    search = ExcitationLevelSearch(plan.excitation_level, attempts)
     runs: list[VirtualEpisode] = []
     again = True
     while again:
-        behaviour = make_behaviour(dataclasses.replace(plan, vigor=search.vigor), virtual.description)
+        behaviour = make_behaviour(
+            dataclasses.replace(plan, excitation_level=search.level), virtual.description
+        )
         run = virtual.run(behaviour, plan.seconds)
         runs.append(run)
         tripped = "" if run.report.outcome is Outcome.FINISHED else run.report.reason

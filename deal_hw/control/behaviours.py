@@ -97,9 +97,14 @@ class PolicyBehaviour:
         self._default = np.array(spec.default_position)[list(description.actuated_index)]
         zeros = np.zeros(len(spec.actuated))
         self._template = JointCommand(
-            zeros, zeros, np.array(spec.stiffness), np.array(spec.damping), zeros,
-            np.array(spec.effort_limit), np.array(spec.speed_limit),
-        )  # fmt: skip
+            zeros,
+            zeros,
+            np.array(spec.stiffness),
+            np.array(spec.damping),
+            zeros,
+            np.array(spec.effort_limit),
+            np.array(spec.speed_limit),
+        )
         self.action: FloatArray | None = None
 
     def reset(self) -> None:
@@ -198,7 +203,7 @@ class ReplayBehaviour:
         t = self._trajectory
         zeros = np.zeros(len(t.actuated))
         return JointCommand(
-            t.asked_position[i],
+            t.requested_position[i],
             zeros,
             t.stiffness[i],
             t.damping[i],

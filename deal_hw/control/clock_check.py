@@ -36,13 +36,17 @@ def judge_clock(host_ns: IntArray, device_ns: IntArray) -> Finding:
     sure = abs(drift) - RESOLUTION_S / span_s
     if sure > FAIL_SHARE:
         return Finding(
-            "states", Level.FAIL, f"{text}; at most 1 % is usable",
+            "states",
+            Level.FAIL,
+            f"{text}; at most 1 % is usable",
             "is it a simulator that does not keep real time? Give it a faster computer or real-time "
             "priority; recordings made like this give wrong speeds and latencies",
-        )  # fmt: skip
+        )
     if sure > WARN_SHARE:
         return Finding(
-            "states", Level.WARN, f"{text}; a sound clock is right to 0.01 %",
+            "states",
+            Level.WARN,
+            f"{text}; a sound clock is right to 0.01 %",
             "listen longer (--seconds 30); if it stays, a calibrated latency will be wrong",
-        )  # fmt: skip
+        )
     return Finding("states", Level.OK, text)

@@ -53,9 +53,13 @@ def segment_command(
     for part in segments:
         if part.start <= fraction < part.stop:
             return position_command(
-                description, target, stiffness=part.stiffness, damping=part.damping,
-                effort_limit=part.effort_limit, speed_limit=part.speed_limit,
-            )  # fmt: skip
+                description,
+                target,
+                stiffness=part.stiffness,
+                damping=part.damping,
+                effort_limit=part.effort_limit,
+                speed_limit=part.speed_limit,
+            )
     return position_command(description, target)
 
 
@@ -83,9 +87,11 @@ class RichConfig:
     def __post_init__(self) -> None:
         low, high = self.hold_s
         if not (
-            0 < self.duration_s <= LONGEST_S and 0 <= self.balance_s <= LONGEST_S
-            and 1e-6 <= self.amplitude <= 1e3 and 1e-3 <= low <= high <= LONGEST_S
-        ):  # fmt: skip
+            0 < self.duration_s <= LONGEST_S
+            and 0 <= self.balance_s <= LONGEST_S
+            and 1e-6 <= self.amplitude <= 1e3
+            and 1e-3 <= low <= high <= LONGEST_S
+        ):
             raise ConfigurationError(
                 f"not a usable collection profile: duration {self.duration_s:g} s, balance "
                 f"{self.balance_s:g} s, amplitude {self.amplitude:g}, hold {low:g} to "

@@ -42,7 +42,7 @@ def room(description: RobotDescription) -> FloatArray:
 
 
 def predicted_effort(description: RobotDescription, offsets: FloatArray) -> FloatArray:
-    """Return the P-D effort of servos that follow a signal, before any limit, (T, A).
+    """Return the PD effort of servos that follow a signal, before any limit, (T, A).
 
     All that a description tells of a servo's motion is its gains: kd v = kp (target - x), a first-order lag
     with the corner kp / kd. It leaves inertia, friction and load out, so it is a lower estimate for heavy

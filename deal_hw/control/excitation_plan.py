@@ -144,7 +144,8 @@ class ExcitationPlan:
         if self.robot != description.name or self.digest != description.digest():
             raise ConfigurationError(
                 f"the excitation was made for robot {shown(self.robot)} (description {shown(self.digest)}), "
-                f"this is {description.name!r} ({description.digest()}); make another with `deal-hw excite`"
+                f"this is {description.name!r} ({description.digest()}); make another with "
+                "`deal-hw design-excitation`"
             )
         with np.errstate(all="ignore"):
             offsets = self.offsets(np.linspace(0.0, self.seconds, _CHECKED))
@@ -191,7 +192,7 @@ def read_plan(path: Path) -> ExcitationPlan:
     Raises:
         ConfigurationError: It cannot be read, or holds no plan.
     """
-    advice = f"--excite takes {', '.join(FAMILIES[:2])}, or a file that `deal-hw excite` wrote"
+    advice = f"--excite takes {', '.join(FAMILIES[:2])}, or a file that `deal-hw design-excitation` wrote"
     values = read_json(path, dict[str, Any], "an excitation", advice, error=ConfigurationError)
     with reading(path, "an excitation"):
         return ExcitationPlan.from_json(values)
@@ -213,15 +214,25 @@ def make_plan(description: RobotDescription, design: ExcitationDesign) -> Excita
         wave, ease_s = random_steps(most, length, design.hold_s, rng), 0.0
     elif design.family == "chirp":
         wave = Sweep(
-            amplitude=tuple(map(float, most)), duration_s=length, low_hz=design.low_hz,
-            high_hz=design.high_hz, law=design.law, arrangement=design.arrangement,
-        )  # fmt: skip
+            amplitude=tuple(map(float, most)),
+            duration_s=length,
+            low_hz=design.low_hz,
+            high_hz=design.high_hz,
+            law=design.law,
+            arrangement=design.arrangement,
+        )
     else:
         wave = multisine(most, design.low_hz, design.high_hz, 1.0 / length, tilt=design.tilt, rng=rng)
     plan = ExcitationPlan(
-        robot=description.name, digest=description.digest(), seconds=design.seconds,
-        balance_s=design.balance_s, ease_s=ease_s, wave=wave, segments=design.segments(), words=words(design),
-    )  # fmt: skip
+        robot=description.name,
+        digest=description.digest(),
+        seconds=design.seconds,
+        balance_s=design.balance_s,
+        ease_s=ease_s,
+        wave=wave,
+        segments=design.segments(),
+        words=words(design),
+    )
     times = design.balance_s + np.arange(0.0, length, 1.0 / description.control_rate_hz)
     scale = fit_to_limits(description, plan.offsets(times), smooth=design.family != "steps")
     return dataclasses.replace(plan, wave=wave.scaled(scale * design.amplitude))

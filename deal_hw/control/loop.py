@@ -10,10 +10,10 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.cadence import Cadence, CadenceReport
-from deal_hw.control.handover import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
 from deal_hw.control.loop_report import LoopConfig, LoopReport, Outcome
+from deal_hw.control.loop_timing import LoopTiming, LoopTimingReport
 from deal_hw.control.passive import make_passive
+from deal_hw.control.process_channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
 from deal_hw.control.repeater import Repeater
 from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
@@ -36,7 +36,7 @@ _MOST_STATE_BYTES = 72_000
 
 
 class OperatorStop(BaseException):
-    """The operator asked to stop while the loop waited for the robot; no error, so not an Exception."""
+    """The operator requested to stop while the loop waited for the robot; no error, so not an Exception."""
 
 
 class ControlLoop:
@@ -68,7 +68,7 @@ class ControlLoop:
         self._robot, self._behaviour, self._safety = robot, behaviour, safety
         self._clock, self._sink, self._config, self._progress = clock, sink, config, progress
         self._scheduling = scheduling
-        self._cadence = Cadence(clock, robot.description.control_rate_hz)
+        self._loop_timing = LoopTiming(clock, robot.description.control_rate_hz)
         self._repeater = Repeater(robot, clock)
         self._stop_reason = ""
         self._raise_on_stop = self._connected = self._commanding = False
@@ -119,9 +119,14 @@ class ControlLoop:
                 self._hand_back()
             self._close(reason)
         return LoopReport(
-            outcome=outcome, reason=reason, passive_confirmed=confirmed, cadence=self._report(),
-            clipped=self._clipped, cycles_sent=self._sent, error=error,
-        )  # fmt: skip
+            outcome=outcome,
+            reason=reason,
+            passive_confirmed=confirmed,
+            loop_timing=self._report(),
+            clipped=self._clipped,
+            cycles_sent=self._sent,
+            error=error,
+        )
 
     def _prepare(self) -> None:
         c = self._config
@@ -158,10 +163,10 @@ class ControlLoop:
     def _cycles(self) -> tuple[Outcome, str]:
         count = round(self._config.duration_s * self._robot.description.control_rate_hz)
         while True:
-            self._collect_until(self._cadence.deadline_ns)
-            if self._cadence.next_index >= count:
+            self._collect_until(self._loop_timing.deadline_ns)
+            if self._loop_timing.next_index >= count:
                 break
-            index, deadline_ns = self._cadence.begin()
+            index, deadline_ns = self._loop_timing.begin()
             self._phase(RUNNING, self._robot.description.limits.silence_s)
             verdict = self._cycle(index, deadline_ns)
             if verdict.state is SafetyState.PASSIVE:
@@ -176,26 +181,26 @@ class ControlLoop:
         start_ns = self._clock.now_ns()
         state, flags = self._state, CycleFlag.NONE
         wanted: JointCommand | None = None
-        if self._cadence.late_ns >= self._cadence.period_ns:
+        if self._loop_timing.late_ns >= self._loop_timing.period_ns:
             flags |= CycleFlag.OVERRUN
         if not self._pending:
             self._blind += 1
             flags |= CycleFlag.NO_STATE
         # A policy must not see numbers that are not: its memory would carry them on.
         if state is not None and _is_finite(state):
-            with self._cadence.section("behaviour"):
-                wanted = self._behaviour.command(state, index * self._cadence.period_ns * 1e-9)
+            with self._loop_timing.section("behaviour"):
+                wanted = self._behaviour.command(state, index * self._loop_timing.period_ns * 1e-9)
         computed_ns = self._clock.now_ns()
         age_ns = computed_ns - state.receive_ns if state is not None else -1
         if age_ns >= 0:
-            self._cadence.note_state_age(age_ns)
-        with self._cadence.section("safety"):
+            self._loop_timing.note_state_age(age_ns)
+        with self._loop_timing.section("safety"):
             cycle = self._input(computed_ns - start_ns)
             verdict = self._safety.step(cycle, wanted)
         flags |= self._note_verdict(verdict)
         sent, sent_ns = None, -1
         if verdict.send and verdict.command is not None:
-            with self._cadence.section("send"):
+            with self._loop_timing.section("send"):
                 sent_ns = self._clock.now_ns()
                 sent = self._robot.send_command(verdict.command)
                 self._repeater.note_sent(sent_ns)
@@ -204,12 +209,12 @@ class ControlLoop:
             self._repeater.stop()
             if verdict.state is SafetyState.PASSIVE and self._commanding:
                 self._robot.passive()
-        with self._cadence.section("record"):
+        with self._loop_timing.section("record"):
             self._hand_over(
                 index,
                 deadline_ns,
                 start_ns,
-                asked=wanted,
+                requested=wanted,
                 sent=sent,
                 sent_ns=sent_ns,
                 state_age_ns=age_ns,
@@ -227,8 +232,8 @@ class ControlLoop:
             flags |= CycleFlag.CLIPPED
         if "action_late" in verdict.flags:
             flags |= CycleFlag.POLICY_LATE
-        if self._robot.link_errors > self._errors_seen:
-            self._errors_seen = self._robot.link_errors
+        if self._robot.transport_errors > self._errors_seen:
+            self._errors_seen = self._robot.transport_errors
             flags |= CycleFlag.LINK_ERROR
         if verdict.state is SafetyState.PASSIVE:
             self.note("passive", verdict.reason, flags=list(verdict.flags))
@@ -243,7 +248,7 @@ class ControlLoop:
         deadline_ns: int,
         start_ns: int,
         *,
-        asked: JointCommand | None = None,
+        requested: JointCommand | None = None,
         sent: JointCommand | None = None,
         sent_ns: int = -1,
         state_age_ns: int = -1,
@@ -256,7 +261,7 @@ class ControlLoop:
             start_ns=start_ns,
             states=_newest_states(self._pending),
             action=self._behaviour.action,
-            asked=asked,
+            requested=requested,
             sent=sent,
             sent_sequence=self._robot.last_sequence if sent is not None else -1,
             sent_ns=sent_ns,
@@ -295,10 +300,14 @@ class ControlLoop:
     def _input(self, action_age_ns: int = 0) -> CycleInput:
         now_ns, sent_ns = self._clock.now_ns(), self._repeater.sent_ns
         return CycleInput(
-            now_ns=now_ns, state=self._state, action_age_ns=action_age_ns,
-            link_errors=self._robot.link_errors, stop_reason=self._stop_reason or self._robot.operator_stop,
-            command_age_ns=now_ns - sent_ns if sent_ns >= 0 else -1, fault=self._robot.fault,
-        )  # fmt: skip
+            now_ns=now_ns,
+            state=self._state,
+            action_age_ns=action_age_ns,
+            transport_errors=self._robot.transport_errors,
+            stop_reason=self._stop_reason or self._robot.operator_stop,
+            command_age_ns=now_ns - sent_ns if sent_ns >= 0 else -1,
+            fault=self._robot.fault,
+        )
 
     def _make_passive(self) -> bool:
         """Send the passive command until the robot confirms it; return whether it did.
@@ -334,7 +343,7 @@ class ControlLoop:
         try:
             now = self._clock.now_ns()
             self.note("ended", reason or "the run ended")
-            self._hand_over(self._cadence.next_index, now, now)
+            self._hand_over(self._loop_timing.next_index, now, now)
         except (DealHwError, OSError):
             self._losses += 1
         finally:
@@ -343,11 +352,14 @@ class ControlLoop:
             except (TransportError, OSError):
                 pass
 
-    def _report(self) -> CadenceReport:
-        return self._cadence.report(
-            states=self._states, cycles_without_state=self._blind, losses=self._losses,
-            link_errors=self._robot.link_errors, scheduling=self._scheduling,
-        )  # fmt: skip
+    def _report(self) -> LoopTimingReport:
+        return self._loop_timing.report(
+            states=self._states,
+            cycles_without_state=self._blind,
+            losses=self._losses,
+            transport_errors=self._robot.transport_errors,
+            scheduling=self._scheduling,
+        )
 
 
 def _newest(wire: Sequence[Message]) -> tuple[Message, ...]:

@@ -6,7 +6,7 @@ import enum
 from dataclasses import dataclass, field
 from typing import Any
 
-from deal_hw.control.cadence import CadenceReport
+from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.passive import PassiveConfig
 from deal_hw.errors import ConfigurationError
 
@@ -59,7 +59,7 @@ class LoopReport:
         reason: In words, for the operator.
         passive_confirmed: Whether the robot itself said that its motors no longer follow commands; also True
             where it was never commanded.
-        cadence: How regular it was.
+        loop_timing: How regular it was.
         clipped: Cycles in which each limit changed the command, by limit.
         cycles_sent: Commands sent.
         error: Name of the error's class where it failed.
@@ -68,7 +68,7 @@ class LoopReport:
     outcome: Outcome
     reason: str
     passive_confirmed: bool
-    cadence: CadenceReport
+    loop_timing: LoopTimingReport
     clipped: dict[str, int]
     cycles_sent: int
     error: str = ""
@@ -76,7 +76,11 @@ class LoopReport:
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         return {
-            "outcome": self.outcome.value, "reason": self.reason, "passive_confirmed": self.passive_confirmed,
-            "cadence": self.cadence.to_json(), "clipped": self.clipped, "cycles_sent": self.cycles_sent,
+            "outcome": self.outcome.value,
+            "reason": self.reason,
+            "passive_confirmed": self.passive_confirmed,
+            "loop_timing": self.loop_timing.to_json(),
+            "clipped": self.clipped,
+            "cycles_sent": self.cycles_sent,
             "error": self.error,
-        }  # fmt: skip
+        }

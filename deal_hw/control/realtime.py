@@ -28,7 +28,7 @@ class Granted:
     """What the operating system granted.
 
     Attributes:
-        scheduling: Scheduling and memory, in words for the cadence report.
+        scheduling: Scheduling and memory, in words for the report on loop timing.
         warnings: What it refused, with the remedy; empty where all was granted.
     """
 

@@ -31,8 +31,8 @@ class SafetyConfig:
 
     clock_jump_s: float = 0.1
     """A device clock that runs ahead of the host's by this much has jumped [s]."""
-    link_window_s: float = 1.0
-    """Time over which link errors are counted [s]."""
+    transport_error_window_s: float = 1.0
+    """Time over which transport errors are counted [s]."""
     link_error_share: float = 0.3
     """Errors in the window over state frames due in it that trip; a corrupt frame counts twice (itself, its
     gap)."""
@@ -40,7 +40,7 @@ class SafetyConfig:
     """The device must report itself armed within this time after arming [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("clock_jump_s", "link_window_s", "link_error_share", "confirm_s"):
+        for name in ("clock_jump_s", "transport_error_window_s", "link_error_share", "confirm_s"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)!r}; it must be above 0")
 
@@ -53,7 +53,7 @@ class CycleInput:
         now_ns: Host clock [ns].
         state: The newest state; None before the first.
         action_age_ns: How long the policy took [ns].
-        link_errors: Link errors since the connection, as the robot counts them.
+        transport_errors: Link errors since the connection, as the robot counts them.
         stop_reason: Why the operator, or somebody for them, asked to stop; "" where nobody did.
         fault: What the driver saw that forbids going on; "" for nothing.
         command_age_ns: Time since a command was last sent, a repeated one included [ns]; -1: none yet. It
@@ -63,7 +63,7 @@ class CycleInput:
     now_ns: int
     state: RobotState | None
     action_age_ns: int = 0
-    link_errors: int = 0
+    transport_errors: int = 0
     stop_reason: str = ""
     fault: str = ""
     command_age_ns: int = -1
@@ -109,7 +109,7 @@ class Safety:
         self._command_age_ns = 0 if legs is None else round(legs.command_age_s * 1e9)
         self._index = list(description.actuated_index)
         self._errors_due = (
-            self._config.link_error_share * self._config.link_window_s * description.state_rate_hz
+            self._config.link_error_share * self._config.transport_error_window_s * description.state_rate_hz
         )
         self.reason = ""
         """Why it is passive, in words."""
@@ -225,7 +225,7 @@ class Safety:
         if cycle.action_age_ns > round(limits.action_age_s * 1e9):
             took_ms, limit_ms = cycle.action_age_ns * 1e-6, limits.action_age_s * 1e3
             found["action_late"] = f"the policy took {took_ms:.1f} ms, at most {limit_ms:g} ms are allowed"
-        self._check_link(cycle.now_ns, cycle.link_errors, found)
+        self._check_link(cycle.now_ns, cycle.transport_errors, found)
         self._check_command_age(cycle, found)
         return found
 
@@ -282,12 +282,13 @@ class Safety:
     def _check_link(self, now_ns: int, errors: int, found: dict[str, str]) -> None:
         window = self._errors
         window.append((now_ns, errors))
-        while now_ns - window[0][0] > self._config.link_window_s * 1e9:
+        while now_ns - window[0][0] > self._config.transport_error_window_s * 1e9:
             window.popleft()
         count = errors - window[0][1]
         if count > self._errors_due:
-            found["link_errors"] = (
-                f"{count} link errors in {self._config.link_window_s:g} s: check cable and connectors"
+            found["transport_errors"] = (
+                f"{count} transport errors in {self._config.transport_error_window_s:g} s: "
+                "check cable and connectors"
             )
 
     def _check_command_age(self, cycle: CycleInput, found: dict[str, str]) -> None:

@@ -15,10 +15,15 @@ def is_finite(command: JointCommand) -> bool:
     return all(
         bool(np.isfinite(part).all())
         for part in (
-            command.position_target, command.velocity_target, command.stiffness, command.damping,
-            command.effort, command.effort_limit, command.speed_limit,
+            command.position_target,
+            command.velocity_target,
+            command.stiffness,
+            command.damping,
+            command.effort,
+            command.effort_limit,
+            command.speed_limit,
         )
-    )  # fmt: skip
+    )
 
 
 def keep_effort(

@@ -62,7 +62,7 @@ class SafetyFlags:
         voltage_low: The supply voltage is too low; arming asks for more.
         action_not_finite: The command asked for holds NaN or infinity.
         action_late: The policy took too long.
-        link_errors: Too large a share of the state frames is corrupt or lost.
+        transport_errors: Too large a share of the state frames is corrupt or lost.
         command_stale: A robot with legs has not been sent a command for too long.
     """
 
@@ -89,7 +89,7 @@ class SafetyFlags:
     voltage_low: bool = False
     action_not_finite: bool = False
     action_late: bool = False
-    link_errors: bool = False
+    transport_errors: bool = False
     command_stale: bool = False
 
     @property

@@ -24,7 +24,14 @@ from typing import Any
 
 from deal_hw.child_process import own_process_group
 from deal_hw.clock import Clock, MonotonicClock
-from deal_hw.control.handover import BUFFER_BYTES, HEARTBEAT, STARTING, Beat, StatusReceiver, socket_pair
+from deal_hw.control.process_channel import (
+    BUFFER_BYTES,
+    HEARTBEAT,
+    STARTING,
+    Beat,
+    StatusReceiver,
+    socket_pair,
+)
 from deal_hw.control.realtime import SUPERVISOR_PRIORITY, hurry, priority
 from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
 

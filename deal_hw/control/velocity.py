@@ -21,9 +21,14 @@ LARGEST = (1.0, 0.5, 1.0)
 KEY_LIFE_S = 0.6
 """A key that is not pressed again counts for this long [s]: longer than the first pause of a key repeat."""
 KEYS = {
-    "w": (0.5, 0.0, 0.0), "s": (-0.5, 0.0, 0.0), "a": (0.0, 0.3, 0.0), "d": (0.0, -0.3, 0.0),
-    "q": (0.0, 0.0, 0.6), "e": (0.0, 0.0, -0.6), " ": (0.0, 0.0, 0.0),
-}  # fmt: skip
+    "w": (0.5, 0.0, 0.0),
+    "s": (-0.5, 0.0, 0.0),
+    "a": (0.0, 0.3, 0.0),
+    "d": (0.0, -0.3, 0.0),
+    "q": (0.0, 0.0, 0.6),
+    "e": (0.0, 0.0, -0.6),
+    " ": (0.0, 0.0, 0.0),
+}
 """Keys and the velocities that they ask for while they are held."""
 _DEAD_ZONE = 0.05
 

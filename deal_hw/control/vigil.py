@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 
 from deal_hw.clock import Clock
-from deal_hw.control.handover import HEARTBEAT, StatusSender
+from deal_hw.control.process_channel import HEARTBEAT, StatusSender
 
 SUPERVISOR_SILENCE_S = 1.0
 """A supervisor that has said nothing for this long is taken for stopped [s]. It beats every 50 ms; without a

@@ -72,19 +72,37 @@ def faulty_policy(
         [helper.make_tensor_value_info("observation", onnx.TensorProto.FLOAT, [1, 3])],
         [helper.make_tensor_value_info("action", onnx.TensorProto.FLOAT, [1, actuated])],
         [
-            *(helper.make_tensor(name, onnx.TensorProto.INT64, [1], [value])
-              for name, value in (("zero", 0), ("one", 1), ("axis", 1), ("flat", -1), ("endless", 2**62),
-                                  ("huge", 2**30))),
-            *(helper.make_tensor(name, onnx.TensorProto.FLOAT, [1], [value])
-              for name, value in (("rare", RARE_M_S), ("width", _RARE_WIDTH_M_S), ("unit", 1.0),
-                                  ("rounds", float(rounds)))),
+            *(
+                helper.make_tensor(name, onnx.TensorProto.INT64, [1], [value])
+                for name, value in (
+                    ("zero", 0),
+                    ("one", 1),
+                    ("axis", 1),
+                    ("flat", -1),
+                    ("endless", 2**62),
+                    ("huge", 2**30),
+                )
+            ),
+            *(
+                helper.make_tensor(name, onnx.TensorProto.FLOAT, [1], [value])
+                for name, value in (
+                    ("rare", RARE_M_S),
+                    ("width", _RARE_WIDTH_M_S),
+                    ("unit", 1.0),
+                    ("rounds", float(rounds)),
+                )
+            ),
             helper.make_tensor("zeros", onnx.TensorProto.FLOAT, [1, actuated], [0.0] * actuated),
             helper.make_tensor("scalar", onnx.TensorProto.INT64, [0], []),
             helper.make_tensor("yes", onnx.TensorProto.BOOL, [], [True]),
-            helper.make_tensor("eye", onnx.TensorProto.FLOAT, [_SIDE, _SIDE],
-                               np.eye(_SIDE, dtype=np.float32).ravel().tolist()),
+            helper.make_tensor(
+                "eye",
+                onnx.TensorProto.FLOAT,
+                [_SIDE, _SIDE],
+                np.eye(_SIDE, dtype=np.float32).ravel().tolist(),
+            ),
         ],
-    )  # fmt: skip
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
     return model, _spec(description)
 

@@ -173,14 +173,14 @@ class RobotSuite:
             armed.passive()
 
     def test_a_corrupt_frame_is_counted_and_survived(self, bench: RobotBench) -> None:
-        """One corrupt frame raises nothing, makes link_errors grow, and the stream goes on."""
+        """One corrupt frame raises nothing, makes transport_errors grow, and the stream goes on."""
         with bench.robot as robot:
             robot.read_state(_PATIENCE_S)
-            assert robot.link_errors == 0
+            assert robot.transport_errors == 0
             bench.corrupt()
             for _ in range(5):
                 robot.read_state(_PATIENCE_S)
-            assert robot.link_errors >= 1
+            assert robot.transport_errors >= 1
 
     def test_the_wire_can_be_taken_once(self, bench: RobotBench) -> None:
         """Raw messages of both directions are kept until taken."""

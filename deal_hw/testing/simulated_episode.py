@@ -122,7 +122,7 @@ def _report(
         command_age_s=age,
         sent_s=sent_s,
         sent_sequence=np.arange(cycles),
-        asked_position=targets[:, None].copy(),
+        requested_position=targets[:, None].copy(),
         position_target=targets[:, None],
         stiffness=as_column * description.stiffness,
         damping=as_column * description.damping,

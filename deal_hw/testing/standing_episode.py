@@ -31,7 +31,7 @@ def standing_episode(
     """Return an exact recording of a robot that first stands still and then follows targets.
 
     Args:
-        description: The robot; a free base, P-D drives without limits of speed.
+        description: The robot; a free base, PD drives without limits of speed.
         space: The parameters.
         theta: The robot's true parameters, (K,).
         targets: One for each control period, (C, A) [rad].
@@ -94,7 +94,7 @@ def _report(description: RobotDescription, x: FloatArray, v: FloatArray, targets
         command_age_s=age_s,
         sent_s=sent_s,
         sent_sequence=np.arange(len(targets)),
-        asked_position=targets.copy(),
+        requested_position=targets.copy(),
         position_target=targets,
         stiffness=rows * description.stiffness,
         damping=rows * description.damping,

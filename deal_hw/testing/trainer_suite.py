@@ -137,9 +137,10 @@ class TrainerSuite:
         config = dataclasses.replace(case.config, steps=stopped + case.short_config.steps)
         first: list[int] = []
         case.train(
-            config, progress=lambda status: first.append(status.steps),
+            config,
+            progress=lambda status: first.append(status.steps),
             files=TrainingFiles(checkpoint=file, resume=True),
-        )  # fmt: skip
+        )
         assert stopped < first[0] and first[-1] == config.steps
 
     def test_a_fine_tune_starts_from_the_networks_of_a_checkpoint(

@@ -155,8 +155,8 @@ class TopicPair:
 class TopicTransportSuite:
     """Contract of a transport of topics; inherit it and override ``pair``.
 
-    Number 0 is the greeting that :func:`meet` sends until the ends have found each other. A greeting may
-    still be on its way when ``meet`` returns, so the tests skip greetings: see :func:`next_message`.
+    Number 0 is the hello that :func:`meet` sends until the ends have found each other. A hello may
+    still be on its way when ``meet`` returns, so the tests skip hellos: see :func:`next_message`.
     """
 
     @pytest.fixture
@@ -302,7 +302,7 @@ def _greet(pair: TopicPair, sender: TopicTransport, topic: str, receiver: TopicT
 
 
 def next_message(pair: TopicPair, receiver: TopicTransport) -> Message:
-    """Receive a message that is not a greeting."""
+    """Receive a message that is not a hello."""
     while True:
         message = receiver.receive(_PATIENCE_S)
         if message.payload != pair.payload(message.channel, 0):

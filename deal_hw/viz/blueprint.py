@@ -33,7 +33,7 @@ def inspect_blueprint(
         _motion(trajectory, description, sets),
         _velocities(trajectory, description, sets),
         _commands(trajectory, description),
-        _plot("/cadence", "Cadence [ms]"),
+        _plot("/loop_timing", "loop timing [ms]"),
     ]
     if trajectory.body is not None:
         tabs.insert(0, _body(trajectory))
@@ -97,7 +97,7 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
     for joint in trajectory.actuated:
         unit = description.position_units[description.joint_names.index(joint)]
         shown = [f"/commands/{joint}/**", f"/joints/{joint}/position/measured"]
-        plots.append(_plot("/", f"{joint}: target asked, target sent, position [{unit}]", shown))
+        plots.append(_plot("/", f"{joint}: target requested, target sent, position [{unit}]", shown))
         plots.append(_plot(f"/joints/{joint}/effort", f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]"))
     return _stack("Commands", plots, len(trajectory.actuated))
 

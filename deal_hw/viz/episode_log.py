@@ -6,10 +6,10 @@ Entities, J joints and any number of parameter sets (``nominal``, ``calibrated``
     /joints/<joint>/position/predicted/<set>   also /velocity
     /joints/<joint>/error/<set>                predicted minus measured position; also /velocity_error
     /joints/<joint>/effort                     N or N·m, the device's own estimate
-    /commands/<joint>/{asked,sent}             position targets, when the device received them
+    /commands/<joint>/{requested,sent}             position targets, when the device received them
     /status/<bit>                              what the robot says of itself
     /status/safety                             state of the safety filter
-    /cadence/{command_period,state_period,state_age,lateness}    ms
+    /loop_timing/{command_period,state_period,state_age,lateness}    ms
     /events                                    text log
     /body/{tilt,gyro,acceleration}/...         IMU, for robots with legs; also
     /body/{feet,temperature,battery}/...
@@ -64,7 +64,7 @@ def write_episode(
         path: File to write.
         trajectory: The recording.
         description: The robot.
-        cycles: The control cycles, for cadence and safety states.
+        cycles: The control cycles, for loop timing and safety states.
         overlay: Predictions to show beside it.
         result: The calibration whose parameters are listed.
         name: Name of the recording in the viewer.
@@ -107,8 +107,10 @@ def log_samples(log: Log, trajectory: Trajectory, description: RobotDescription)
         if joint in trajectory.actuated:
             log.line(f"/joints/{joint}/effort", f"{joint} effort", palette.REAL)
             log.scalars(f"/joints/{joint}/effort", *clocks, trajectory.effort[:, j])
-    log.line("/cadence/state_period", "between samples [ms]", palette.REAL, step=True)
-    log.scalars("/cadence/state_period", clocks[0][1:], clocks[1][1:], 1e3 * np.diff(trajectory.receive_s))
+    log.line("/loop_timing/state_period", "between samples [ms]", palette.REAL, step=True)
+    log.scalars(
+        "/loop_timing/state_period", clocks[0][1:], clocks[1][1:], 1e3 * np.diff(trajectory.receive_s)
+    )
 
 
 def log_commands(log: Log, trajectory: Trajectory) -> None:
@@ -116,13 +118,13 @@ def log_commands(log: Log, trajectory: Trajectory) -> None:
     device_s, sent_s = command_device_times(trajectory), trajectory.sent_s
     for a, joint in enumerate(trajectory.actuated):
         for what, values, color, width in (
-            ("asked", trajectory.asked_position, palette.ASKED, 3.0),
+            ("requested", trajectory.requested_position, palette.REQUESTED, 3.0),
             ("sent", trajectory.position_target, palette.SENT, 1.5),
         ):
             log.line(f"/commands/{joint}/{what}", what, color, width=width, step=True)
             log.scalars(f"/commands/{joint}/{what}", device_s, sent_s, values[:, a])
-    log.line("/cadence/command_period", "between commands [ms]", palette.NOMINAL, step=True)
-    log.scalars("/cadence/command_period", device_s[1:], sent_s[1:], 1e3 * np.diff(sent_s))
+    log.line("/loop_timing/command_period", "between commands [ms]", palette.NOMINAL, step=True)
+    log.scalars("/loop_timing/command_period", device_s[1:], sent_s[1:], 1e3 * np.diff(sent_s))
 
 
 def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
@@ -138,8 +140,8 @@ def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
             palette.CALIBRATED,
         ),
     ):
-        log.line(f"/cadence/{name}", label, color, step=True)
-        log.scalars(f"/cadence/{name}", device_s, host_s, 1e3 * values)
+        log.line(f"/loop_timing/{name}", label, color, step=True)
+        log.scalars(f"/loop_timing/{name}", device_s, host_s, 1e3 * values)
     change = [
         i for i, state in enumerate(cycles.safety_state) if i == 0 or state != cycles.safety_state[i - 1]
     ]
@@ -167,7 +169,7 @@ def log_status(log: Log, trajectory: Trajectory) -> None:
         style = rr.StateConfiguration(
             values=["on", "off"],
             labels=[label, "off"],
-            colors=[palette.REAL if usual else palette.ALARM, palette.ASKED],
+            colors=[palette.REAL if usual else palette.ALARM, palette.REQUESTED],
             visible=[True, False],
         )
         log.stream.log(path, style, static=True)

@@ -12,7 +12,7 @@ NOMINAL: Color = (230, 159, 0)
 """Orange: what the user's model predicts."""
 CALIBRATED: Color = (0, 178, 130)
 """Green: what the calibrated model predicts; a little lighter than the original for thin lines on black."""
-ASKED: Color = (150, 150, 150)
+REQUESTED: Color = (150, 150, 150)
 SENT: Color = (240, 228, 66)
 ALARM: Color = (213, 94, 0)
 OTHERS: tuple[Color, ...] = ((204, 121, 167), (148, 103, 189), (230, 230, 230))

@@ -98,9 +98,9 @@ class PopulationView:
         self._stream.send_blueprint(_blueprint(self._space, self._predict is not None))
         for p in self._space:
             for name, color in (
-                ("p95", palette.ASKED),
+                ("p95", palette.REQUESTED),
                 ("median", palette.CALIBRATED),
-                ("p05", palette.ASKED),
+                ("p05", palette.REQUESTED),
             ):
                 style = rr.SeriesLines(colors=[color], names=[name])
                 self._stream.log(f"/parameters/{p.name}/{name}", style, static=True)

@@ -66,13 +66,18 @@ class Calibration:
         verdicts = result.verdicts or ("",) * len(result.space)
         rows: list[dict[str, Any]] = [
             {
-                "parameter": p.name, "unit": p.unit, "nominal": p.nominal, "estimate": float(estimate),
-                "low": float(low), "high": float(high), "verdict": verdict,
+                "parameter": p.name,
+                "unit": p.unit,
+                "nominal": p.nominal,
+                "estimate": float(estimate),
+                "low": float(low),
+                "high": float(high),
+                "verdict": verdict,
             }
             for p, estimate, (low, high), verdict in zip(
                 result.space, result.estimate, result.interval, verdicts, strict=True
             )
-        ]  # fmt: skip
+        ]
         low, high = result.latency_interval_s
         latency = {"parameter": "latency", "unit": "s", "nominal": 0.0, "estimate": result.latency_s}
         return [*rows, {**latency, "low": low, "high": high, "verdict": ""}]
@@ -246,7 +251,7 @@ def calibrate(
         free=tuple(free),
         known=dict(known or {}),
         ranges=[(name, low, high) for name, (low, high) in (ranges or {}).items()],
-        xi=range_ratio,
+        range_ratio=range_ratio,
     )
     judges = _listed(holdout)
     with contextlib.ExitStack() as kept:
@@ -264,9 +269,14 @@ def calibrate(
                 fit_seconds=fit_seconds,
             )
             inputs = prepare_model(
-                recordings, judges, overrides, std=lambda robot: residual_std_of(residual_std, robot),
-                data=_listed(data), threads=threads, say=say,
-            )  # fmt: skip
+                recordings,
+                judges,
+                overrides,
+                std=lambda robot: residual_std_of(residual_std, robot),
+                data=_listed(data),
+                threads=threads,
+                say=say,
+            )
         else:
             source = DatasetRecordings(
                 folder=Path(dataset),

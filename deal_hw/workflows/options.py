@@ -61,7 +61,7 @@ Threads = Annotated[int | None, Range(1, 1024)]
 RunSeconds = Annotated[float, Range(0.02, 3600, "s")]
 Share = Annotated[float, Range(0, 1)]
 Ratio = Range(1.001, 1000)
-"""Of a search range: from nominal / xi to nominal * xi."""
+"""Of a search range: from nominal / range_ratio to nominal * range_ratio."""
 
 
 class Checked:

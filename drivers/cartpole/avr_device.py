@@ -45,10 +45,14 @@ class Rig:
 
 class _Outputs(ctypes.Structure):
     _fields_ = [
-        ("pwm", ctypes.c_double), ("armed", ctypes.c_int32), ("set_pole", ctypes.c_int32),
-        ("longest_step", ctypes.c_uint32), ("asleep", ctypes.c_uint32), ("complaints", ctypes.c_uint32),
+        ("pwm", ctypes.c_double),
+        ("armed", ctypes.c_int32),
+        ("set_pole", ctypes.c_int32),
+        ("longest_step", ctypes.c_uint32),
+        ("asleep", ctypes.c_uint32),
+        ("complaints", ctypes.c_uint32),
         ("crashed", ctypes.c_int32),
-    ]  # fmt: skip
+    ]
 
 
 @functools.cache
@@ -70,18 +74,31 @@ def library() -> ctypes.CDLL:
     board.board_close.argtypes = [ctypes.c_void_p]
     board.board_tick.restype = number
     board.board_tick.argtypes = [
-        ctypes.c_void_p, integer, integer, ctypes.c_int, ctypes.c_int, ctypes.c_char_p, number,
-        ctypes.c_char_p, ctypes.POINTER(_Outputs),
-    ]  # fmt: skip
+        ctypes.c_void_p,
+        integer,
+        integer,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_char_p,
+        number,
+        ctypes.c_char_p,
+        ctypes.POINTER(_Outputs),
+    ]
     return board
 
 
 def eeprom(settings: Settings, full_force_n: float) -> bytes:
     """Return what the chip's EEPROM holds: the settings with their CRC, little-endian."""
     data = struct.pack(
-        "<5I2H", settings.stiffness_trim, settings.damping_trim, settings.effort_trim, settings.speed_trim,
-        settings.unique_id, settings.delay_ticks, round(full_force_n * 1000),
-    )  # fmt: skip
+        "<5I2H",
+        settings.stiffness_trim,
+        settings.damping_trim,
+        settings.effort_trim,
+        settings.speed_trim,
+        settings.unique_id,
+        settings.delay_ticks,
+        round(full_force_n * 1000),
+    )
     return data + struct.pack("<H", crc16.ibm_3740(data))
 
 
@@ -112,9 +129,12 @@ class Chip:
         self._inbox = b""
 
     def tick(
-        self, cart_counts: int = 0, pole_counts: int = 0, switches: tuple[bool, bool] = (False, False),
+        self,
+        cart_counts: int = 0,
+        pole_counts: int = 0,
+        switches: tuple[bool, bool] = (False, False),
         data: bytes = b"",
-    ) -> bytes:  # fmt: skip
+    ) -> bytes:
         """Run a millisecond; return the bytes sent in it.
 
         Args:
@@ -163,9 +183,7 @@ class AvrDevice(EmulatedDevice):
         ConfigurationError: avr-gcc, a C compiler or simavr is missing, or the image cannot be read.
     """
 
-    def __init__(
-        self, truth: Truth, *, start_angle_rad: float | None = None, build: Rig = Rig()
-    ) -> None:  # fmt: skip
+    def __init__(self, truth: Truth, *, start_angle_rad: float | None = None, build: Rig = Rig()) -> None:
         super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad))
         self._build = build
         profile = find_profile(truth.profile)

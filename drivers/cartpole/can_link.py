@@ -53,10 +53,16 @@ _NUMBER_BITS: Final = 5
 _DEVICE_TIME: Final = 2**48 - 1
 _DBC_NODE: Final = 1
 _GROUPS: Final[dict[str, type[CanMessage]]] = {
-    "Stop": protocol.Stop, "Target": protocol.Target, "Arm": protocol.Arm, "Home": protocol.Home,
-    "Hello": protocol.Hello, "State": protocol.State, "Ack": protocol.Ack, "Info": protocol.Info,
+    "Stop": protocol.Stop,
+    "Target": protocol.Target,
+    "Arm": protocol.Arm,
+    "Home": protocol.Home,
+    "Hello": protocol.Hello,
+    "State": protocol.State,
+    "Ack": protocol.Ack,
+    "Info": protocol.Info,
     "Angle": Angle,
-}  # fmt: skip
+}
 _LENGTHS: Final = {"Target": 3, "State": 5, "Info": 5, "Angle": 2}
 
 
@@ -246,25 +252,38 @@ def _to_values(message: CanMessage, version: int) -> dict[str, int]:
     match message:
         case protocol.State():
             return {
-                "Sequence": message.sequence, "CommandSequence": message.command_sequence,
-                "DeviceTime": message.device_us & _DEVICE_TIME, "Status": message.status,
-                "SequenceLow": message.sequence & 0xFF, "CartPosition": message.cart_um,
-                "CartVelocity": message.cart_um_s, "PolePosition": message.pole_urad,
-                "PoleVelocity": message.pole_urad_s, "Effort": message.effort_mn,
-                "CommandAge": message.command_age_us, "Crc": 0,
-            }  # fmt: skip
+                "Sequence": message.sequence,
+                "CommandSequence": message.command_sequence,
+                "DeviceTime": message.device_us & _DEVICE_TIME,
+                "Status": message.status,
+                "SequenceLow": message.sequence & 0xFF,
+                "CartPosition": message.cart_um,
+                "CartVelocity": message.cart_um_s,
+                "PolePosition": message.pole_urad,
+                "PoleVelocity": message.pole_urad_s,
+                "Effort": message.effort_mn,
+                "CommandAge": message.command_age_us,
+                "Crc": 0,
+            }
         case Angle():
             return {
-                "PoleAngle": message.pole_urad, "PoleRate": message.pole_urad_s,
-                "DeviceTimeLow": message.device_us & 0xFFFF_FFFF, "SequenceByte": message.sequence & 0xFF,
-                "Status": message.status, "Crc": 0,
-            }  # fmt: skip
+                "PoleAngle": message.pole_urad,
+                "PoleRate": message.pole_urad_s,
+                "DeviceTimeLow": message.device_us & 0xFFFF_FFFF,
+                "SequenceByte": message.sequence & 0xFF,
+                "Status": message.status,
+                "Crc": 0,
+            }
         case protocol.Target():
             return {
-                "Sequence": message.sequence, "Position": message.position_um,
-                "Stiffness": message.stiffness_mn_m, "Damping": message.damping_mns_m,
-                "EffortLimit": message.effort_limit_mn, "SpeedLimit": message.speed_limit_um_s, "Crc": 0,
-            }  # fmt: skip
+                "Sequence": message.sequence,
+                "Position": message.position_um,
+                "Stiffness": message.stiffness_mn_m,
+                "Damping": message.damping_mns_m,
+                "EffortLimit": message.effort_limit_mn,
+                "SpeedLimit": message.speed_limit_um_s,
+                "Crc": 0,
+            }
         case protocol.Info():
             kind = message.kind.encode("ascii")
             if len(kind) > 16:
@@ -273,15 +292,25 @@ def _to_values(message: CanMessage, version: int) -> dict[str, int]:
             # A device of another version says so, whatever the message was made with.
             told = version if message.version == protocol.VERSION else message.version
             return {
-                "Request": message.request, "Version": told, "DeviceRate": message.device_rate_hz,
-                "StateRate": message.state_rate_hz, "Kind1": int.from_bytes(kind[:8], "little"),
-                "Kind2": int.from_bytes(kind[8:], "little"), "UniqueId": message.unique_id,
-                "Major": major, "Minor": minor, "Patch": patch, "Crc": 0,
-            }  # fmt: skip
+                "Request": message.request,
+                "Version": told,
+                "DeviceRate": message.device_rate_hz,
+                "StateRate": message.state_rate_hz,
+                "Kind1": int.from_bytes(kind[:8], "little"),
+                "Kind2": int.from_bytes(kind[8:], "little"),
+                "UniqueId": message.unique_id,
+                "Major": major,
+                "Minor": minor,
+                "Patch": patch,
+                "Crc": 0,
+            }
         case protocol.Ack():
             return {
-                "Request": message.request, "Of": message.of, "Result": message.result, "Version": version,
-            }  # fmt: skip
+                "Request": message.request,
+                "Of": message.of,
+                "Result": message.result,
+                "Version": version,
+            }
         case protocol.Hello():
             return {"Request": message.request, "Version": message.version}
         case _:
@@ -293,9 +322,17 @@ def _from_values(kind: type[CanMessage], v: dict[str, int]) -> CanMessage:
         if v["SequenceLow"] != v["Sequence"] & 0xFF:
             raise FrameError("State: its frames have different numbers")
         return protocol.State(
-            v["Sequence"], v["DeviceTime"], v["CartPosition"], v["CartVelocity"], v["PolePosition"],
-            v["PoleVelocity"], v["Effort"], v["Status"], v["CommandSequence"], v["CommandAge"],
-        )  # fmt: skip
+            v["Sequence"],
+            v["DeviceTime"],
+            v["CartPosition"],
+            v["CartVelocity"],
+            v["PolePosition"],
+            v["PoleVelocity"],
+            v["Effort"],
+            v["Status"],
+            v["CommandSequence"],
+            v["CommandAge"],
+        )
     if kind is protocol.Target:
         return protocol.Target(
             v["Sequence"], v["Position"], v["Stiffness"], v["Damping"], v["EffortLimit"], v["SpeedLimit"]
@@ -305,9 +342,14 @@ def _from_values(kind: type[CanMessage], v: dict[str, int]) -> CanMessage:
     if kind is protocol.Info:
         text = v["Kind1"].to_bytes(8, "little") + v["Kind2"].to_bytes(8, "little")
         return protocol.Info(
-            v["Request"], text.rstrip(b"\0").decode("ascii"), (v["Major"], v["Minor"], v["Patch"]),
-            v["DeviceRate"], v["StateRate"], v["UniqueId"], v["Version"],
-        )  # fmt: skip
+            v["Request"],
+            text.rstrip(b"\0").decode("ascii"),
+            (v["Major"], v["Minor"], v["Patch"]),
+            v["DeviceRate"],
+            v["StateRate"],
+            v["UniqueId"],
+            v["Version"],
+        )
     if kind is protocol.Ack:
         return protocol.Ack(v["Request"], protocol.MessageType(v["Of"]), protocol.Result(v["Result"]))
     if kind is protocol.Hello:

@@ -186,13 +186,17 @@ class Controller:
         self._state_count = (sequence + 1) & 0xFFFF_FFFF
         known = self._command_sequence != protocol.NO_COMMAND
         return protocol.State(
-            sequence=sequence, device_us=tick * 1000,
-            cart_um=reading.cart_um, cart_um_s=reading.cart_um_s,
-            pole_urad=reading.pole_urad, pole_urad_s=reading.pole_urad_s,
-            effort_mn=max(-32767, min(32767, round(effort * 1e3))) if armed else 0, status=int(status),
+            sequence=sequence,
+            device_us=tick * 1000,
+            cart_um=reading.cart_um,
+            cart_um_s=reading.cart_um_s,
+            pole_urad=reading.pole_urad,
+            pole_urad_s=reading.pole_urad_s,
+            effort_mn=max(-32767, min(32767, round(effort * 1e3))) if armed else 0,
+            status=int(status),
             command_sequence=self._command_sequence,
             command_age_us=min((tick - self._command_tick) * 1000, 0xFFFF_FFFF) if known else 0,
-        )  # fmt: skip
+        )
 
     def finish_homing(self) -> None:
         """Take note that the cart is in the middle and the pole upright; nothing happens unless homing."""
@@ -216,10 +220,13 @@ class Controller:
         self._command_sequence = protocol.NO_COMMAND
         self._last_request = None
         return protocol.Info(
-            request=hello.request, kind=protocol.DEVICE_KIND, firmware=FIRMWARE_VERSION,
+            request=hello.request,
+            kind=protocol.DEVICE_KIND,
+            firmware=FIRMWARE_VERSION,
             device_rate_hz=round(DESCRIPTION.device_rate_hz),
-            state_rate_hz=round(DESCRIPTION.state_rate_hz), unique_id=self._unique_id,
-        )  # fmt: skip
+            state_rate_hz=round(DESCRIPTION.state_rate_hz),
+            unique_id=self._unique_id,
+        )
 
     def _answer(self, request: protocol.Arm | protocol.Stop | protocol.Home, motor: Motor) -> protocol.Ack:
         result = protocol.Result.DONE

@@ -1,4 +1,4 @@
-"""Facts about the cart-pole: a 0.8 m rail, a 0.3 m pole, a P-D position loop at 1 kHz in the device.
+"""Facts about the cart-pole: a 0.8 m rail, a 0.3 m pole, a PD position loop at 1 kHz in the device.
 
 The numbers of the mechanics are a plausible bench build, not a measured one: the paper's Table 8 prints the
 sizes (0.3 m, 0.1 kg, 0.3 kg) beside frictions and gains that no such cart could have (a pole friction of 0.1
@@ -63,7 +63,7 @@ DESCRIPTION = RobotDescription(
         "effort_limit": "ten times what 1 m/s^2 of cart and pole takes; the paper's 0.2 N is below friction",
         "speed_limit": "DEAL (Table 8): Cart Vel 1.0 m/s",
         "control_rate_hz": "DEAL, section 4.4: targets at 50 Hz",
-        "device_rate_hz": "DEAL, section 4.4: P-D loop at 1000 Hz",
+        "device_rate_hz": "DEAL, section 4.4: PD loop at 1000 Hz",
         "state_rate_hz": "a 45-byte state frame at 1 Mbaud takes 0.45 ms; 200 Hz leaves the line 91 % idle",
         "limits": "rail of +-0.40 m between the stops; trips 20 mm before them; targets 0.15 m before them",
         "sensor": "0.3 mm / 2 mrad noise, 0.5 mm belt encoder, 12-bit pole encoder, differenced velocity",

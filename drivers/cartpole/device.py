@@ -143,9 +143,13 @@ class CartpoleDevice(EmulatedDevice):
     """
 
     def __init__(
-        self, truth: Truth, *, keep_truth: bool = False, start_angle_rad: float | None = None,
+        self,
+        truth: Truth,
+        *,
+        keep_truth: bool = False,
+        start_angle_rad: float | None = None,
         firmware: Callable[[Truth, Mechanics], Firmware] = python_firmware,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad), keep_truth=keep_truth)
         self._firmware = firmware(truth, self._mechanics)
 

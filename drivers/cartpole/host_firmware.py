@@ -29,18 +29,23 @@ class Settings(ctypes.Structure):
     """``cartpole_settings`` of cartpole.h."""
 
     _fields_ = [
-        ("stiffness_trim", ctypes.c_uint32), ("damping_trim", ctypes.c_uint32),
-        ("effort_trim", ctypes.c_uint32), ("speed_trim", ctypes.c_uint32),
-        ("unique_id", ctypes.c_uint32), ("delay_ticks", ctypes.c_uint16),
-    ]  # fmt: skip
+        ("stiffness_trim", ctypes.c_uint32),
+        ("damping_trim", ctypes.c_uint32),
+        ("effort_trim", ctypes.c_uint32),
+        ("speed_trim", ctypes.c_uint32),
+        ("unique_id", ctypes.c_uint32),
+        ("delay_ticks", ctypes.c_uint16),
+    ]
 
 
 def settings_of(truth: Truth, delay_ticks: int) -> Settings:
     """Return the settings of a device with this truth: its trims are what nobody told the host."""
     nominal = {
-        "stiffness": STIFFNESS_N_M, "damping": DAMPING_NS_M,
-        "effort_limit": EFFORT_LIMIT_N, "speed_limit": SPEED_LIMIT_M_S,
-    }  # fmt: skip
+        "stiffness": STIFFNESS_N_M,
+        "damping": DAMPING_NS_M,
+        "effort_limit": EFFORT_LIMIT_N,
+        "speed_limit": SPEED_LIMIT_M_S,
+    }
     trims = [round(truth.parameters[f"servo.{name}"] / value * _ONE) for name, value in nominal.items()]
     return Settings(*trims, unique_id(truth), delay_ticks)
 
@@ -139,8 +144,9 @@ class HostFirmware:
 
     def report(self, reading: Reading) -> bytes:
         """Return the state frame of the tick that :meth:`control` ran last."""
-        length = self._core.host_report(self._device, *reading[:4], _fit(reading.setpoint * 1e9),
-                                        reading.at_end_stop, self._frame)  # fmt: skip
+        length = self._core.host_report(
+            self._device, *reading[:4], _fit(reading.setpoint * 1e9), reading.at_end_stop, self._frame
+        )
         return self._frame.raw[:length]
 
     def finish_homing(self) -> None:

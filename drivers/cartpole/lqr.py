@@ -175,7 +175,10 @@ class _Period:
 
 def _target(position: float) -> Target:
     return Target(
-        sequence=0, position_um=round(position * 1e6), stiffness_mn_m=round(STIFFNESS_N_M * 1e3),
-        damping_mns_m=round(DAMPING_NS_M * 1e3), effort_limit_mn=round(EFFORT_LIMIT_N * 1e3),
+        sequence=0,
+        position_um=round(position * 1e6),
+        stiffness_mn_m=round(STIFFNESS_N_M * 1e3),
+        damping_mns_m=round(DAMPING_NS_M * 1e3),
+        effort_limit_mn=round(EFFORT_LIMIT_N * 1e3),
         speed_limit_um_s=10**9,
-    )  # fmt: skip
+    )

@@ -27,9 +27,11 @@ def build_simulation(parameters: Mapping[str, float]) -> SingleSimulation:
     sim.set_body_mass("pole", parameters["pole.mass"])
     sim.set_dof("cart", frictionloss=parameters["cart.frictionloss"])
     sim.set_dof(
-        "pole", damping=parameters["pole.damping"], frictionloss=parameters["pole.frictionloss"],
+        "pole",
+        damping=parameters["pole.damping"],
+        frictionloss=parameters["pole.frictionloss"],
         armature=parameters["pole.armature"],
-    )  # fmt: skip
+    )
     return sim
 
 
@@ -51,9 +53,12 @@ class Mechanics:
     """
 
     def __init__(
-        self, truth: Truth, *, start_angle_rad: float | None = None,
+        self,
+        truth: Truth,
+        *,
+        start_angle_rad: float | None = None,
         read_rate_hz: float = DESCRIPTION.state_rate_hz,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.homing = self.held = False
         self._profile = find_profile(truth.profile)
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0xCA47]).spawn(4)]

@@ -17,9 +17,16 @@ SOURCES = Path(__file__).parent / "firmware"
 CORE = ("frames.c", "servo.c", "cartpole.c")
 RIG = ("avr/main.c", "rig.c", *CORE)
 AVR_CC = (
-    "avr-gcc", "-std=gnu99", "-mmcu=atmega328p", "-DF_CPU=16000000UL", "-Os", "-flto", "-Wall", "-Wextra",
+    "avr-gcc",
+    "-std=gnu99",
+    "-mmcu=atmega328p",
+    "-DF_CPU=16000000UL",
+    "-Os",
+    "-flto",
+    "-Wall",
+    "-Wextra",
     "-Werror",
-)  # fmt: skip
+)
 CFLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
 
 

@@ -38,14 +38,20 @@ class Command(enum.IntEnum):
 
 
 LAYOUT: Final = {
-    Command.HEARTBEAT: struct.Struct("<IBBBx"), Command.ESTOP: struct.Struct(""),
-    Command.RX_SDO: struct.Struct("<BHx4s"), Command.TX_SDO: struct.Struct("<xHx4s"),
-    Command.SET_AXIS_STATE: struct.Struct("<I"), Command.ENCODER_ESTIMATES: struct.Struct("<ff"),
-    Command.SET_CONTROLLER_MODE: struct.Struct("<II"), Command.SET_INPUT_POS: struct.Struct("<fhh"),
-    Command.SET_LIMITS: struct.Struct("<ff"), Command.CLEAR_ERRORS: struct.Struct("<B"),
-    Command.SET_POS_GAIN: struct.Struct("<f"), Command.SET_VEL_GAINS: struct.Struct("<ff"),
+    Command.HEARTBEAT: struct.Struct("<IBBBx"),
+    Command.ESTOP: struct.Struct(""),
+    Command.RX_SDO: struct.Struct("<BHx4s"),
+    Command.TX_SDO: struct.Struct("<xHx4s"),
+    Command.SET_AXIS_STATE: struct.Struct("<I"),
+    Command.ENCODER_ESTIMATES: struct.Struct("<ff"),
+    Command.SET_CONTROLLER_MODE: struct.Struct("<II"),
+    Command.SET_INPUT_POS: struct.Struct("<fhh"),
+    Command.SET_LIMITS: struct.Struct("<ff"),
+    Command.CLEAR_ERRORS: struct.Struct("<B"),
+    Command.SET_POS_GAIN: struct.Struct("<f"),
+    Command.SET_VEL_GAINS: struct.Struct("<ff"),
     Command.TORQUES: struct.Struct("<ff"),
-}  # fmt: skip
+}
 """Data of each frame; rev, rev/s, N*m, A."""
 
 

@@ -206,9 +206,13 @@ class OdriveLink:
         here = target.position_um if self._setpoint_um is None else self._setpoint_um
         step = round(target.speed_limit_um_s / DESCRIPTION.control_rate_hz)
         return protocol.Target(
-            target.sequence, min(max(target.position_um, here - step), here + step), target.stiffness_mn_m,
-            target.damping_mns_m, target.effort_limit_mn, round(self._s.velocity_limit_m_s * 1e6),
-        )  # fmt: skip
+            target.sequence,
+            min(max(target.position_um, here - step), here + step),
+            target.stiffness_mn_m,
+            target.damping_mns_m,
+            target.effort_limit_mn,
+            round(self._s.velocity_limit_m_s * 1e6),
+        )
 
     def encode(self, message: protocol.AnyMessage) -> bytes:
         """Return a message's frames for drive and encoder.
@@ -291,10 +295,12 @@ class OdriveLink:
         # first: it feeds the watchdog, whose error would keep the axis from being armed.
         return (
             self._pack(Command.SET_CONTROLLER_MODE, POSITION_CONTROL, PASSTHROUGH)
-            + self._pack(Command.SET_POS_GAIN, 0.0) + self._pack(Command.SET_VEL_GAINS, 0.0, 0.0)
-            + self._pack(Command.SET_INPUT_POS, self._turns, 0, 0) + self._pack(Command.CLEAR_ERRORS, 0)
+            + self._pack(Command.SET_POS_GAIN, 0.0)
+            + self._pack(Command.SET_VEL_GAINS, 0.0, 0.0)
+            + self._pack(Command.SET_INPUT_POS, self._turns, 0, 0)
+            + self._pack(Command.CLEAR_ERRORS, 0)
             + self._pack(Command.SET_AXIS_STATE, CLOSED_LOOP)
-        )  # fmt: skip
+        )
 
     def _target(self, target: protocol.Target) -> bytes:
         self._setpoint_um = target.position_um
@@ -343,9 +349,14 @@ class OdriveLink:
         elif isinstance(found, protocol.Info):
             kind = protocol.DEVICE_KIND if found.kind == ENCODER_KIND else found.kind
             self._info = protocol.Info(
-                found.request, kind, found.firmware, found.device_rate_hz, found.state_rate_hz,
-                found.unique_id, found.version,
-            )  # fmt: skip
+                found.request,
+                kind,
+                found.firmware,
+                found.device_rate_hz,
+                found.state_rate_hz,
+                found.unique_id,
+                found.version,
+            )
         elif isinstance(found, protocol.Ack):
             yield found
 
@@ -375,14 +386,17 @@ class OdriveLink:
             ((us, number) for us, number in reversed(self._sent) if us <= self._device_us), (0, -1)
         )
         yield protocol.State(
-            sequence=self._sequence, device_us=self._device_us,
+            sequence=self._sequence,
+            device_us=self._device_us,
             cart_um=_clip((position_m - (self._zero_m or 0.0)) * 1e6),
-            cart_um_s=_clip(cart[1] * self._s.metres_per_turn * 1e6), pole_urad=angle.pole_urad,
-            pole_urad_s=angle.pole_urad_s, effort_mn=self._force_mn if status & Status.ARMED else 0,
+            cart_um_s=_clip(cart[1] * self._s.metres_per_turn * 1e6),
+            pole_urad=angle.pole_urad,
+            pole_urad_s=angle.pole_urad_s,
+            effort_mn=self._force_mn if status & Status.ARMED else 0,
             status=int(status),
             command_sequence=newest if newest >= 0 else protocol.NO_COMMAND,
             command_age_us=min(self._device_us - then_us, _U32) if newest >= 0 else 0,
-        )  # fmt: skip
+        )
 
 
 def _clip(value: float) -> int:

@@ -15,8 +15,13 @@ from deal_hw.drivers.transports.listen_only import listen_only
 from deal_hw.transport import Transport
 
 _LOWEST: Final = {
-    "node": 0, "encoder": 1, "mm_per_turn": 1, "kv": 1, "enable_watchdog": 1, "watchdog_timeout": 1,
-}  # fmt: skip
+    "node": 0,
+    "encoder": 1,
+    "mm_per_turn": 1,
+    "kv": 1,
+    "enable_watchdog": 1,
+    "watchdog_timeout": 1,
+}
 """Settings that a port may give, and the lowest value of each."""
 
 

@@ -21,29 +21,29 @@ FALLEN_RAD = 0.3
 MAX_DRAWS = 200
 
 
-def draw_truth(profile: str, seed: int, *, xi: float = 5.0) -> Truth:
+def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> Truth:
     """Return the hidden truth of a seed: the first draw that the oracle balances.
 
     Args:
         profile: Name of the profile.
         seed: Seed of the draw.
-        xi: Ratio of the range around the nominal parameters.
+        range_ratio: Ratio of the range around the nominal parameters.
 
     Raises:
         UnknownNameError: There is no such profile.
-        ConfigurationError: ``xi`` is not above 1, or no draw can be balanced.
+        ConfigurationError: ``range_ratio`` is not above 1, or no draw can be balanced.
     """
     find_profile(profile)
     if seed < 0:
         raise ConfigurationError(f"a seed is 0 or more, got {seed}")
     rng = np.random.default_rng([seed, 0x7207])
     for refused in range(MAX_DRAWS):
-        truth = candidate_truth(profile, rng, seed=seed, xi=xi, refused=refused)
+        truth = candidate_truth(profile, rng, seed=seed, range_ratio=range_ratio, refused=refused)
         if oracle_balances(truth):
             return truth
     raise ConfigurationError(
-        f"none of {MAX_DRAWS} draws of seed {seed} with xi={xi:g} can be balanced in profile {profile!r}; "
-        "use a smaller xi"
+        f"none of {MAX_DRAWS} draws of seed {seed} with range ratio {range_ratio:g} can be balanced in "
+        f"profile {profile!r}; use a smaller range ratio"
     )
 
 

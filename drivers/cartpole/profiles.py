@@ -1,4 +1,4 @@
-"""What stands between the emulated mechanics and the wire, in three steps of honesty."""
+"""What stands between the emulated mechanics and the wire, in three steps of realism."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Info:
         request: Number of the hello that is answered.
         kind: What the device is, at most 16 ASCII characters.
         firmware: Major, minor, patch.
-        device_rate_hz: Rate of the P-D loop.
+        device_rate_hz: Rate of the PD loop.
         state_rate_hz: Rate of state frames.
         unique_id: Serial number of the device.
         version: The protocol version that the device speaks.
@@ -216,15 +216,30 @@ def _encode_payload(message: AnyMessage) -> bytes:
     match message:
         case State():
             return _STATE.pack(
-                VERSION, MessageType.STATE, message.sequence, message.device_us,
-                message.cart_um, message.cart_um_s, message.pole_urad, message.pole_urad_s,
-                message.effort_mn, message.status, message.command_sequence, message.command_age_us,
-            )  # fmt: skip
+                VERSION,
+                MessageType.STATE,
+                message.sequence,
+                message.device_us,
+                message.cart_um,
+                message.cart_um_s,
+                message.pole_urad,
+                message.pole_urad_s,
+                message.effort_mn,
+                message.status,
+                message.command_sequence,
+                message.command_age_us,
+            )
         case Target():
             return _TARGET.pack(
-                VERSION, MessageType.TARGET, message.sequence, message.position_um, message.stiffness_mn_m,
-                message.damping_mns_m, message.effort_limit_mn, message.speed_limit_um_s,
-            )  # fmt: skip
+                VERSION,
+                MessageType.TARGET,
+                message.sequence,
+                message.position_um,
+                message.stiffness_mn_m,
+                message.damping_mns_m,
+                message.effort_limit_mn,
+                message.speed_limit_um_s,
+            )
         case Info():
             kind = message.kind.encode("ascii")
             if len(kind) > 16:

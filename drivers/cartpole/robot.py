@@ -118,7 +118,7 @@ class CartpoleRobot(Robot):
             except TransportTimeoutError as error:
                 raise TransportTimeoutError(
                     f"cartpole: no state within {timeout_s:g} s; is the device powered, is the cable good "
-                    f"({self.link_errors} link errors so far)?{self._trouble}"
+                    f"({self.transport_errors} transport errors so far)?{self._trouble}"
                 ) from error
         return self._states.popleft()
 
@@ -149,7 +149,7 @@ class CartpoleRobot(Robot):
         return self._sequence
 
     @property
-    def link_errors(self) -> int:
+    def transport_errors(self) -> int:
         """Corrupt or foreign frames and missing state samples so far."""
         return self._link.errors + self._gaps
 

@@ -1,4 +1,4 @@
-"""The P-D position loop inside the device: what it was sent, times the factors that it does not know of."""
+"""The PD position loop inside the device: what it was sent, times the factors that it does not know of."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RAIL_M = 0.4
 
 
 class Servo:
-    """P-D loop with a set-point that slews towards the target.
+    """PD loop with a set-point that slews towards the target.
 
     Args:
         parameters: What the servo parameters of the description's default command really are, by name.

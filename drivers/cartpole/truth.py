@@ -91,9 +91,11 @@ def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Trut
     return Truth(profile=profile, seed=seed, parameters=parameters, **changes)
 
 
-def candidate_truth(profile: str, rng: np.random.Generator, *, seed: int, xi: float, refused: int) -> Truth:
+def candidate_truth(
+    profile: str, rng: np.random.Generator, *, seed: int, range_ratio: float, refused: int
+) -> Truth:
     """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency."""
-    space = k9_space().with_ratio(xi).with_known(k9_space().known)
+    space = k9_space().with_ratio(range_ratio).with_known(k9_space().known)
     values = space.unnormalize(rng.uniform(0.1, 0.9, len(space)))
     low, high = find_profile(profile).latency_ticks
     total = int(rng.integers(low, high + 1))

@@ -114,15 +114,15 @@ class WireClaim:
         if claim["state"] == ASKING:
             self._say(HELD)
 
-    def _listen(self, timeout_s: float, heed: Callable[[dict[str, Any]], None]) -> None:
-        """Hand what another says to ``heed``; return after one message or the time [s]."""
+    def _listen(self, timeout_s: float, handle: Callable[[dict[str, Any]], None]) -> None:
+        """Hand what another says to ``handle``; return after one message or the time [s]."""
         try:
             message = self._transport.receive(timeout_s)
         except TransportTimeoutError:
             return
         claim = read_claim(message.payload) if message.channel == CLAIM else None
         if claim is not None and claim["id"] != self._identity:
-            heed(claim)
+            handle(claim)
 
     def _say(self, state: str) -> None:
         text = json.dumps({"id": self._identity, "who": self._holder, "state": state})

@@ -78,9 +78,11 @@ class Doctor:
             yield from self._discovery()
             if not self._strict:
                 yield Finding(
-                    "states", Level.WARN, "head and checksum of the states are not checked",
+                    "states",
+                    Level.WARN,
+                    "head and checksum of the states are not checked",
                     "leave --state-check out where the robot makes both as deal-hw expects",
-                )  # fmt: skip
+                )
             yield from _judge_states(heard, self._seconds)
             mode = yield from self._ask_mode()
             yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode or "")
@@ -104,10 +106,12 @@ class Doctor:
         seen = survey()
         if not seen.peers:
             yield Finding(
-                "dds", Level.FAIL, "no other participant is on the domain",
+                "dds",
+                Level.FAIL,
+                "no other participant is on the domain",
                 "is the robot on, is this its network (192.168.123.x), is the domain 0, does a firewall "
                 "block UDP 7400 to 7500?",
-            )  # fmt: skip
+            )
         for peer in seen.peers:
             yield Finding("dds", Level.OK, str(peer))
         for complaint in seen.complaints:
@@ -138,9 +142,11 @@ class Doctor:
             times.append((self._clock.now_ns() - begun_ns) * 1e-9)
         if name is None:
             yield Finding(
-                "services", Level.WARN, f"the service {SWITCHER} does not answer",
+                "services",
+                Level.WARN,
+                f"the service {SWITCHER} does not answer",
                 "older firmware has the service robot_state instead; deal-hw tries that one, too",
-            )  # fmt: skip
+            )
             return None
         p50, most = float(np.median(times)), max(times)
         text = (
@@ -148,9 +154,11 @@ class Doctor:
         )
         slow = p50 > _SLOW_ROUND_TRIP_S
         yield Finding(
-            "link", Level.WARN if slow else Level.OK, text,
+            "link",
+            Level.WARN if slow else Level.OK,
+            text,
             "a cable instead of wireless; stop what else loads network and computer" if slow else "",
-        )  # fmt: skip
+        )
         yield _judge_mode(name)
         return name
 
@@ -180,10 +188,12 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
             return
     if len(heard.stamps) < 2:
         yield Finding(
-            "states", Level.FAIL, f"no states came on {topics.LOW_STATE} within {seconds:g} s",
+            "states",
+            Level.FAIL,
+            f"no states came on {topics.LOW_STATE} within {seconds:g} s",
             "is the robot on and started up (one minute), is this the right interface or endpoint, does a "
             "firewall stand between?",
-        )  # fmt: skip
+        )
         return
     gaps = np.diff(heard.stamps) * 1e-9
     rate = (len(heard.stamps) - 1) / ((heard.stamps[-1] - heard.stamps[0]) * 1e-9)
@@ -203,9 +213,10 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     back = int(np.sum(steps <= 0))
     if missing or back:
         yield Finding(
-            "states", Level.NOTE,
+            "states",
+            Level.NOTE,
             f"{missing} states lost and {back} repeated or out of order of {len(heard.ticks)}",
-        )  # fmt: skip
+        )
     device_ms = np.concatenate(((0,), np.cumsum(steps.astype(np.int64))))
     yield judge_clock(np.array(heard.stamps), 1_000_000 * device_ms)
 
@@ -229,21 +240,26 @@ def _judge_refused(refused: Refusals, sound: int) -> Finding:
 def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str) -> Iterator[Finding]:
     if heard.commands and mode:
         yield Finding(
-            "commands", Level.NOTE,
+            "commands",
+            Level.NOTE,
             f"{heard.commands} motor commands came while sport mode {mode!r} is active, probably its own",
             "run doctor again after the release: nobody may command the motors then",
-        )  # fmt: skip
+        )
     elif heard.commands:
         who = f" ({'; '.join(writers)})" if writers else ""
         yield Finding(
-            "commands", Level.FAIL, f"somebody else commands the motors: {heard.commands} messages{who}",
+            "commands",
+            Level.FAIL,
+            f"somebody else commands the motors: {heard.commands} messages{who}",
             "stop that program",
-        )  # fmt: skip
+        )
     elif writers:
         yield Finding(
-            "commands", Level.WARN, f"silent writers of {topics.LOW_COMMAND}: {'; '.join(writers)}",
+            "commands",
+            Level.WARN,
+            f"silent writers of {topics.LOW_COMMAND}: {'; '.join(writers)}",
             "stop them if they are not deal-hw's own",
-        )  # fmt: skip
+        )
     else:
         yield Finding("commands", Level.OK, "nobody else commands the motors")
 
@@ -256,21 +272,27 @@ def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
     hottest = int(np.max(frame.temperature))
     hot = hottest > 70
     yield Finding(
-        "robot", Level.WARN if hot else Level.OK, f"hottest motor {hottest} °C",
+        "robot",
+        Level.WARN if hot else Level.OK,
+        f"hottest motor {hottest} °C",
         "let it cool down" if hot else "",
-    )  # fmt: skip
+    )
     lean = math.degrees(tilt(frame.orientation))
     tilted = not lean < 30.0 or not abs(float(frame.orientation @ frame.orientation) - 1.0) < 0.01
     yield Finding(
-        "robot", Level.WARN if tilted else Level.OK, f"the body leans by {lean:.0f} degrees",
+        "robot",
+        Level.WARN if tilted else Level.OK,
+        f"the body leans by {lean:.0f} degrees",
         "set it down level" if tilted else "",
-    )  # fmt: skip
+    )
     remote = decode_remote(frame.remote)
     if remote is None:
         yield Finding(
-            "robot", Level.NOTE, "no remote is heard: L2+B cannot stop the robot",
+            "robot",
+            Level.NOTE,
+            "no remote is heard: L2+B cannot stop the robot",
             "switch the remote on and pair it before you arm",
-        )  # fmt: skip
+        )
     else:
         yield Finding("robot", Level.OK, "the remote is heard: L2+B makes the robot passive")
 
@@ -279,6 +301,8 @@ def _judge_mode(name: str) -> Finding:
     if not name:
         return Finding("services", Level.OK, "no sport mode is active: the low level is free")
     return Finding(
-        "services", Level.NOTE, f"sport mode {name!r} is active",
+        "services",
+        Level.NOTE,
+        f"sport mode {name!r} is active",
         "deal-hw releases it when it arms, after the robot has lain down; keep the robot on the floor",
-    )  # fmt: skip
+    )

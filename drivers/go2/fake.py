@@ -149,16 +149,32 @@ class FakeGo2:
     def state(self) -> LowState:
         """Return the state now."""
         values: dict[str, Any] = {
-            "position": self.pose, "velocity": self.velocity, "acceleration": np.zeros(12),
-            "effort": self.effort(), "temperature": np.arange(12) + 30, "lost": np.arange(12),
-            "mode": np.ones(12, np.int64), "orientation": np.array([1.0, 0.0, 0.0, 0.0]),
-            "angular_velocity": np.array([0.1, 0.2, 0.3]), "specific_force": np.array([0.0, 0.0, 9.81]),
-            "rpy": np.zeros(3), "imu_temperature": 60, "foot_force": np.array([1, 2, 3, 4]),
-            "foot_force_estimate": np.zeros(4, np.int64), "tick_ms": self.tick_ms,
-            "remote": encode_remote(self.remote), "battery_percent": 77, "battery_current_ma": -2000,
-            "battery_status": 8, "battery_cycles": 1, "cell_voltage_mv": np.full(15, 3900), "voltage": 30.5,
-            "current": 2.0, "serial": (1, 2), "version": (3, 4),
-        }  # fmt: skip
+            "position": self.pose,
+            "velocity": self.velocity,
+            "acceleration": np.zeros(12),
+            "effort": self.effort(),
+            "temperature": np.arange(12) + 30,
+            "lost": np.arange(12),
+            "mode": np.ones(12, np.int64),
+            "orientation": np.array([1.0, 0.0, 0.0, 0.0]),
+            "angular_velocity": np.array([0.1, 0.2, 0.3]),
+            "specific_force": np.array([0.0, 0.0, 9.81]),
+            "rpy": np.zeros(3),
+            "imu_temperature": 60,
+            "foot_force": np.array([1, 2, 3, 4]),
+            "foot_force_estimate": np.zeros(4, np.int64),
+            "tick_ms": self.tick_ms,
+            "remote": encode_remote(self.remote),
+            "battery_percent": 77,
+            "battery_current_ma": -2000,
+            "battery_status": 8,
+            "battery_cycles": 1,
+            "cell_voltage_mv": np.full(15, 3900),
+            "voltage": 30.5,
+            "current": 2.0,
+            "serial": (1, 2),
+            "version": (3, 4),
+        }
         return LowState(**{**values, **self.changes})
 
 

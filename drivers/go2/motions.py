@@ -81,7 +81,11 @@ def sway_plan(
     offsets *= amplitude * float(np.min(fit_to_limits(description, offsets, smooth=True)))
     rows = tuple(tuple(map(float, row)) for row in offsets)
     return ExcitationPlan(
-        robot=description.name, digest=description.digest(), seconds=seconds, balance_s=0.0,
-        ease_s=min(EASE_S, 0.25 * seconds), wave=Steps(begin_s=tuple(map(float, times)), value=rows),
+        robot=description.name,
+        digest=description.digest(),
+        seconds=seconds,
+        balance_s=0.0,
+        ease_s=min(EASE_S, 0.25 * seconds),
+        wave=Steps(begin_s=tuple(map(float, times)), value=rows),
         words=f"{seconds:g} s of swaying over standing feet, {band_hz[0]:.2g} to {band_hz[1]:.2g} Hz",
-    )  # fmt: skip
+    )

@@ -120,9 +120,13 @@ class Go2Robot(Robot):
         self._sender.reset()
         self._states.clear()
         self._takeover = Takeover(
-            self._transport, self._clock, self._sender.publish, self._pump, self._motion,
+            self._transport,
+            self._clock,
+            self._sender.publish,
+            self._pump,
+            self._motion,
             None if self.description.floating_base is None else np.array(self.description.rest_position),
-        )  # fmt: skip
+        )
         self._frame: LowStateFrame | None = None
         self._armed = self._homed = self._in_charge = False
         self._passive_ns: int | None = None
@@ -223,12 +227,12 @@ class Go2Robot(Robot):
                 frozen = " (it repeats old ones: its clock stands still)" * (self._stream.stale > stale)
                 raise TransportTimeoutError(
                     f"go2: no new state within {timeout_s:g} s{frozen}; is the robot on, is the cable in "
-                    f"({self.link_errors} link errors so far)?"
+                    f"({self.transport_errors} transport errors so far)?"
                 ) from error
         return self._states.popleft()
 
     def send_command(self, command: JointCommand) -> JointCommand:
-        """Send P-D targets; once passive, damping is sent instead and returned.
+        """Send PD targets; once passive, damping is sent instead and returned.
 
         The wire has no limits of effort and speed: those of the description come back.
 
@@ -273,7 +277,7 @@ class Go2Robot(Robot):
         return self._sender.sequence
 
     @property
-    def link_errors(self) -> int:
+    def transport_errors(self) -> int:
         """Corrupt, missing, repeated and overtaken states so far."""
         return self._stream.errors
 
@@ -347,11 +351,18 @@ class Go2Robot(Robot):
         sequence, age_ns = self._sender.echo.at(stream.device_ns, stream.offset_ns)
         self._states.append(
             RobotState(
-                position=frame.position, velocity=frame.velocity, effort=frame.effort, receive_ns=receive_ns,
-                device_ns=stream.device_ns, sequence=stream.sequence, command_sequence=sequence,
-                command_age_ns=age_ns, status=self._status(frame), body=body_state(frame, remote),
+                position=frame.position,
+                velocity=frame.velocity,
+                effort=frame.effort,
+                receive_ns=receive_ns,
+                device_ns=stream.device_ns,
+                sequence=stream.sequence,
+                command_sequence=sequence,
+                command_age_ns=age_ns,
+                status=self._status(frame),
+                body=body_state(frame, remote),
             )
-        )  # fmt: skip
+        )
 
     def _status(self, frame: LowStateFrame) -> Status:
         if self._passive_ns is not None:

@@ -1,6 +1,6 @@
 """What carries a Go2: the floor, or a stand that holds its body in the air.
 
-The two are different robots to deal-hw (``go2``, ``go2_hung``), and commands for one are dangerous to the
+The two are different robots to deal-hw (``go2``, ``go2_on_stand``), and commands for one are dangerous to the
 other. No sensor tells which it is. Two quantities do: how far the feet reach below the base, along gravity,
 and the force that the legs carry, by the motors' estimated efforts.
 
@@ -175,9 +175,11 @@ def _unsteady(
 ) -> SupportReading | None:
     """Return why forces and geometry say nothing; None where the robot is level and still."""
     size = float(np.linalg.norm(force))
-    if joint_speed > config.joint_rad_s or body_speed > config.body_rad_s or (
-        abs(size - GRAVITY_M_S2) > config.force_m_s2
-    ):  # fmt: skip
+    if (
+        joint_speed > config.joint_rad_s
+        or body_speed > config.body_rad_s
+        or (abs(size - GRAVITY_M_S2) > config.force_m_s2)
+    ):
         return _undecided(
             f"it moves: a joint at {joint_speed:.1f} rad/s, the body at {body_speed:.1f} rad/s, "
             f"specific force {size:.1f} m/s²",
@@ -287,7 +289,7 @@ class SupportGuard:
             return (
                 f"{self._name}: something holds the robot in the air: {found.seen}. `{self._name}` is the "
                 "robot on the floor: it would stand up and walk in the air. Lay it on the floor, or take the "
-                f"robot `go2_hung`. {skip}"
+                f"robot `go2_on_stand`. {skip}"
             )
         return (
             f"{self._name}: the robot is on the floor: {found.seen}. `{self._name}` lets go of it as it "

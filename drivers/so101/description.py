@@ -73,7 +73,7 @@ DESCRIPTION: Final = RobotDescription(
     sources={
         "joint_names": "mujoco_menagerie robotstudio_so101/so101.xml @ 191a7ba; LeRobot uses the same",
         "default_position": "middle of each calibrated travel",
-        "stiffness": "static droop of a real arm at P = 16; the published 998 N·m/rad is 90 times as much",
+        "stiffness": "static sag of a real arm at P = 16; the published 998 N·m/rad is 90 times as much",
         "damping": "the servo takes no D gain; its back-EMF is joint damping in the model",
         "effort_limit": "forcerange of the same so101.xml: the servo's stall torque",
         "speed_limit": "the servo follows the set-point as it comes",
@@ -114,13 +114,19 @@ def parameter_space() -> ParameterSpace:
             *_rows(),
             *(
                 Parameter(
-                    name=f"{joint}.encoder_bias", kind="encoder_bias", elements=(joint,), unit="rad",
-                    nominal=0.0, low=-ENCODER_BIAS_RAD, high=ENCODER_BIAS_RAD, scale="linear",
+                    name=f"{joint}.encoder_bias",
+                    kind="encoder_bias",
+                    elements=(joint,),
+                    unit="rad",
+                    nominal=0.0,
+                    low=-ENCODER_BIAS_RAD,
+                    high=ENCODER_BIAS_RAD,
+                    scale="linear",
                 )
                 for joint in JOINTS
             ),
         ]
-    )  # fmt: skip
+    )
 
 
 def unbiased_space() -> ParameterSpace:

@@ -160,10 +160,16 @@ def read_certificate(path: Path) -> Certificate:
     key = path.with_suffix(".key")
     here = key.exists()
     return Certificate(
-        path=path, name=_name_of(found.subject), addresses=addresses, authority=authority,
-        issuer=_name_of(found.issuer), begins=found.not_valid_before_utc, expires=found.not_valid_after_utc,
-        key=key if here else None, key_mode=key.stat().st_mode & 0o777 if here else 0,
-    )  # fmt: skip
+        path=path,
+        name=_name_of(found.subject),
+        addresses=addresses,
+        authority=authority,
+        issuer=_name_of(found.issuer),
+        begins=found.not_valid_before_utc,
+        expires=found.not_valid_after_utc,
+        key=key if here else None,
+        key_mode=key.stat().st_mode & 0o777 if here else 0,
+    )
 
 
 def _x509() -> Any:
@@ -211,10 +217,19 @@ def _usage(**given: bool) -> Any:
     from cryptography import x509
 
     none = dict.fromkeys(
-        ("digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
-         "key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
+        (
+            "digital_signature",
+            "content_commitment",
+            "key_encipherment",
+            "data_encipherment",
+            "key_agreement",
+            "key_cert_sign",
+            "crl_sign",
+            "encipher_only",
+            "decipher_only",
+        ),
         False,
-    )  # fmt: skip
+    )
     return x509.KeyUsage(**(none | given))
 
 

@@ -22,9 +22,16 @@ from deal_hw.errors import ConfigurationError, TransportTimeoutError
 from deal_hw.transport import Message
 
 BITRATES: Final = {
-    10_000: b"S0", 20_000: b"S1", 50_000: b"S2", 100_000: b"S3", 125_000: b"S4", 250_000: b"S5",
-    500_000: b"S6", 800_000: b"S7", 1_000_000: b"S8",
-}  # fmt: skip
+    10_000: b"S0",
+    20_000: b"S1",
+    50_000: b"S2",
+    100_000: b"S3",
+    125_000: b"S4",
+    250_000: b"S5",
+    500_000: b"S6",
+    800_000: b"S7",
+    1_000_000: b"S8",
+}
 TTY_BAUD_RATE: Final = 1_000_000
 """Of adapters behind a real UART; over USB it is a formality."""
 END: Final = b"\r"

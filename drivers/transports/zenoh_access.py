@@ -58,6 +58,9 @@ def access_settings(
 
 def _rule(name: str, messages: list[str], flows: list[str], keys: Sequence[str]) -> dict[str, Any]:
     return {
-        "id": name, "permission": "allow", "messages": messages, "flows": flows,
+        "id": name,
+        "permission": "allow",
+        "messages": messages,
+        "flows": flows,
         "key_exprs": list(dict.fromkeys(keys)),
-    }  # fmt: skip
+    }

@@ -15,10 +15,28 @@ from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
 
 FIELDS = {
-    "bench", "task", "profile", "method", "refined", "xi", "seed", "error_percent", "log_error_x100",
-    "null_error_percent", "null_log_error_x100", "coverage90", "width90", "heldout_nrmse_nominal",
-    "heldout_nrmse_calibrated", "latency_true", "latency_found", "steps", "seconds", "flagged", "error",
-}  # fmt: skip
+    "bench",
+    "task",
+    "profile",
+    "method",
+    "refined",
+    "range_ratio",
+    "seed",
+    "error_percent",
+    "log_error_x100",
+    "null_error_percent",
+    "null_log_error_x100",
+    "coverage90",
+    "width90",
+    "heldout_nrmse_nominal",
+    "heldout_nrmse_calibrated",
+    "latency_true",
+    "latency_found",
+    "steps",
+    "seconds",
+    "flagged",
+    "error",
+}
 
 
 def test_seeds() -> None:
@@ -82,7 +100,7 @@ def test_ratios() -> None:
     """Numbers above one, and an error that shows how."""
     assert parse_ratios("3, 5,20") == (3.0, 5.0, 20.0)
     for text in ("", "a", "1", "5,0.5"):
-        with pytest.raises(ConfigurationError, match="--xi"):
+        with pytest.raises(ConfigurationError, match="--range-ratio"):
             parse_ratios(text)
 
 
@@ -90,14 +108,21 @@ def test_honest_rows_for_every_task(tmp_path: Path) -> None:
     """Cells are tasks by methods; no-data baselines score the centre's error everywhere."""
     out = tmp_path / "honest.json"
     settings = Bench(
-        bench="honest", task="cartpole,ant,go2", profile="ideal", seeds="3", methods="midpoint,nominal",
-        xi="3", out=out, threads=1, quiet=True,
-    )  # fmt: skip
+        bench="fixed-range",
+        task="cartpole,ant,go2",
+        profile="ideal",
+        seeds="3",
+        methods="midpoint,nominal",
+        range_ratio="3",
+        out=out,
+        threads=1,
+        quiet=True,
+    )
     assert bench(settings) == 0
     rows = json.loads(out.read_text())["rows"]
     assert len(rows) == 3 * 2
     for row in rows:
-        assert set(row) >= FIELDS and row["bench"] == "honest" and not row["refined"]
+        assert set(row) >= FIELDS and row["bench"] == "fixed-range" and not row["refined"]
         assert row["log_error_x100"] == pytest.approx(row["null_log_error_x100"])
         assert row["log_error_x100"] > 10, "an honest truth is not the midpoint"
     assert bench(settings) == 0
@@ -140,9 +165,18 @@ def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
     for shown in ("excite", "policy"):
         out = tmp_path / f"{shown}.json"
         settings = Bench(
-            bench="honest", task="cartpole", profile="ideal", seeds="3", methods="deal-paper", population=4,
-            generations=1, demonstration=shown, out=out, threads=1, quiet=True,
-        )  # fmt: skip
+            bench="fixed-range",
+            task="cartpole",
+            profile="ideal",
+            seeds="3",
+            methods="deal-paper",
+            population=4,
+            generations=1,
+            demonstration=shown,
+            out=out,
+            threads=1,
+            quiet=True,
+        )
         bench(settings)
         (row,) = json.loads(out.read_text())["rows"]
         errors[shown] = row["error"]
@@ -163,4 +197,4 @@ def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:
 def test_an_unknown_task_is_refused(tmp_path: Path) -> None:
     """The tasks are listed."""
     with pytest.raises(UnknownNameError, match="go2"):
-        bench(Bench(bench="honest", task="humanoid", out=tmp_path / "honest.json"))
+        bench(Bench(bench="fixed-range", task="humanoid", out=tmp_path / "honest.json"))

@@ -57,9 +57,17 @@ def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
     """The rows say who fitted, how far off unseen motion is predicted, and what ended at a bound."""
     out = tmp_path / "real.json"
     settings = Bench(
-        bench="real", recordings=hinge, methods="nominal,default", seeds="0", out=out, heldout_window=0.5,
-        population=30, generations=10, threads=1, quiet=True,
-    )  # fmt: skip
+        bench="real",
+        recordings=hinge,
+        methods="nominal,default",
+        seeds="0",
+        out=out,
+        heldout_window=0.5,
+        population=30,
+        generations=10,
+        threads=1,
+        quiet=True,
+    )
     assert bench(settings) == 0
     rows = {row["method"]: row for row in json.loads(out.read_text())["rows"]}
     assert set(rows) == {"nominal", "default"}

@@ -78,9 +78,13 @@ def small_problem() -> Callable[..., Problem]:
     def make(seconds: float = 1.2, latency_ticks: int = 0, fixed_latency_s: float | None = 0.0) -> Problem:
         space, _, episode = _recorded(seconds, latency_ticks)
         return Problem(
-            load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=fixed_latency_s,
+            load_model(DESCRIPTION),
+            space,
+            [episode],
+            threads=1,
+            fixed_latency_s=fixed_latency_s,
             policy=RecordedCommands.of(episode.target, 20),
-        )  # fmt: skip
+        )
 
     return make
 

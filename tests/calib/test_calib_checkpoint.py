@@ -18,9 +18,11 @@ from deal_hw.errors import ConfigurationError, DatasetError
 KEYS = st.text(max_size=8).filter(lambda key: key != "__array__")
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
 KINDS = st.one_of(
-    npst.boolean_dtypes(), npst.integer_dtypes(endianness="<"), npst.unsigned_integer_dtypes(endianness="<"),
+    npst.boolean_dtypes(),
+    npst.integer_dtypes(endianness="<"),
+    npst.unsigned_integer_dtypes(endianness="<"),
     npst.floating_dtypes(endianness="<", sizes=(32, 64)),
-)  # fmt: skip
+)
 ARRAYS = npst.arrays(KINDS, npst.array_shapes(min_dims=0, min_side=0, max_dims=3, max_side=3))
 TREES = st.recursive(
     PLAIN | ARRAYS,
@@ -151,9 +153,21 @@ def test_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 def test_digest_tells_apart_what_differs() -> None:
     """A value, its kind, its shape and its place all count; copies do not."""
     values: list[Any] = [
-        1, 1.0, "1", True, None, [1], [[1]], {"a": 1}, {"b": 1}, np.zeros(4), np.zeros((2, 2)),
-        np.zeros(4, dtype=np.float32), [1, [2]], [[1], 2],
-    ]  # fmt: skip
+        1,
+        1.0,
+        "1",
+        True,
+        None,
+        [1],
+        [[1]],
+        {"a": 1},
+        {"b": 1},
+        np.zeros(4),
+        np.zeros((2, 2)),
+        np.zeros(4, dtype=np.float32),
+        [1, [2]],
+        [[1], 2],
+    ]
     assert len({digest(value) for value in values}) == len(values)
     assert digest({"a": np.arange(3)}) == digest({"a": np.arange(3)})
     with pytest.raises(TypeError, match="has no digest"):

@@ -45,7 +45,7 @@ def test_ratio_with_errors_shared_inside_windows_by_hand() -> None:
     assert found.ratio[0] == pytest.approx(16 / (4 * (1 - 4 / 96)))
 
 
-def test_sandwich_equals_the_textbook_up_to_its_small_sample_factor() -> None:
+def test_cluster_robust_covariance_equals_the_textbook_up_to_its_small_sample_factor() -> None:
     """H^-1 (sum g g') H^-1 over H^-1 by the formula, over what white noise would give by the same formula."""
     rng = np.random.default_rng(0)
     design = rng.normal(size=(30, 10, 3))
@@ -111,11 +111,17 @@ def test_offsets_of_windows_do_not_bias_the_ratio_of_parts_of_windows() -> None:
 def _space(K: int) -> ParameterSpace:
     return ParameterSpace(
         Parameter(
-            name=f"p{k}", kind="body_mass", elements=("b",), unit="kg", nominal=0.0, low=-50.0, high=50.0,
+            name=f"p{k}",
+            kind="body_mass",
+            elements=("b",),
+            unit="kg",
+            nominal=0.0,
+            low=-50.0,
+            high=50.0,
             scale="linear",
         )
         for k in range(K)
-    )  # fmt: skip
+    )
 
 
 def _coverage(wild: float, windows: int, draws: int) -> tuple[float, float, float]:

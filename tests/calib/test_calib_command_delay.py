@@ -25,9 +25,15 @@ def space_with(*more: Parameter) -> ParameterSpace:
 
 
 DELAY = Parameter(
-    name="cart.delay", kind="command_delay", elements=("cart",), unit="s", nominal=0.002, low=0.0, high=0.02,
+    name="cart.delay",
+    kind="command_delay",
+    elements=("cart",),
+    unit="s",
+    nominal=0.002,
+    low=0.0,
+    high=0.02,
     scale="linear",
-)  # fmt: skip
+)
 
 
 def problem(space: ParameterSpace, latency_s: float | None, *, sensor: bool = False) -> Problem:
@@ -58,9 +64,16 @@ def test_delay_of_every_actuator_beside_a_searched_latency_is_refused() -> None:
 def test_known_noise_is_what_the_recording_is_weighed_by() -> None:
     """The cart's is given, the pole's estimated as without it."""
     known = Parameter(
-        name="cart.noise", kind="sensor_noise", elements=("cart",), unit="m", nominal=0.004, low=0.0,
-        high=1.0, scale="linear", known=True,
-    )  # fmt: skip
+        name="cart.noise",
+        kind="sensor_noise",
+        elements=("cart",),
+        unit="m",
+        nominal=0.004,
+        low=0.0,
+        high=1.0,
+        scale="linear",
+        known=True,
+    )
     plain, given = problem(space_with(), 0.0, sensor=True), problem(space_with(known), 0.0, sensor=True)
     assert given.noise_std[0] == given.noise.position_std[0] == 0.004
     assert plain.noise_std[0] < 0.001

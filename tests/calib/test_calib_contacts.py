@@ -68,9 +68,12 @@ def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Know
     real.model.dof_frictionloss[list(real.qvel)[2::3]] += 0.5
     whole = parameter_space().with_ratio(3.0)
     sensing = Sensing(
-        joint_std=DESCRIPTION.sensor.noise, joint_resolution=DESCRIPTION.sensor.resolution,
-        orientation_std=4e-3, gyro_std=0.02, feet=FEET,
-    )  # fmt: skip
+        joint_std=DESCRIPTION.sensor.noise,
+        joint_resolution=DESCRIPTION.sensor.resolution,
+        orientation_std=4e-3,
+        gyro_std=0.02,
+        feet=FEET,
+    )
     target = record_target(
         real, whole, whole.nominal, sway(robot, rng, 1.7), seconds=1.7, sensing=sensing, rng=rng
     )

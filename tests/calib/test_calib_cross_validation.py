@@ -109,9 +109,12 @@ def test_robust_refinement_shrugs_off_wild_samples(
     wild = noisy.fit.position.copy()
     wild[20::40, 0] += 1e-2
     spoilt = Problem(
-        noisy.robot, noisy.space, [dataclasses.replace(noisy.fit, position=wild)], threads=1,
+        noisy.robot,
+        noisy.space,
+        [dataclasses.replace(noisy.fit, position=wild)],
+        threads=1,
         fixed_latency_s=noisy.latency_s,
-    )  # fmt: skip
+    )
     # The noise is that of the clean recording: an outlier is what noise does not make.
     spoilt.noise, spoilt.starts = noisy_problem.noise, noisy_problem.starts
     shooting = Shooting(spoilt, noisy_refined.shooting.length)

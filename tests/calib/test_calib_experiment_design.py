@@ -59,18 +59,36 @@ def describe(folder: Path, actuation: str) -> RobotDescription:
     motor = '<motor name="slide" joint="slide" gear="1" ctrlrange="-1 1"/>'
     path.write_text(MJCF.replace("ACTUATOR", POSITION if servo else motor))
     return RobotDescription(
-        name="slide", joint_names=("slide",), actuated=("slide",), position_units=("m",),
-        default_position=(0.0,), stiffness=(STIFFNESS if servo else 0.0,), damping=(GAIN if servo else 0.0,),
-        effort_limit=(60.0 if servo else 1.0,), speed_limit=(math.inf,), control_rate_hz=50.0,
-        device_rate_hz=1000.0, state_rate_hz=200.0,
+        name="slide",
+        joint_names=("slide",),
+        actuated=("slide",),
+        position_units=("m",),
+        default_position=(0.0,),
+        stiffness=(STIFFNESS if servo else 0.0,),
+        damping=(GAIN if servo else 0.0,),
+        effort_limit=(60.0 if servo else 1.0,),
+        speed_limit=(math.inf,),
+        control_rate_hz=50.0,
+        device_rate_hz=1000.0,
+        state_rate_hz=200.0,
         limits=SafetyLimits(
-            target=((-0.5, 0.5) if servo else (-1.0, 1.0),), target_step=(2.0,), target_distance=(5.0,),
-            trip_position=((-3.0, 3.0),), trip_velocity=(20.0,), stiffness=(200.0,), damping=(20.0,),
-            effort=(60.0,), speed=(math.inf,), state_age_s=0.1, action_age_s=0.1, ease_in_s=0.0,
+            target=((-0.5, 0.5) if servo else (-1.0, 1.0),),
+            target_step=(2.0,),
+            target_distance=(5.0,),
+            trip_position=((-3.0, 3.0),),
+            trip_velocity=(20.0,),
+            stiffness=(200.0,),
+            damping=(20.0,),
+            effort=(60.0,),
+            speed=(math.inf,),
+            state_age_s=0.1,
+            action_age_s=0.1,
+            ease_in_s=0.0,
         ),
-        sensor=SensorModel(noise=(NOISE,), resolution=(0.0,), velocity_window_s=0.0), mjcf=path,
+        sensor=SensorModel(noise=(NOISE,), resolution=(0.0,), velocity_window_s=0.0),
+        mjcf=path,
         actuation=actuation,
-    )  # fmt: skip
+    )
 
 
 def space(*names: str) -> ParameterSpace:
@@ -245,10 +263,20 @@ def test_candidates_that_trip_are_discarded_and_counted(servo: RobotModel) -> No
 def test_a_trial_whose_gains_the_filter_lowers_is_discarded(servo: RobotModel) -> None:
     """12 N·s/m would brake a slide that is faster than 0.04 m/s with more than the 0.5 N allowed."""
     legs = LegLimits(
-        effort=(0.5,), tilt=1.0, tumble=6.0, free_fall=2.0, free_fall_s=0.1, flail_velocity=(9.0,),
-        flail_s=0.1, temperature=80.0, lost_rate=20.0, battery=0.2, battery_low=0.1, voltage=25.0,
+        effort=(0.5,),
+        tilt=1.0,
+        tumble=6.0,
+        free_fall=2.0,
+        free_fall_s=0.1,
+        flail_velocity=(9.0,),
+        flail_s=0.1,
+        temperature=80.0,
+        lost_rate=20.0,
+        battery=0.2,
+        battery_low=0.1,
+        voltage=25.0,
         command_age_s=0.1,
-    )  # fmt: skip
+    )
     limits = dataclasses.replace(servo.description.limits, legs=legs)
     legged = dataclasses.replace(servo, description=dataclasses.replace(servo.description, limits=limits))
     plan = make_plan(legged.description, ExcitationDesign(seconds=1.0, low_hz=1.0))
@@ -271,9 +299,14 @@ def test_robots_that_cannot_be_designed_for_are_refused(servo: RobotModel) -> No
     moving = dataclasses.replace(plan, digest=still.description.digest())
     with pytest.raises(CalibrationError, match="only 0 of 16 draws"):
         Experiment(
-            still, default_knowledge(space("mass")), 1.0, 2, np.random.default_rng(0),
-            rest=lambda: ExcitationBehaviour(moving, still.description), threads=1,
-        )  # fmt: skip
+            still,
+            default_knowledge(space("mass")),
+            1.0,
+            2,
+            np.random.default_rng(0),
+            rest=lambda: ExcitationBehaviour(moving, still.description),
+            threads=1,
+        )
 
 
 def result(parameters: ParameterSpace, std: FloatArray) -> CalibrationResult:
@@ -282,9 +315,15 @@ def result(parameters: ParameterSpace, std: FloatArray) -> CalibrationResult:
     interval = np.stack([parameters.from_scale(value + s * 1.645 * std) for s in (-1.0, 1.0)], axis=1)
     verdicts: tuple[Verdict, ...] = tuple("identifiable" if s < 0.15 else "weak" for s in std)
     return CalibrationResult(
-        method="x", space=parameters, estimate=parameters.nominal, interval=interval,
-        covariance=np.diag(std**2), verdicts=verdicts, latency_s=2e-3, latency_interval_s=(1e-3, 3e-3),
-    )  # fmt: skip
+        method="x",
+        space=parameters,
+        estimate=parameters.nominal,
+        interval=interval,
+        covariance=np.diag(std**2),
+        verdicts=verdicts,
+        latency_s=2e-3,
+        latency_interval_s=(1e-3, 3e-3),
+    )
 
 
 def test_advice_names_what_lowers_the_spread_most(servo: RobotModel) -> None:

@@ -37,9 +37,13 @@ def problem() -> Problem:
     trajectory = simulated_episode(DESCRIPTION, space, 2 * space.nominal, seconds=1.5, latency_ticks=0)
     episode = align(trajectory, DESCRIPTION)
     return Problem(
-        load_model(DESCRIPTION), space, [episode], threads=1, fixed_latency_s=0.0,
+        load_model(DESCRIPTION),
+        space,
+        [episode],
+        threads=1,
+        fixed_latency_s=0.0,
         policy=RecordedCommands.of(episode.target, 20),
-    )  # fmt: skip
+    )
 
 
 def members(problem: Problem) -> Members:
@@ -78,7 +82,7 @@ def test_trajectory_is_the_logarithm_of_the_mean_square(problem: Problem) -> Non
     """Scores are minus ln of the mean squared whitened innovation, whatever generation asks."""
     from deal_hw.calib.data.innovations import cut, whitened_residual
 
-    fitness = make_fitness("trajectory", problem, np.random.default_rng(0), FitnessSettings(horizon_ticks=5))
+    fitness = make_fitness("trajectory", problem, np.random.default_rng(0), FitnessSettings(window_ticks=5))
     centre = Members(problem.space.center[None], np.zeros(1))
     residual = whitened_residual(problem, members(problem), centre, cut(problem, 5))
     wanted = -np.log(np.mean(residual**2, axis=1))
@@ -139,6 +143,6 @@ def test_bad_names_and_settings_are_refused(problem: Problem) -> None:
     """Each error says what is known or allowed."""
     with pytest.raises(UnknownNameError, match="unknown fitness 'crtic'; known: critic, trajectory"):
         make_fitness("crtic", problem, np.random.default_rng(0))
-    for name, value in (("horizon_ticks", 0), ("replay_generations", 0), ("bandwidth", -1.0)):
+    for name, value in (("window_ticks", 0), ("replay_generations", 0), ("bandwidth", -1.0)):
         with pytest.raises(ConfigurationError, match=name):
             FitnessSettings(**{name: value})  # type: ignore[arg-type]

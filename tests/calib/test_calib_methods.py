@@ -67,9 +67,13 @@ def small_problem() -> Problem:
         speed_limit=fit.speed_limit[:steps],
     )
     return Problem(
-        d.robot, two_parameters()[0], [short], threads=1, fixed_latency_s=0.0,
+        d.robot,
+        two_parameters()[0],
+        [short],
+        threads=1,
+        fixed_latency_s=0.0,
         policy=RecordedCommands.of(short.target, 20),
-    )  # fmt: skip
+    )
 
 
 def case_of(name: str, budget: Budget, tolerance: float | None) -> MethodCase:

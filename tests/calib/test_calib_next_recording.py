@@ -27,10 +27,14 @@ def result(space: ParameterSpace, verdict: str, std: float = 0.3) -> Calibration
     """Return a result that is as wide as asked in each parameter."""
     K = len(space)
     return CalibrationResult(
-        method="fake", space=space, estimate=space.nominal, covariance=std**2 * np.eye(K),
-        interval=np.stack([space.low, space.high], axis=1), verdicts=(verdict,) * K,  # type: ignore[arg-type]
+        method="fake",
+        space=space,
+        estimate=space.nominal,
+        covariance=std**2 * np.eye(K),
+        interval=np.stack([space.low, space.high], axis=1),
+        verdicts=(verdict,) * K,  # type: ignore[arg-type]
         chi2=1.0,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +76,14 @@ def row(name: str, after: float, excitation: str, command: str = "--family steps
     sentence = f"record {excitation}: {name} goes from 60 % to {100 * after:.2g} %, which is still weak"
     if not excitation:
         sentence = f"{name} is open at 60 %"
-    return {"parameter": name, "std": 0.6, "std_after": after, "excitation": excitation,
-            "sentence": sentence, "command": command}  # fmt: skip
+    return {
+        "parameter": name,
+        "std": 0.6,
+        "std_after": after,
+        "excitation": excitation,
+        "sentence": sentence,
+        "command": command,
+    }
 
 
 def test_one_step_is_next_with_its_commands() -> None:
@@ -81,7 +91,7 @@ def test_one_step_is_next_with_its_commands() -> None:
     rows = [row("a", 0.3, "steps"), row("b", 0.2, "a chirp"), row("c", 0.5, "steps"), row("m", 0.6, "")]
     assert next_step(rows, "cartpole") == [
         "record a chirp: b goes from 60 % to 20 %",
-        "    deal-hw excite cartpole --family steps --out next.json",
+        "    deal-hw design-excitation cartpole --family steps --out next.json",
         "    deal-hw collect cartpole --excite next.json",
         "no recording helps with m: measure it by other means, then --known NAME VALUE",
     ]
@@ -93,8 +103,11 @@ def test_one_step_is_next_with_its_commands() -> None:
 
 
 def test_the_command_makes_the_recording_that_was_reckoned_with(tmp_path: Path) -> None:
-    """`deal-hw excite` with the options of each of the menu's designs writes that very plan."""
+    """`deal-hw design-excitation` with the options of each of the menu's designs writes that very plan."""
     for name, design in menu_designs(DESCRIPTION, balances=True).items():
         out = tmp_path / "next.json"
-        assert main(["excite", "cartpole", *options(design).split(), "--out", str(out), "--quiet"]) == 0
+        assert (
+            main(["design-excitation", "cartpole", *options(design).split(), "--out", str(out), "--quiet"])
+            == 0
+        )
         assert read_plan(out).words == name

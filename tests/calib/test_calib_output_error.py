@@ -82,7 +82,7 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=None)
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=None)
     work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1)
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
@@ -151,10 +151,21 @@ def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationRes
     """Every candidate has an error in each fold, a fit wins, and the truth lies in the intervals."""
     folds = result.provenance["cross_validation"]
     assert set(folds["errors"]) == {
-        "search", "short", "long", "long, wide prior", "long, robust", "long, no latency",
-        "mean of horizons", "mean of horizons, wide prior",
-        "0.4 s", "0.8 s", "1.2 s", "0.4 s, wide prior", "0.8 s, wide prior", "1.2 s, wide prior",
-    }  # fmt: skip
+        "search",
+        "short",
+        "long",
+        "long, wide prior",
+        "long, robust",
+        "long, no latency",
+        "mean of windows",
+        "mean of windows, wide prior",
+        "0.4 s",
+        "0.8 s",
+        "1.2 s",
+        "0.4 s, wide prior",
+        "0.8 s, wide prior",
+        "1.2 s, wide prior",
+    }
     assert all(len(errors) == 2 for errors in folds["errors"].values())
     assert folds["chosen"] != "long, no latency"
     assert result.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)

@@ -70,7 +70,7 @@ def checked(
         parameters=folder / "params.yaml",
         holdout_part=0.0,
     )
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), xi=None)
+    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=None)
     work = prepare_model(source, (), overrides, std=lambda robot: None, threads=1)
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = local_fit(problem, None)

@@ -230,9 +230,13 @@ def test_a_parameter_at_its_bound_is_reported() -> None:
     space = _two()
     residual = (np.random.default_rng(0).normal(size=(4, 50, 2)),)
     told = uncertainty(
-        space, np.array([1.0, 5.0]), 0.01,
-        Normal(1.0, 1, np.diag([1e4, 1e4, 1e8]), np.zeros(3), residual, np.zeros(3)), 1.0, (0.0, 0.04),
-    )  # fmt: skip
+        space,
+        np.array([1.0, 5.0]),
+        0.01,
+        Normal(1.0, 1, np.diag([1e4, 1e4, 1e8]), np.zeros(3), residual, np.zeros(3)),
+        1.0,
+        (0.0, 0.04),
+    )
     assert any("bound of the search range: b (5 kg)" in alarm.seen for alarm in told.alarms)
     assert told.verdicts == ("identifiable", "identifiable")
 

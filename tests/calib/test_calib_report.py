@@ -66,12 +66,18 @@ def inputs(found: CalibrationResult, channels: int = 2, samples: int = 200, name
     real = rng.normal(size=(samples, channels))
     overlays = tuple(
         Overlay(
-            title=f"{name} {heldout}", heldout=heldout, names=names, units=("rad",) * channels,
-            time_s=np.arange(samples, dtype=np.float64) * 0.01, real=real, nominal=real + 1,
-            calibrated=real, window_s=0.2,
+            title=f"{name} {heldout}",
+            heldout=heldout,
+            names=names,
+            units=("rad",) * channels,
+            time_s=np.arange(samples, dtype=np.float64) * 0.01,
+            real=real,
+            nominal=real + 1,
+            calibrated=real,
+            window_s=0.2,
         )
         for heldout in (False, True)
-    )  # fmt: skip
+    )
     whitened = rng.normal(size=(samples // 20, 20, channels))
     time = np.arange(samples, dtype=np.float64).reshape(-1, 20) * 0.01
     residuals = (Residuals(title=name, names=names, time_s=time, whitened=whitened),)
@@ -198,9 +204,15 @@ def test_what_the_data_cannot_tell_gets_no_value() -> None:
 def test_a_bare_result_makes_a_page_too() -> None:
     """Without covariance, population, verdicts, scan and recordings there are words in their place."""
     found = result(
-        space(), covariance=None, population=None, verdicts=(), trace=(), provenance={}, heldout_nrmse={},
+        space(),
+        covariance=None,
+        population=None,
+        verdicts=(),
+        trace=(),
+        provenance={},
+        heldout_nrmse={},
         chi2=float("nan"),
-    )  # fmt: skip
+    )
     text = render(ReportInputs(robot="r", result=found))
     assert (
         "No recording was given" in text
@@ -272,9 +284,14 @@ def recordings() -> tuple[RobotModel, CalibrationResult, list[Episode]]:
     ]
     K = len(searched)
     found = CalibrationResult(
-        method="truth", space=searched, estimate=truth, interval=np.stack([truth, truth], axis=1),
-        covariance=np.eye(K) * 1e-4, latency_s=0.007, latency_interval_s=(0.007, 0.007),
-    )  # fmt: skip
+        method="truth",
+        space=searched,
+        estimate=truth,
+        interval=np.stack([truth, truth], axis=1),
+        covariance=np.eye(K) * 1e-4,
+        latency_s=0.007,
+        latency_interval_s=(0.007, 0.007),
+    )
     return robot, found, episodes
 
 

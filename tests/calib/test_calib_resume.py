@@ -60,8 +60,11 @@ def check_same(a: CalibrationResult, b: CalibrationResult) -> None:
     np.testing.assert_array_equal(a.population, b.population)
     np.testing.assert_equal([dict(row) for row in a.trace], [dict(row) for row in b.trace])
     assert (a.latency_s, a.latency_interval_s, a.chi2, a.alarms) == (
-        b.latency_s, b.latency_interval_s, b.chi2, b.alarms,
-    )  # fmt: skip
+        b.latency_s,
+        b.latency_interval_s,
+        b.chi2,
+        b.alarms,
+    )
 
 
 @pytest.mark.parametrize("stop", [2, 5, 9])
@@ -163,7 +166,9 @@ def test_identity_changes_with_all_that_decides_the_numbers() -> None:
         identity(seed=1),
         run_identity(
             Problem(load_model(DESCRIPTION, 0.0005), problem.space, problem.episodes, threads=1),
-            Eki(), Budget(), rng(0),
+            Eki(),
+            Budget(),
+            rng(0),
         ),
-    ]  # fmt: skip
+    ]
     assert len(set(different)) == len(different)

@@ -48,10 +48,18 @@ def steps_of(robot: RobotModel, T: int = 200) -> Episode:
     rows = np.ones((steps, 1))
     square = 0.05 * np.sign(np.sin(2 * np.pi * np.arange(steps) / 250))[:, None]
     return Episode(
-        step_s=robot.step_s, sample=5 * np.arange(T), position=np.zeros((T, 1)), velocity=np.zeros((T, 1)),
-        target=square, stiffness=50 * rows, damping=rows, effort_limit=100 * rows, speed_limit=rows * np.inf,
-        usable=np.ones(T, dtype=bool), start_setpoint=np.zeros(1),
-    )  # fmt: skip
+        step_s=robot.step_s,
+        sample=5 * np.arange(T),
+        position=np.zeros((T, 1)),
+        velocity=np.zeros((T, 1)),
+        target=square,
+        stiffness=50 * rows,
+        damping=rows,
+        effort_limit=100 * rows,
+        speed_limit=rows * np.inf,
+        usable=np.ones(T, dtype=bool),
+        start_setpoint=np.zeros(1),
+    )
 
 
 def test_parameters_are_told_apart_by_what_they_change(robot: RobotModel) -> None:
@@ -60,10 +68,17 @@ def test_parameters_are_told_apart_by_what_they_change(robot: RobotModel) -> Non
         [
             Parameter.around("gain", "servo_stiffness", ("drive",), "N/m", 50.0),
             Parameter.around("friction", "dof_frictionloss", ("rail",), "N", 1e-6),
-            Parameter(name="limit", kind="servo_effort_limit", elements=("drive",), unit="N", nominal=100.0,
-                      low=50.0, high=200.0),
+            Parameter(
+                name="limit",
+                kind="servo_effort_limit",
+                elements=("drive",),
+                unit="N",
+                nominal=100.0,
+                low=50.0,
+                high=200.0,
+            ),
         ]
-    )  # fmt: skip
+    )
     found = look(Problem(robot, space, [steps_of(robot)], threads=1, known_std=STD))
     assert found.unseen == ("limit",) and found.faint == ("friction",)
     assert found.effect[0] > 10
@@ -137,12 +152,18 @@ def test_a_solver_that_stops_early_is_seen_by_what_jumps(solver: str, smooth: bo
     angle = -1.2 + 0.4 * np.sin(np.arange(steps) * 0.0025 * 3.0)[:, None] * [1.0, -1.0]
     found = np.concatenate([angle[:1], angle[3::4]])
     episode = Episode(
-        step_s=robot.step_s, sample=4 * np.arange(T), position=found,
+        step_s=robot.step_s,
+        sample=4 * np.arange(T),
+        position=found,
         velocity=np.gradient(found, 0.01, axis=0),
         target=angle + 0.2 * np.sign(np.cos(np.arange(steps) * 0.0025 * 3.0))[:, None] * [1.0, -1.0],
-        stiffness=20 * rows, damping=2 * rows, effort_limit=rows * np.inf, speed_limit=rows * np.inf,
-        usable=np.ones(T, dtype=bool), start_setpoint=np.full(2, -1.2),
-    )  # fmt: skip
+        stiffness=20 * rows,
+        damping=2 * rows,
+        effort_limit=rows * np.inf,
+        speed_limit=rows * np.inf,
+        usable=np.ones(T, dtype=bool),
+        start_setpoint=np.full(2, -1.2),
+    )
     space = ParameterSpace(
         [
             Parameter.around("rod", "tendon_frictionloss", ("rod",), "N", 15.0),

@@ -12,7 +12,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline import foretell
 from deal_hw.calib.uncertainty.intervals import uncertainty_at, with_rows
-from deal_hw.calib.validation.split_half import SplitHalf, check_split_half, half_of, widened_by_halves
+from deal_hw.calib.validation.split_half import SplitHalf, check_split_half, half_of, widened_by_split_half
 from deal_hw.calib.validation.verdict import Validation, judge
 from deal_hw.calibration import BEFORE_SEARCH, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
@@ -33,12 +33,12 @@ def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refin
 def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """No parameter is flagged, estimates lie inside their intervals, the JSON gives the rows back."""
     known = uncertainty_at(noisy_problem, noisy_refined, fixed_latency=True)
-    halves = check_split_half(noisy_problem, noisy_refined, known)
-    assert halves.flagged == () and halves.alarms(noisy_problem.space) == () and halves.steps > 0
-    assert [r.name for r in halves.rows] == list(noisy_problem.space.names)
-    assert all(r.first[1] <= r.first[0] <= r.first[2] for r in halves.rows)
-    assert set(halves.to_json()["parameters"]) == set(noisy_problem.space.names)
-    assert widened_by_halves(noisy_problem, known, noisy_refined.theta, halves) is known
+    split = check_split_half(noisy_problem, noisy_refined, known)
+    assert split.flagged == () and split.alarms(noisy_problem.space) == () and split.steps > 0
+    assert [r.name for r in split.rows] == list(noisy_problem.space.names)
+    assert all(r.first[1] <= r.first[0] <= r.first[2] for r in split.rows)
+    assert set(split.to_json()["parameters"]) == set(noisy_problem.space.names)
+    assert widened_by_split_half(noisy_problem, known, noisy_refined.theta, split) is known
 
 
 def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
@@ -52,7 +52,7 @@ def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(
     far = noisy_problem.space.from_scale(far + 10 * std * np.eye(len(noisy_problem.space))[k])[k]
     reach = np.zeros(len(noisy_problem.space))
     reach[k] = 10 * std
-    wide = widened_by_halves(
+    wide = widened_by_split_half(
         noisy_problem, known, noisy_refined.theta, SplitHalf((), ("servo.stiffness",), reach)
     )
     assert wide.interval[k, 1] == pytest.approx(far)
@@ -65,8 +65,8 @@ def test_too_few_windows_are_not_halved(noisy: Case, noisy_problem: Problem, noi
     few = dataclasses.replace(noisy.fit, usable=np.arange(len(noisy.fit.sample)) < 130)
     short = Problem(noisy.robot, noisy.space, [few], threads=1, fixed_latency_s=noisy.latency_s)
     found = refine(short, noisy.theta, noisy.latency_s, (0.2,), iterations=1, fixed_latency=True)
-    halves = check_split_half(short, found, uncertainty_at(short, found, fixed_latency=True))
-    assert halves.rows == () and "too few" in halves.note
+    split = check_split_half(short, found, uncertainty_at(short, found, fixed_latency=True))
+    assert split.rows == () and "too few" in split.note
 
 
 @pytest.mark.parametrize(("profile", "seed"), [("ideal", 0), ("sensor", 0), ("sensor", 2)])

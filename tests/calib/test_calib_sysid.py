@@ -128,9 +128,15 @@ def test_what_it_cannot_express_is_refused() -> None:
     """The error names the parameter and the kinds that are possible."""
     space, _, episode = recorded()
     bias = Parameter(
-        name="pole.bias", kind="encoder_bias", elements=("pole",), unit="rad", nominal=0.0,
-        low=-0.1, high=0.1, scale="linear",
-    )  # fmt: skip
+        name="pole.bias",
+        kind="encoder_bias",
+        elements=("pole",),
+        unit="rad",
+        nominal=0.0,
+        low=-0.1,
+        high=0.1,
+        scale="linear",
+    )
     wider = ParameterSpace([*space.parameters, bias])
     made = Problem(load_model(DESCRIPTION), wider, [episode], threads=1, fixed_latency_s=0.0)
     with pytest.raises(

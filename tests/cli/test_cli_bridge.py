@@ -74,11 +74,26 @@ def test_it_loads_neither_simulator_nor_learning(tmp_path: Path) -> None:
     domain = str(SystemRandom().randrange(10, 100))
     done = subprocess.run(
         [
-            sys.executable, "-c", SERVE, "bridge", "go2", "--port", "lo", "--domain", domain,
-            "--listen", "tcp/127.0.0.1:0", "--duration-s", "0.1",
+            sys.executable,
+            "-c",
+            SERVE,
+            "bridge",
+            "go2",
+            "--port",
+            "lo",
+            "--domain",
+            domain,
+            "--listen",
+            "tcp/127.0.0.1:0",
+            "--duration-s",
+            "0.1",
         ],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
     port, told = done.stdout.splitlines()
     assert port.startswith("port tcp/127.0.0.1:")
     assert "who moves the robot is not known, so it is not damped yet" in done.stderr

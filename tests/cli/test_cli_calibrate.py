@@ -44,9 +44,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def settings(folder: Path, **changes: object) -> Calibrate:
     """Settings of a short calibration of two parameters."""
     values: dict[str, object] = {
-        "dataset": folder, "free": ("cart.mass", "servo.stiffness"), "population": 30, "generations": 12,
+        "dataset": folder,
+        "free": ("cart.mass", "servo.stiffness"),
+        "population": 30,
+        "generations": 12,
         "quiet": True,
-    }  # fmt: skip
+    }
     return Calibrate(**{**values, **changes})  # type: ignore[arg-type]
 
 
@@ -102,8 +105,8 @@ def test_unknown_method_lists_the_methods(dataset: Path) -> None:
 
 def test_ratio_of_one_is_refused(dataset: Path) -> None:
     """The ratio must be above 1."""
-    with pytest.raises(ConfigurationError, match="--xi 1"):
-        calibrate(settings(dataset, xi=1.0))
+    with pytest.raises(ConfigurationError, match="--range-ratio 1"):
+        calibrate(settings(dataset, range_ratio=1.0))
 
 
 def test_robot_that_stood_still_is_refused(tmp_path: Path) -> None:

@@ -54,9 +54,25 @@ def test_open_parameters_come_with_advice(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A slow motion leaves the armature open: output, result and report say which motion would show it."""
-    words = ["calibrate", "--model", str(folder / "robot.xml"), "--data", str(folder / "rec.csv"),
-             "--parameters", str(folder / "params.yaml"), "--population", "16", "--generations", "6",
-             "--threads", "1", "--residual-std", "0.03", "--holdout-part", "0"]  # fmt: skip
+    words = [
+        "calibrate",
+        "--model",
+        str(folder / "robot.xml"),
+        "--data",
+        str(folder / "rec.csv"),
+        "--parameters",
+        str(folder / "params.yaml"),
+        "--population",
+        "16",
+        "--generations",
+        "6",
+        "--threads",
+        "1",
+        "--residual-std",
+        "0.03",
+        "--holdout-part",
+        "0",
+    ]
     assert main([*words, "--out", str(tmp_path)]) == EXIT_OK
     told = " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "calibration" / "result.json").read_text())

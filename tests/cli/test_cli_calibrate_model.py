@@ -334,13 +334,20 @@ def test_parameter_that_no_rollout_sees_is_refused(
     [
         ("<mujoco><worldbody><body/></mujoco>", "does not compile"),
         (ARM.replace('joint="elbow"', 'joint="shoulder"'), "servo_b, servo_a all drive joint 'shoulder'"),
-        (ARM.replace('<position name="servo_b" joint="elbow" kp="12" kv="0.1" forcerange="-20 20"/>', ""),
-         "no actuator of the model drives joint 'elbow'"),
-        (ARM.replace("<body name=\"upper\">", '<body name="upper"><freejoint name="base"/><geom size="0.1"/>'
-                     '</body><body>'), "floats"),
+        (
+            ARM.replace('<position name="servo_b" joint="elbow" kp="12" kv="0.1" forcerange="-20 20"/>', ""),
+            "no actuator of the model drives joint 'elbow'",
+        ),
+        (
+            ARM.replace(
+                '<body name="upper">',
+                '<body name="upper"><freejoint name="base"/><geom size="0.1"/></body><body>',
+            ),
+            "floats",
+        ),
         (ARM.replace('kp="12" kv="0.1"', 'kp="12" gear="3"', 1), "gear 3"),
     ],
-)  # fmt: skip
+)
 def test_bad_models_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, message: str
 ) -> None:
@@ -362,10 +369,23 @@ def test_wrong_sign_and_gain_show_under_gravity(
     (folder / "stiff.xml").write_text(text)
     params = tmp_path / "params.yaml"
     params.write_text("parameters: [{kind: servo_stiffness, elements: '*'}]\n")
-    for data, model, message in (("mirror.csv", "arm.xml", "hangs against gravity"),
-                                 ("rec.csv", "stiff.xml", "hangs as with a gain of about")):  # fmt: skip
-        words = command(folder, "--out", str(tmp_path / "out"), "--generations", "2", "--no-refine",
-                        "--no-report", "--parameters", str(params), data=data, model=model)  # fmt: skip
+    for data, model, message in (
+        ("mirror.csv", "arm.xml", "hangs against gravity"),
+        ("rec.csv", "stiff.xml", "hangs as with a gain of about"),
+    ):
+        words = command(
+            folder,
+            "--out",
+            str(tmp_path / "out"),
+            "--generations",
+            "2",
+            "--no-refine",
+            "--no-report",
+            "--parameters",
+            str(params),
+            data=data,
+            model=model,
+        )
         main(words)
         assert message in capsys.readouterr().err
 

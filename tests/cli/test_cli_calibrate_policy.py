@@ -31,9 +31,13 @@ def record(folder: Path, *changes: Mapping[str, Any]) -> Path:
         for change in changes:
             path = store.next_episode_path()
             metadata = {
-                "profile": plan.profile, "purpose": "collect", "robot": "cartpole",
-                "policy_digest": plan.policy_digest[:16], "velocity": plan.velocity, "stand": plan.stand,
-            }  # fmt: skip
+                "profile": plan.profile,
+                "purpose": "collect",
+                "robot": "cartpole",
+                "policy_digest": plan.policy_digest[:16],
+                "velocity": plan.velocity,
+                "stand": plan.stand,
+            }
             robot = VirtualCartpole(nominal_truth("ideal", 4))
             robot.run(make_behaviour(plan, DESCRIPTION), plan.seconds, path, {**metadata, **change})
             store.note_episode(path)
@@ -45,9 +49,16 @@ def record(folder: Path, *changes: Mapping[str, Any]) -> Path:
 def settings(folder: Path, **changes: Any) -> Calibrate:
     """A calibration by the paper's method that is over in two generations."""
     values: dict[str, Any] = {
-        "dataset": folder, "method": "deal-paper", "refine": False, "population": 6, "generations": 2,
-        "advise": False, "report": False, "quiet": True, "free": ("cart.mass", "servo.stiffness"),
-    }  # fmt: skip
+        "dataset": folder,
+        "method": "deal-paper",
+        "refine": False,
+        "population": 6,
+        "generations": 2,
+        "advise": False,
+        "report": False,
+        "quiet": True,
+        "free": ("cart.mass", "servo.stiffness"),
+    }
     return Calibrate(**{**values, **changes})
 
 

@@ -31,8 +31,8 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     assert summary["latency_s"]["found"] == pytest.approx(summary["latency_s"]["true"], abs=2.1e-3)
     assert summary["heldout_nrmse"]["calibrated"] < 0.5 * summary["heldout_nrmse"]["nominal"]
     assert set(summary["angle_error_rad"]) == set(summary["cart_speed_m_s"]) == {"udr", "retrained"}
-    assert {"period_p50", "period_p99", "period_max", "overruns"} <= set(summary["cadence"])
-    assert summary["cadence"]["period_p50"] == pytest.approx(0.02, abs=1e-3)
+    assert {"period_p50", "period_p99", "period_max", "overruns"} <= set(summary["loop_timing"])
+    assert summary["loop_timing"]["period_p50"] == pytest.approx(0.02, abs=1e-3)
     assert {"collect", "calibrate", "train", "inspect"} <= set(summary["seconds"])
     assert mujoco.MjModel.from_xml_path(summary["paths"]["mjcf"]).nq == 2
     assert OnnxPolicy(summary["paths"]["policy"]).spec.robot == "cartpole"
@@ -74,7 +74,7 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     ("config", "words"),
     [
         ({"robot": "go2", "firmware": "host"}, "--firmware would have no effect: only the demo of cartpole"),
-        ({"hung": True}, "--hung would have no effect: only the demo of go2"),
+        ({"on_stand": True}, "--on-stand would have no effect: only the demo of go2"),
     ],
 )
 def test_what_is_another_robots_is_refused(config: dict[str, Any], words: str) -> None:

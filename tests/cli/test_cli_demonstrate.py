@@ -18,8 +18,8 @@ from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode, demonstrate
+from deal_hw.control.excitation_level import ExcitationLevelSearch
 from deal_hw.control.loop import Outcome
-from deal_hw.control.vigor import VigorSearch
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
@@ -32,7 +32,7 @@ from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.shipped import shipped_policy
 
 
-def shown(truth: Truth) -> tuple[VirtualEpisode, VigorSearch]:
+def shown(truth: Truth) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
     """Return the demonstration of an emulated robot."""
     policy = str(shipped_policy("cartpole"))
     plan = RunPlan(robot="cartpole", profile="rich", policy=policy, seed=truth.seed)
@@ -42,27 +42,27 @@ def shown(truth: Truth) -> tuple[VirtualEpisode, VigorSearch]:
 def test_a_robot_that_moves_is_recorded_once() -> None:
     """The nominal one needs no second recording, and what is played is the profile itself."""
     run, search = shown(nominal_truth())
-    assert [a.vigor for a in search.attempts] == [0]
+    assert [a.level for a in search.attempts] == [0]
     assert run.report.outcome is Outcome.FINISHED
 
 
-def test_a_creeping_robot_is_recorded_again_livelier_and_then_moves() -> None:
+def test_a_creeping_robot_is_recorded_again_stronger_and_then_moves() -> None:
     """Strong damping, a slow set-point, a pole that stands in its own friction: one step up makes it fall."""
-    run, search = shown(draw_truth("ideal", 7, xi=20.0))
+    run, search = shown(draw_truth("ideal", 7, range_ratio=20.0))
     assert any("pole moved" in words for words in search.attempts[0].shortfalls)
-    assert search.attempts[search.best].enough and search.attempts[search.best].vigor > 0
+    assert search.attempts[search.best].enough and search.attempts[search.best].level > 0
     assert np.ptp(run.trajectory.position[:, 1]) > 1.0
 
 
 def test_a_robot_that_trips_is_recorded_again_gentler() -> None:
     """A stiff and light one reaches the end of its range at first."""
-    run, search = shown(draw_truth("ideal", 9, xi=20.0))
-    assert search.attempts[0].tripped and search.attempts[search.best].vigor < 0
+    run, search = shown(draw_truth("ideal", 9, range_ratio=20.0))
+    assert search.attempts[0].tripped and search.attempts[search.best].level < 0
     assert run.report.outcome is Outcome.FINISHED
 
 
 def test_a_stuck_robot_is_refused_without_any_noise_too() -> None:
-    """No vigor moves a pole that is held by more than its weight; the calibration says so, and what to do."""
+    """No level moves a pole that is held by more than its weight; the calibration says so, and what to do."""
     truth = nominal_truth()
     truth = dataclasses.replace(truth, parameters={**truth.parameters, "pole.frictionloss": 2.0})
     run, search = shown(truth)
@@ -83,11 +83,11 @@ def test_collect_records_again_what_hardly_moved(tmp_path: Path, capsys: pytest.
         report = collect(asked)
     assert [e.outcome for e in report.episodes] == [Outcome.FINISHED] * 2
     told = capsys.readouterr().err
-    assert "pole moved" in told and "recording again, livelier (vigor 1)" in told
-    assert "go on with --vigor 2" in told
+    assert "pole moved" in told and "recording again, stronger (excitation level 1)" in told
+    assert "go on with --excitation-level 2" in told
     dataset = Dataset.open(tmp_path / "dataset")
     metadata = [dataset.read(i).metadata for i in range(2)]
-    assert [(m["vigor"], m["attempt"], m["seed"]) for m in metadata] == [(0, 0, 0), (1, 1, 0)]
+    assert [(m["excitation_level"], m["attempt"], m["seed"]) for m in metadata] == [(0, 0, 0), (1, 1, 0)]
     assert choose_episodes(dataset, (), ()) == ((1,), ())
     assert "episodes [0] hardly moved" in capsys.readouterr().err
     assert choose_episodes(dataset, (0, 1), ()) == ((0, 1), ())
@@ -105,4 +105,4 @@ def test_a_row_is_flagged_where_a_parameter_is_given_no_value(monkeypatch: pytes
     monkeypatch.setattr(bench_loop, "calibrate_episodes", told)
     row, _ = bench_loop.calibration_row(case, "midpoint", Budget(refine=False), 1)
     assert row["untold"] == ["servo.effort_limit"] and row["flagged"] and not row["alarms"]
-    assert row["vigors"] == list(case.vigors)
+    assert row["excitation_levels"] == list(case.excitation_levels)

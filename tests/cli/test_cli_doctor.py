@@ -81,8 +81,10 @@ def test_what_is_refused_has_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[str]) -> None:
     """A wrong endpoint or interface is told like everything else, and the exit code says so."""
     for robot, transport, port in (
-        ("go2", "zenoh", "tcp/127.0.0.1:1"), ("go2", "dds", "nope0"), ("cartpole", "", "/dev/ttyNONE7"),
-    ):  # fmt: skip
+        ("go2", "zenoh", "tcp/127.0.0.1:1"),
+        ("go2", "dds", "nope0"),
+        ("cartpole", "", "/dev/ttyNONE7"),
+    ):
         report = doctor(Doctor(robot=robot, transport=transport, port=port))
         assert report.exit_code == 1
         assert levels(report.findings, "link") == {Level.FAIL}

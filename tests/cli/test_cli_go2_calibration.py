@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
-from deal_hw.cli.excite import Excite, excite
+from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import VirtualClock
 from deal_hw.control.excitation_limits import room
@@ -49,9 +49,13 @@ def record(device: Go2Device, dataset: Dataset, plan: RunPlan) -> None:
             return True
 
         loop = ControlLoop(
-            robot, make_behaviour(plan, DESCRIPTION), Safety(DESCRIPTION), clock, sink,
+            robot,
+            make_behaviour(plan, DESCRIPTION),
+            Safety(DESCRIPTION),
+            clock,
+            sink,
             LoopConfig(duration_s=plan.seconds),
-        )  # fmt: skip
+        )
         report = loop.run()
     assert report.outcome is Outcome.FINISHED, report.reason
     dataset.note_episode(path)
@@ -81,7 +85,7 @@ def dataset(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Dataset.create_or_open(folder, DESCRIPTION.to_json()) as store:
         for kind, seconds in (("multisine", 4.0), ("chirp", 2.4)):
             device = Go2Device(truth, on_stand=True, sport="")
-            plan = RunPlan(robot="go2_hung", profile="excite", excite=kind, seconds=seconds)
+            plan = RunPlan(robot="go2_on_stand", profile="excite", excite=kind, seconds=seconds)
             record(device, store, plan)
     return folder
 
@@ -90,9 +94,16 @@ def dataset(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def calibrated(dataset: Path) -> CalibrateReport:
     """Calibrate the hips."""
     config = Calibrate(
-        dataset=dataset, holdout=(1,), method="local", sample_hz=100.0, free=HIPS, threads=1, report=False,
-        advise=False, quiet=True,
-    )  # fmt: skip
+        dataset=dataset,
+        holdout=(1,),
+        method="local",
+        sample_hz=100.0,
+        free=HIPS,
+        threads=1,
+        report=False,
+        advise=False,
+        quiet=True,
+    )
     return calibrate(config)
 
 
@@ -124,7 +135,7 @@ def test_held_out_motion_is_predicted_four_times_better(calibrated: CalibrateRep
 
 def test_parameter_sets_of_the_suspended_robot() -> None:
     """Gains, friction and armature of each joint; encoder biases, shared values, knee friction on request."""
-    counts = {name: len(make()) for name, make in parameter_spaces("go2_hung").items()}
+    counts = {name: len(make()) for name, make in parameter_spaces("go2_on_stand").items()}
     assert counts == {"default": 48, "biased": 60, "shared": 12, "linkage": 56}
 
 
@@ -140,8 +151,13 @@ def leg_distance(joints: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
         body = model.body(model.geom_bodyid[geom]).name
         if body[:2] in of_leg:
             of_leg[body[:2]].append(geom)
-    pairs = [(a, b) for i, one in enumerate(LEGS) for other in LEGS[i + 1 :]
-             for a in of_leg[one] for b in of_leg[other]]  # fmt: skip
+    pairs = [
+        (a, b)
+        for i, one in enumerate(LEGS)
+        for other in LEGS[i + 1 :]
+        for a in of_leg[one]
+        for b in of_leg[other]
+    ]
     return float(min(mujoco.mj_geomDistance(model, data, a, b, 0.5, None) for a, b in pairs))
 
 
@@ -183,7 +199,9 @@ def test_a_range_of_the_wrong_length_is_refused() -> None:
 def test_swaying_is_planned_for_the_driven_robot_and_keeps_its_limits(tmp_path: Path) -> None:
     """The file fits the robot on the wire; feet would slip if joints were scaled one by one."""
     path = tmp_path / "sway.json"
-    excite(Excite(robot="go2", out=path, family="sway", seconds=3.0, high_hz=3.0, quiet=True))
+    design_excitation(
+        DesignExcitation(robot="go2", out=path, family="sway", seconds=3.0, high_hz=3.0, quiet=True)
+    )
     plan = read_plan(path)
     plan.check_fits(DRIVER)
     targets = np.array(DRIVER.default_position) + plan.offsets(np.arange(0.0, 3.0, 0.02))
@@ -196,13 +214,15 @@ def test_swaying_is_planned_for_the_driven_robot_and_keeps_its_limits(tmp_path: 
 def test_only_the_go2_sways(tmp_path: Path) -> None:
     """A suspended robot has no standing feet."""
     with pytest.raises(ConfigurationError, match="for go2, which stands"):
-        excite(Excite(robot="go2_hung", out=tmp_path / "x.json", family="sway", quiet=True))
+        design_excitation(
+            DesignExcitation(robot="go2_on_stand", out=tmp_path / "x.json", family="sway", quiet=True)
+        )
 
 
 def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
     """The robot's computer reads a table."""
     path = tmp_path / "sway.json"
-    excite(Excite(robot="go2", out=path, family="sway", seconds=1.0, quiet=True))
+    design_excitation(DesignExcitation(robot="go2", out=path, family="sway", seconds=1.0, quiet=True))
     code = (
         "import json, sys\n"
         "from deal_hw.cli.run_plan import RunPlan, make_behaviour\n"

@@ -36,8 +36,11 @@ def test_keys_are_private_and_certificates_fit(folder: Path) -> None:
     """Each key is 0600 in a folder of 0700; each certificate is accepted by the authority."""
     assert folder.stat().st_mode & 0o777 == 0o700
     assert {path.name for path in folder.glob("*.key")} == {
-        "ca.key", "robot.key", "controller.key", "observer.key",
-    }  # fmt: skip
+        "ca.key",
+        "robot.key",
+        "controller.key",
+        "observer.key",
+    }
     assert all(path.stat().st_mode & 0o777 == 0o600 for path in folder.glob("*.key"))
     for name in ("robot", "controller", "observer"):
         assert own_certificate_trouble(options(folder, name)) == (0, "")

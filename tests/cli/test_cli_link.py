@@ -17,7 +17,7 @@ from deal_hw.transport import WireOptions
 
 @pytest.mark.parametrize(
     ("robot", "transport", "stand"),
-    [("cartpole", "serial", False), ("go2", "dds", True), ("go2_hung", "dds", False)],
+    [("cartpole", "serial", False), ("go2", "dds", True), ("go2_on_stand", "dds", False)],
 )
 def test_defaults_follow_from_the_robot(robot: str, transport: str, stand: bool) -> None:
     """A robot on legs stands up first, unless it hangs in the air; each is reached its usual way."""
@@ -45,9 +45,16 @@ def test_what_is_given_wins() -> None:
         )
     )
     assert plan == RunPlan(
-        robot="go2", transport="zenoh", record_wire=False, wire=wire, stand=True, velocity="remote",
-        hand_back=True, posture=posture, robot_settings={"stop_buttons": "R2+A", "support_check": False},
-    )  # fmt: skip
+        robot="go2",
+        transport="zenoh",
+        record_wire=False,
+        wire=wire,
+        stand=True,
+        velocity="remote",
+        hand_back=True,
+        posture=posture,
+        robot_settings={"stop_buttons": "R2+A", "support_check": False},
+    )
 
 
 def test_a_robot_without_a_driver_is_refused() -> None:

@@ -50,8 +50,9 @@ ARM = """
   </actuator>
 </mujoco>
 """
-VELOCITY_ARM = ARM.replace('<position name="servo" joint="elbow" kp="12" kv="0.1"/>',
-                           '<velocity name="servo" joint="elbow" kv="2"/>')  # fmt: skip
+VELOCITY_ARM = ARM.replace(
+    '<position name="servo" joint="elbow" kp="12" kv="0.1"/>', '<velocity name="servo" joint="elbow" kv="2"/>'
+)
 MODEL = "calibrate --model arm.xml --out o --data"
 Lines = list[tuple[str, str]]
 
@@ -90,10 +91,15 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     other = {name.replace("elbow", "knee").replace("rail", "foot"): v for name, v in columns.items()}
     csv(folder / "other.csv", **other)
     np.savez(
-        folder / "base.npz", time=time_s, dof_pos=np.stack([columns["elbow_pos"], columns["rail_pos"]], 1),
-        target=np.stack([columns["elbow_cmd"], columns["rail_cmd"]], 1), quat=np.zeros((300, 3)),
-        gyro=np.zeros((300, 2)), short=np.zeros((299, 4)), nothing=np.full((300, 2), np.nan),
-    )  # fmt: skip
+        folder / "base.npz",
+        time=time_s,
+        dof_pos=np.stack([columns["elbow_pos"], columns["rail_pos"]], 1),
+        target=np.stack([columns["elbow_cmd"], columns["rail_cmd"]], 1),
+        quat=np.zeros((300, 3)),
+        gyro=np.zeros((300, 2)),
+        short=np.zeros((299, 4)),
+        nothing=np.full((300, 2), np.nan),
+    )
     (folder / "lerobot" / "meta").mkdir(parents=True)
     info = {"fps": 50, "features": {}, "codebase_version": "v3.0"}
     (folder / "lerobot" / "meta" / "info.json").write_text(json.dumps(info))
@@ -184,10 +190,13 @@ SETTINGS: Lines = [
     ("deploy go2 --port p --velocity 9,0,0", "x is 9.0, allowed: -1 to 1"),
     ("deploy go2 --port p --stop-buttons X+NOSUCH", "unknown button 'NOSUCH'; known: R1, L1"),
     ("replay run/dataset/episodes/000000.mcap --port p --robot go2", "the recording is of joints"),
-    ("excite cartpole --out o.json --low-hz 5 --high-hz 1", "--low-hz 5 must be below --high-hz 1"),
-    ("excite cartpole --out o.json --family multisine --low-hz 0.9 --high-hz 1", "widen the band"),
-    ("excite go2 --out o.json --family sway --high-hz 900", "which carry up to 25 Hz"),
-    ("excite go2 --out o.json", "robots on a stand (such as go2_suspended)"),
+    (
+        "design-excitation cartpole --out o.json --low-hz 5 --high-hz 1",
+        "--low-hz 5 must be below --high-hz 1",
+    ),
+    ("design-excitation cartpole --out o.json --family multisine --low-hz 0.9 --high-hz 1", "widen the band"),
+    ("design-excitation go2 --out o.json --family sway --high-hz 900", "which carry up to 25 Hz"),
+    ("design-excitation go2 --out o.json", "robots on a stand (such as go2_suspended)"),
     ("inspect run/dataset/episodes/000000.mcap --calibration empty.json --web", "not a calibration result"),
     ("inspect run/dataset/episodes/000000.mcap --save folder", "name a file, such as folder/episode.rrd"),
     ("train --distribution scale.json", "scale is 'cubic'"),
@@ -202,7 +211,7 @@ SETTINGS: Lines = [
     ("doctor go2", "name a robot and its port"),
     ("demo --out folder/../run", "does not hold a former demo; name another folder with --out"),
     ("emulate go2 --transport zenoh --port tcp/192.0.2.1:0 --duration-s 0", "port 'tcp/192.0.2.1:0': "),
-]  # fmt: skip
+]
 DATA: Lines = [
     ("data export blank --out o", "no recording to export"),
     ("data export run/dataset --out text.txt", "text.txt cannot be written: Not a directory"),

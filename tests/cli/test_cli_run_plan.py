@@ -23,17 +23,39 @@ from deal_hw.types import RobotState, Status
 SEGMENT = Segment(**{f.name: getattr(RichConfig().segments[0], f.name) for f in dataclasses.fields(Segment)})
 POSTURE = PostureConfig(fold_s=1.0, rise_s=2.0, settle_s=0.5, lie_s=1.5)
 FULL = RunPlan(
-    robot="go2", transport="zenoh", profile="rich", policy="p.onnx", recording="r.mcap", seconds=7.5, seed=3,
-    dry_run=True, home=False, policy_digest="ab12", trust_calibration=True,
-    rich=RichConfig(segments=(SEGMENT, SEGMENT)), vigor=1.5,
-    excite="multisine", port="tls/192.168.123.18:7447",
+    robot="go2",
+    transport="zenoh",
+    profile="rich",
+    policy="p.onnx",
+    recording="r.mcap",
+    seconds=7.5,
+    seed=3,
+    dry_run=True,
+    home=False,
+    policy_digest="ab12",
+    trust_calibration=True,
+    rich=RichConfig(segments=(SEGMENT, SEGMENT)),
+    excitation_level=1.5,
+    excite="multisine",
+    port="tls/192.168.123.18:7447",
     wire=WireOptions(
-        domain=4, listen=True, mode="peer", insecure=True, ca=Path("/etc/a.pem"), certificate=Path("b.pem"),
+        domain=4,
+        listen=True,
+        mode="peer",
+        insecure=True,
+        ca=Path("/etc/a.pem"),
+        certificate=Path("b.pem"),
         key=Path("c.pem"),
     ),
-    velocity="0.3,0,-0.1", stand=True, posture=POSTURE, robot_settings={"stop_buttons": "R2+A"},
-    hand_back=True, record_wire=False, realtime=False, passive_timeout_s=12.0,
-)  # fmt: skip
+    velocity="0.3,0,-0.1",
+    stand=True,
+    posture=POSTURE,
+    robot_settings={"stop_buttons": "R2+A"},
+    hand_back=True,
+    record_wire=False,
+    realtime=False,
+    passive_timeout_s=12.0,
+)
 
 
 @pytest.mark.parametrize("plan", [FULL, RunPlan(robot="cartpole")], ids=["full", "default"])

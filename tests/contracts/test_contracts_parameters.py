@@ -18,9 +18,14 @@ from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 def parameter(name: str, low: float = 0.1, high: float = 10.0, **changes: object) -> Parameter:
     """Return a parameter with nominal 1."""
     values: dict[str, object] = {
-        "name": name, "kind": "body_mass", "elements": ("cart",), "unit": "kg", "nominal": 1.0, "low": low,
+        "name": name,
+        "kind": "body_mass",
+        "elements": ("cart",),
+        "unit": "kg",
+        "nominal": 1.0,
+        "low": low,
         "high": high,
-    }  # fmt: skip
+    }
     return Parameter(**{**values, **changes})  # type: ignore[arg-type]
 
 
@@ -116,10 +121,16 @@ def test_distributions_draw_what_they_say() -> None:
 def test_result_there_and_back() -> None:
     """A result comes back from its JSON text; intervals make a distribution where no covariance is."""
     result = CalibrationResult(
-        method="eki", space=SPACE, estimate=np.array([2.0, 0.5]),
-        interval=np.array([[1.8, 2.2], [0.4, 0.6]]), verdicts=("identifiable", "weak"), latency_s=0.012,
-        latency_interval_s=(0.0115, 0.0125), alarms=(Alarm("x", "y", "z"),), heldout_nrmse={"nominal": 0.3},
-    )  # fmt: skip
+        method="eki",
+        space=SPACE,
+        estimate=np.array([2.0, 0.5]),
+        interval=np.array([[1.8, 2.2], [0.4, 0.6]]),
+        verdicts=("identifiable", "weak"),
+        latency_s=0.012,
+        latency_interval_s=(0.0115, 0.0125),
+        alarms=(Alarm("x", "y", "z"),),
+        heldout_nrmse={"nominal": 0.3},
+    )
     again = CalibrationResult.from_json(json.loads(json.dumps(result.to_json())))
     np.testing.assert_array_equal(again.interval, result.interval)
     assert (

@@ -63,21 +63,44 @@ BALL = "<mujoco><worldbody><body><joint name='j' type='ball'/><geom size='0.1'/>
 HINGE = BALL.replace("ball", "hinge")
 DIFFERENT = HINGE.replace("</body>", "</body><body><geom size='0.1'/></body>")
 CYCLE = CycleRecord(
-    cycle=7, deadline_ns=0, start_ns=0, states=(), action=None, asked=None, sent=None, sent_sequence=0,
-    sent_ns=0, state_age_ns=0, safety_state="", flags=0, events=(), wire=(), lost=0,
-)  # fmt: skip
+    cycle=7,
+    deadline_ns=0,
+    start_ns=0,
+    states=(),
+    action=None,
+    requested=None,
+    sent=None,
+    sent_sequence=0,
+    sent_ns=0,
+    state_age_ns=0,
+    safety_state="",
+    flags=0,
+    events=(),
+    wire=(),
+    lost=0,
+)
 
 
 def parameter(**changes: Any) -> Parameter:
     """Return a sound parameter with some fields changed."""
-    fields: dict[str, Any] = {"name": "a.b", "kind": "k", "elements": ("a",), "unit": "kg", "nominal": 1.0,
-                              "low": 0.5, "high": 2.0}  # fmt: skip
+    fields: dict[str, Any] = {
+        "name": "a.b",
+        "kind": "k",
+        "elements": ("a",),
+        "unit": "kg",
+        "nominal": 1.0,
+        "low": 0.5,
+        "high": 2.0,
+    }
     return Parameter(**{**fields, **changes})
 
 
 SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
-    (lambda: Sweep(amplitude=(1.0,), duration_s=1.0, low_hz=1.0, high_hz=2.0, arrangement="x"),  # type: ignore[arg-type]
-     UnknownNameError, "unknown arrangement 'x'; known: "),
+    (
+        lambda: Sweep(amplitude=(1.0,), duration_s=1.0, low_hz=1.0, high_hz=2.0, arrangement="x"),  # type: ignore[arg-type]
+        UnknownNameError,
+        "unknown arrangement 'x'; known: ",
+    ),
     (lambda: random_steps(np.ones(1), 1.0, (0.5, 0.1), RNG), ConfigurationError, "holds of 0.5 to 0.1 s"),
     (lambda: parameter(scale="cubic"), UnknownNameError, "unknown scale of parameter 'a.b' 'cubic'"),
     (lambda: object_of(3, "a table"), ConfigurationError, "a table was expected, got 3"),
@@ -88,20 +111,29 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: FaultRates(drop=2.0), ConfigurationError, "drop is a probability from 0 to 1, got 2"),
     (lambda: WireOptions(mode="router"), ConfigurationError, "wire mode 'router': peer or client"),
     (lambda: make_topic_transport("serial", "p", MonotonicClock()), UnknownNameError, "known: dds, zenoh"),
-    (lambda: make_transport("serial", "p", MonotonicClock(), WireOptions(domain=3, mode="peer")),
-     ConfigurationError, "--domain, --mode would have no effect: transport 'serial' is no network"),
+    (
+        lambda: make_transport("serial", "p", MonotonicClock(), WireOptions(domain=3, mode="peer")),
+        ConfigurationError,
+        "--domain, --mode would have no effect: transport 'serial' is no network",
+    ),
     (lambda: SportMode("moonwalk"), UnknownNameError, "unknown sport mode 'moonwalk'"),
     (lambda: draw_truth("nosuch", 0), UnknownNameError, "unknown profile 'nosuch'"),
-    (lambda: supervised.run_episodes(PLAN, port="p", dataset=None, episodes=0, purpose="x"),
-     ConfigurationError, "--episodes 0: at least 1"),
-    (lambda: train_policy("so101", udr_distribution("cartpole"), Path("p.onnx")),
-     UnknownNameError, "unknown robot with a training environment 'so101'; known: ant, cartpole, go2"),
+    (
+        lambda: supervised.run_episodes(PLAN, port="p", dataset=None, episodes=0, purpose="x"),
+        ConfigurationError,
+        "--episodes 0: at least 1",
+    ),
+    (
+        lambda: train_policy("so101", udr_distribution("cartpole"), Path("p.onnx")),
+        UnknownNameError,
+        "unknown robot with a training environment 'so101'; known: ant, cartpole, go2",
+    ),
     (lambda: make_behaviour(PLAN, DESCRIPTION), PolicyError, "give --policy FILE"),
     (lambda: EmulatorProcess("cartpole").pid, TransportError, "the emulator is not running"),
     (lambda: VirtualClock().advance_ns(-1), ValueError, "a monotonic clock cannot go back: delta_ns=-1"),
     (lambda: minimal_description([], "r", ("rad",), 50.0), ConfigurationError, "no recording to describe"),
     (lambda: encode(dataclasses.replace(CYCLE, cycle=2**70)), ConfigurationError, "does not fit the record"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("call", "kind", "words"), SETTINGS, ids=[words[:40] for *_, words in SETTINGS])
@@ -124,11 +156,16 @@ FILES: list[tuple[Callable[[Path], object], type[DealHwError], str]] = [
     (lambda p: SingleSimulation(p / "hinge.xml").set_body_mass("leg", 1.0), UnknownNameError, "'leg'; kn"),
     (lambda p: read_files(p / "wide.xml"), ConfigurationError, "wide.xml is in UTF-16; save it as UTF-8"),
     (lambda p: read_files(p / "no.xml"), ConfigurationError, "no.xml cannot be read: No such file"),
-    (lambda p: differences(mujoco.MjModel.from_xml_string(HINGE), mujoco.MjModel.from_xml_string(DIFFERENT)),
-     ConfigurationError, "the calibrated model has other elements than the file: "),
+    (
+        lambda p: differences(
+            mujoco.MjModel.from_xml_string(HINGE), mujoco.MjModel.from_xml_string(DIFFERENT)
+        ),
+        ConfigurationError,
+        "the calibrated model has other elements than the file: ",
+    ),
     (lambda p: load_recordings([p / "a.csv", p / "b.csv"]), DatasetError, "import them apart"),
     (lambda p: export_lerobot([], p / "out", "r", "t"), InsufficientDataError, "no recording to export"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("call", "kind", "words"), FILES, ids=[words[:40] for *_, words in FILES])
@@ -152,10 +189,19 @@ def test_a_file_that_cannot_be_is_refused(
 def test_samples_that_never_follow_each_other_are_no_recording() -> None:
     """Two samples in 1000 s, on the grid of another recording."""
     table = Table(
-        joint_names=("a",), actuated=("a",), units=("rad",), time_s=np.array([0.0, 500.0, 1000.0]),
-        position=np.zeros((3, 1)), velocity=None, effort=None, command_s=np.zeros(1), target=np.zeros((1, 1)),
-        orientation=None, gyro=None, source={"file": "rec.csv", "part": "", "kind": "csv", "sha256": ""},
-    )  # fmt: skip
+        joint_names=("a",),
+        actuated=("a",),
+        units=("rad",),
+        time_s=np.array([0.0, 500.0, 1000.0]),
+        position=np.zeros((3, 1)),
+        velocity=None,
+        effort=None,
+        command_s=np.zeros(1),
+        target=np.zeros((1, 1)),
+        orientation=None,
+        gyro=None,
+        source={"file": "rec.csv", "part": "", "kind": "csv", "sha256": ""},
+    )
     with pytest.raises(DatasetError, match=r"rec\.csv: no two samples follow within"):
         to_trajectories(table, period_s=0.01)
 

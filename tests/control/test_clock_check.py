@@ -28,11 +28,17 @@ def judged(
 @pytest.mark.parametrize(
     ("drift", "level"),
     [
-        (0.0, Level.OK), (1e-4, Level.OK), (-4e-4, Level.OK),
-        (3e-3, Level.WARN), (-3e-3, Level.WARN), (8e-3, Level.WARN),
-        (0.0955, Level.FAIL), (-0.02, Level.FAIL), (0.012, Level.FAIL),
+        (0.0, Level.OK),
+        (1e-4, Level.OK),
+        (-4e-4, Level.OK),
+        (3e-3, Level.WARN),
+        (-3e-3, Level.WARN),
+        (8e-3, Level.WARN),
+        (0.0955, Level.FAIL),
+        (-0.02, Level.FAIL),
+        (0.012, Level.FAIL),
     ],
-)  # fmt: skip
+)
 def test_drift_has_its_level_and_remedy(drift: float, level: Level) -> None:
     """Beyond 0.1 % a warning, beyond 1 % a failure; both say what to do."""
     found, remedy = judged(drift)

@@ -152,13 +152,25 @@ def recording(**changes: Any) -> Trajectory:
     """Return a recording of three commands at 50 Hz, sent with jitter, from 5 s on."""
     empty, column = np.empty(0), np.ones((3, 1))
     fields: dict[str, Any] = {
-        "joint_names": ("cart", "pole"), "actuated": ("cart",), "receive_s": empty, "device_s": empty,
-        "position": empty, "velocity": empty, "effort": empty, "status": empty, "command_sequence": empty,
-        "command_age_s": empty, "sent_s": np.array([5.0, 5.024, 5.036]), "sent_sequence": np.arange(3),
-        "asked_position": np.array([[0.1], [0.2], [0.3]]), "position_target": column * 0.0,
-        "stiffness": column * 70, "damping": column * 7, "effort_limit": column * 3,
+        "joint_names": ("cart", "pole"),
+        "actuated": ("cart",),
+        "receive_s": empty,
+        "device_s": empty,
+        "position": empty,
+        "velocity": empty,
+        "effort": empty,
+        "status": empty,
+        "command_sequence": empty,
+        "command_age_s": empty,
+        "sent_s": np.array([5.0, 5.024, 5.036]),
+        "sent_sequence": np.arange(3),
+        "requested_position": np.array([[0.1], [0.2], [0.3]]),
+        "position_target": column * 0.0,
+        "stiffness": column * 70,
+        "damping": column * 7,
+        "effort_limit": column * 3,
         "speed_limit": column * 0.9,
-    }  # fmt: skip
+    }
     return Trajectory(**{**fields, **changes})
 
 

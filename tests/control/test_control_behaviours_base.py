@@ -46,10 +46,18 @@ class Ear:
 def state(orientation: FloatArray, angular_velocity: FloatArray, offset: float = 0.0) -> RobotState:
     """Return the default pose, each joint off by so much, on a base that turns."""
     body = BodyState(
-        orientation=orientation, angular_velocity=angular_velocity, acceleration=np.array([0.0, 0.0, 9.81]),
-        foot_force=np.zeros(4), temperature=np.full(12, 30.0), lost=np.zeros(12, dtype=np.int64), battery=0.9,
-        voltage=30.0, current=1.0, sticks=np.zeros(4), buttons=0,
-    )  # fmt: skip
+        orientation=orientation,
+        angular_velocity=angular_velocity,
+        acceleration=np.array([0.0, 0.0, 9.81]),
+        foot_force=np.zeros(4),
+        temperature=np.full(12, 30.0),
+        lost=np.zeros(12, dtype=np.int64),
+        battery=0.9,
+        voltage=30.0,
+        current=1.0,
+        sticks=np.zeros(4),
+        buttons=0,
+    )
     position = np.array(DRIVER.default_position) + offset
     return RobotState(position, np.zeros(12), np.zeros(12), 0, 0, 0, -1, -1, Status.ARMED, body)
 

@@ -26,10 +26,15 @@ def record(folder: Path, seconds: float, *faults: str) -> tuple[EpisodeReport, T
     with EmulatorProcess("cartpole", "--transport", "dynamixel", *profile, *faults) as emulator:
         report = collect(
             Collect(
-                robot="cartpole", port=emulator.port + PATIENT, link=LINK, dataset=folder / "set",
-                profile="chirp", seconds=seconds, quiet=True,
+                robot="cartpole",
+                port=emulator.port + PATIENT,
+                link=LINK,
+                dataset=folder / "set",
+                profile="chirp",
+                seconds=seconds,
+                quiet=True,
             )
-        )  # fmt: skip
+        )
     return report.episodes[-1], Dataset.open(folder / "set").read(0).trajectory
 
 

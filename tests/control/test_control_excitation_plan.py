@@ -138,7 +138,7 @@ def test_plan_for_another_robot_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"made for robot 'cartpole'.*'so101'"):
         ExcitationBehaviour(plan, ARM)
     other = dataclasses.replace(DESCRIPTION, stiffness=(81.0,))
-    with pytest.raises(ConfigurationError, match="make another with `deal-hw excite`"):
+    with pytest.raises(ConfigurationError, match="make another with `deal-hw design-excitation`"):
         ExcitationBehaviour(plan, other)
     with pytest.raises(ConfigurationError, match="there is no policy"):
         ExcitationBehaviour(plan, DESCRIPTION)
@@ -147,10 +147,15 @@ def test_plan_for_another_robot_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"amplitude": 0.0}, {"amplitude": 1.1}, {"balance_s": 4.0}, {"split": 0.0},
-        {"effort": (1.0, 2.1)}, {"speed": (3.1, 1.0)}, {"effort": (0.0, 1.0)},
+        {"amplitude": 0.0},
+        {"amplitude": 1.1},
+        {"balance_s": 4.0},
+        {"split": 0.0},
+        {"effort": (1.0, 2.1)},
+        {"speed": (3.1, 1.0)},
+        {"effort": (0.0, 1.0)},
     ],
-)  # fmt: skip
+)
 def test_designs_outside_the_limits_are_refused(changes: dict[str, object]) -> None:
     """8 N and 3 m/s may be sent, twice and thrice the defaults."""
     with pytest.raises(ConfigurationError):
@@ -167,7 +172,7 @@ def test_unknown_family_and_broken_files_are_refused(tmp_path: Path) -> None:
     good = make_plan(DESCRIPTION, ExcitationDesign()).to_json()
     for broken, words in (
         ("[1]", "should be an object"),
-        ("{", "a file that `deal-hw excite`"),
+        ("{", "a file that `deal-hw design-excitation`"),
         (json.dumps({**good, "format": "x"}), "format is 'x'"),
         (json.dumps({k: v for k, v in good.items() if k != "wave"}), "field wave is missing"),
         (json.dumps({**good, "segments": [{"start": 1.0, "stop": 0.0}]}), "segment"),

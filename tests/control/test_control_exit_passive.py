@@ -402,9 +402,14 @@ class Hung:
     def run(self, **config: Any) -> LoopReport:
         """Hold the standing pose for half a second."""
         return ControlLoop(
-            self.robot, HoldBehaviour(ON_STAND), Safety(ON_STAND), self.clock, lambda record: True,
-            LoopConfig(duration_s=0.5, **config), progress=self.progress,
-        ).run()  # fmt: skip
+            self.robot,
+            HoldBehaviour(ON_STAND),
+            Safety(ON_STAND),
+            self.clock,
+            lambda record: True,
+            LoopConfig(duration_s=0.5, **config),
+            progress=self.progress,
+        ).run()
 
     @property
     def kinds(self) -> list[str]:

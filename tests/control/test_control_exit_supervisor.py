@@ -17,7 +17,7 @@ import pytest
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control import supervisor as module
-from deal_hw.control.handover import Beat
+from deal_hw.control.process_channel import Beat
 from deal_hw.control.realtime import SUPERVISOR_PRIORITY
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
@@ -45,7 +45,7 @@ def on_term(act):
 
 
 def stopped():
-    result(passive_confirmed=True, how="asked")
+    result(passive_confirmed=True, how="requested")
     os._exit(0)
 
 
@@ -67,9 +67,13 @@ class Run:
         self.beats: list[str] = []
         self._at = at
         self.supervisor = Supervisor(
-            module="deal_hw_obedient_child", plan={"do": do}, port_fd=None, passive=self._passive,
-            on_beat=self._on_beat, **settings,
-        )  # fmt: skip
+            module="deal_hw_obedient_child",
+            plan={"do": do},
+            port_fd=None,
+            passive=self._passive,
+            on_beat=self._on_beat,
+            **settings,
+        )
 
     def _passive(self, phase: str, in_vain: bool) -> bool:
         child = self.supervisor._child
@@ -187,7 +191,9 @@ def test_the_operators_signals_ask_once_and_are_named(number: signal.Signals, ca
     )
     end = run.end()
     assert signal.signal(number, before) is ours
-    assert end == ChildEnd({"passive_confirmed": True, "how": "asked"}, 0, "", cause, True, None, number.name)
+    assert end == ChildEnd(
+        {"passive_confirmed": True, "how": "requested"}, 0, "", cause, True, None, number.name
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTSTP])

@@ -15,7 +15,7 @@ import pytest
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.claim import LocalClaim
-from deal_hw.control.handover import HEARTBEAT, StatusReceiver, StatusSender, socket_pair
+from deal_hw.control.process_channel import HEARTBEAT, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.realtime import priority
 from deal_hw.control.vigil import SUPERVISOR_SILENCE_S, SupervisorVigil
 from deal_hw.errors import PortBusyError

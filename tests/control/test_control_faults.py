@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from deal_hw.install import install_line
+
 pytestmark = pytest.mark.slow
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
@@ -24,6 +26,7 @@ TYPICAL_S = {"connecting": 2.0, "taking over": 0.5}
 @pytest.fixture
 def measure() -> Iterator[Any]:
     """Return a function that runs one repetition of a row at a phase and returns what came of it."""
+    pytest.importorskip("torch", reason=install_line("calib"))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(TOOLS))
         table = importlib.import_module("fault_table")

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
-from deal_hw.control.handover import RUNNING
 from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _newest
 from deal_hw.control.passive import PassiveConfig
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
+from deal_hw.control.process_channel import RUNNING
 from deal_hw.control.safety import CycleInput, Safety, Verdict
 from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -114,9 +114,14 @@ class LegRig:
         whole = PostureBehaviour(behaviour or HoldBehaviour(DRIVER), DRIVER, HOLD_S, POSTURE)
         settings = LoopConfig(**{"duration_s": whole.duration_s, **config})
         return ControlLoop(
-            self.robot, whole, self.safety, self.clock, self.sink, settings,
+            self.robot,
+            whole,
+            self.safety,
+            self.clock,
+            self.sink,
+            settings,
             progress=lambda phase, silence_s: self.beats.append((phase, silence_s)),
-        )  # fmt: skip
+        )
 
     @property
     def commands(self) -> list[tuple[int, str, bytes]]:
@@ -174,8 +179,8 @@ def test_the_robot_stands_up_and_lies_down(stood: Stood) -> None:
     rig, report = stood
     assert (report.outcome, report.reason, report.error) == (Outcome.FINISHED, "the run is over", "")
     assert report.passive_confirmed
-    assert report.cycles_sent == report.cadence.cycles == 135
-    assert report.cadence.overruns == 0
+    assert report.cycles_sent == report.loop_timing.cycles == 135
+    assert report.loop_timing.overruns == 0
     run = rig.tap.heights[(rig.records[0].start_ns - 10**9) // MS : (rig.records[-1].start_ns - 10**9) // MS]
     assert max(run) > 0.25
     assert run[-1] < 0.15
@@ -209,8 +214,12 @@ def test_the_heartbeat_is_as_short_as_the_robot_asks_for(stood: Stood) -> None:
     assert DRIVER.limits.silence_s == 0.2
     assert {silence_s for phase, silence_s in stood[0].beats if phase == RUNNING} == {0.2}
     assert [phase for phase, _ in stood[0].beats if phase != RUNNING] == [
-        "connecting", "homing", "arming", "making passive", "handing back",
-    ]  # fmt: skip
+        "connecting",
+        "homing",
+        "arming",
+        "making passive",
+        "handing back",
+    ]
 
 
 def test_each_state_is_recorded_once_with_its_body(stood: Stood) -> None:
@@ -365,7 +374,7 @@ def test_a_dry_run_sends_nothing_at_all() -> None:
     assert rig.tap.heard == []
     assert "handing back" not in dict(rig.beats), "nothing was taken"
     assert rig.device.sport_name == "normal"
-    assert all(record.asked is not None and record.sent is None for record in rig.records[:-1])
+    assert all(record.requested is not None and record.sent is None for record in rig.records[:-1])
 
 
 def test_a_robot_that_hangs_needs_no_standing_up() -> None:

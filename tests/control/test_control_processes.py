@@ -25,8 +25,8 @@ from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.replay import Replay, replay
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import InterruptedRunError, run_episodes
-from deal_hw.control.handover import RUNNING, Beat
 from deal_hw.control.loop import Outcome
+from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.drivers.cartpole import protocol
@@ -153,7 +153,7 @@ def assert_whole(folder: Path, at_least: int = AT_BEAT - 5) -> None:
 
 
 def test_collect_records_a_whole_episode(emulator: Emulator, tmp_path: Path) -> None:
-    """Two episodes under one roof: cadence in the index, all commands in the file, a passive robot."""
+    """Two episodes under one roof: loop_timing in the index, all commands in the file, a passive robot."""
     report = collect(
         Collect(
             robot="cartpole",
@@ -168,7 +168,7 @@ def test_collect_records_a_whole_episode(emulator: Emulator, tmp_path: Path) -> 
     assert (report.outcome, report.exit_code, len(report.episodes)) == (Outcome.FINISHED, 0, 2)
     dataset = Dataset.open(tmp_path / "dataset")
     facts = [episode.facts for episode in dataset.episodes]
-    assert [f["cadence"]["cycles"] for f in facts] == [30, 30]
+    assert [f["loop_timing"]["cycles"] for f in facts] == [30, 30]
     assert dataset.read(0).trajectory.sent_sequence.tolist() == list(range(30))
     assert dataset.read(1).metadata["seed"] == 1
     assert Status.ARMED not in emulator.status()
@@ -180,7 +180,7 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     first = Dataset.open(tmp_path / "a")
     report = replay(Replay(episode=first.path(0), port=emulator.port, dataset=tmp_path / "b", quiet=True))
     assert report.outcome is Outcome.FINISHED
-    asked = [d.read(0).trajectory.asked_position for d in (first, Dataset.open(tmp_path / "b"))]
+    asked = [d.read(0).trajectory.requested_position for d in (first, Dataset.open(tmp_path / "b"))]
     assert asked[0].shape == (25, 1)
     assert (asked[0] == asked[1]).all()
 
@@ -228,9 +228,14 @@ def test_ctrl_c_in_every_other_phase_ends_passively(emulator: Emulator, tmp_path
     plan = RunPlan(robot="cartpole", profile="chirp", seconds=0.2 if phase == "making passive" else LONG)
     with pytest.raises(InterruptedRunError) as raised:
         run_episodes(
-            plan, port=emulator.port, dataset=tmp_path, episodes=1, purpose="collect", quiet=True,
+            plan,
+            port=emulator.port,
+            dataset=tmp_path,
+            episodes=1,
+            purpose="collect",
+            quiet=True,
             on_beat=on_beat,
-        )  # fmt: skip
+        )
     assert done
     assert raised.value.report.outcome is (Outcome.FINISHED if phase == "making passive" else Outcome.STOPPED)
     assert Status.ARMED not in emulator.status()

@@ -18,9 +18,9 @@ from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import run_episodes
-from deal_hw.control.handover import RUNNING, Beat
 from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
+from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError
@@ -29,9 +29,13 @@ from deal_hw.types import Status
 pytestmark = pytest.mark.slow
 
 PLAN = RunPlan(
-    robot="go2", transport="zenoh", profile="hold", seconds=1.0, stand=True,
+    robot="go2",
+    transport="zenoh",
+    profile="hold",
+    seconds=1.0,
+    stand=True,
     posture=PostureConfig(fold_s=0.4, rise_s=0.8, settle_s=0.2, lie_s=0.8),
-)  # fmt: skip
+)
 MOST_S = 60.0
 
 
@@ -54,9 +58,14 @@ class Rig:
                     act()
 
         return run_episodes(
-            PLAN, port=self.process.port, dataset=folder, episodes=1, purpose="collect", quiet=True,
+            PLAN,
+            port=self.process.port,
+            dataset=folder,
+            episodes=1,
+            purpose="collect",
+            quiet=True,
             on_beat=on_beat,
-        )  # fmt: skip
+        )
 
     def finish(self) -> dict[str, Any]:
         """End the emulator and return its report."""
@@ -70,9 +79,17 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     """A nominal Go2 on the floor, with ideal sensors, that anybody on this machine reaches over Zenoh."""
     truth = tmp_path / "truth.json"
     process = EmulatorProcess(
-        "go2", "--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--nominal", "--profile", "ideal",
-        "--reveal-to", str(truth),
-    )  # fmt: skip
+        "go2",
+        "--transport",
+        "zenoh",
+        "--port",
+        "tcp/127.0.0.1:0",
+        "--nominal",
+        "--profile",
+        "ideal",
+        "--reveal-to",
+        str(truth),
+    )
     with process:
         yield Rig(process, truth)
 

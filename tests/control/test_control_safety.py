@@ -50,9 +50,15 @@ def state(
 def command(target: float = 0.0, **changes: float) -> JointCommand:
     """Return a command with the description's gains, or others."""
     values = {
-        "position_target": target, "velocity_target": 0.0, "stiffness": 80.0, "damping": 8.0, "effort": 0.0,
-        "effort_limit": 4.0, "speed_limit": 1.0, **changes,
-    }  # fmt: skip
+        "position_target": target,
+        "velocity_target": 0.0,
+        "stiffness": 80.0,
+        "damping": 8.0,
+        "effort": 0.0,
+        "effort_limit": 4.0,
+        "speed_limit": 1.0,
+        **changes,
+    }
     return JointCommand(**{name: np.array([value]) for name, value in values.items()})
 
 
@@ -382,17 +388,17 @@ def test_a_device_that_disarms_itself_trips(armed: Safety) -> None:
     assert verdict.flags == ("device_disarmed",)
 
 
-def test_link_errors_trip_by_their_share_of_a_second() -> None:
+def test_transport_errors_trip_by_their_share_of_a_second() -> None:
     """Of 200 states/s, 60 errors within a second pass and 61 trip; older ones do not count."""
     safety = Safety(DESCRIPTION)
-    safety.arm(cycle(link_errors=1000))
-    assert safety.step(cycle(T0 + 500 * MS, link_errors=1060), command()).send
-    assert safety.step(cycle(T0 + 1600 * MS, link_errors=1120), command()).send
-    verdict = safety.step(cycle(T0 + 1700 * MS, link_errors=1122), command())
+    safety.arm(cycle(transport_errors=1000))
+    assert safety.step(cycle(T0 + 500 * MS, transport_errors=1060), command()).send
+    assert safety.step(cycle(T0 + 1600 * MS, transport_errors=1120), command()).send
+    verdict = safety.step(cycle(T0 + 1700 * MS, transport_errors=1122), command())
     assert verdict.flags == ()
-    verdict = safety.step(cycle(T0 + 2000 * MS, link_errors=1182), command())
-    assert verdict.flags == ("link_errors",)
-    assert "62 link errors in 1 s" in verdict.reason
+    verdict = safety.step(cycle(T0 + 2000 * MS, transport_errors=1182), command())
+    assert verdict.flags == ("transport_errors",)
+    assert "62 transport errors in 1 s" in verdict.reason
 
 
 def test_no_state_is_a_failure(safety: Safety) -> None:
@@ -443,8 +449,8 @@ def test_a_stop_gives_its_reason(armed: Safety) -> None:
 
 def test_settings_that_disable_a_check_are_refused() -> None:
     """A window of 0 would never trip."""
-    with pytest.raises(ValueError, match=r"link_window_s is 0.*above 0"):
-        SafetyConfig(link_window_s=0)
+    with pytest.raises(ValueError, match=r"transport_error_window_s is 0.*above 0"):
+        SafetyConfig(transport_error_window_s=0)
 
 
 def test_the_description_is_what_limits(armed: Safety) -> None:

@@ -23,10 +23,20 @@ S = 1_000_000_000
 ARMED = Status.ARMED | Status.HOMED
 T0 = 50 * S
 LEGS = LegLimits(
-    effort=(10.0,), tilt=0.8, tumble=6.0, free_fall=3.0, free_fall_s=2.0, flail_velocity=(4.0, 5.0),
-    flail_s=2.0, temperature=80.0, lost_rate=50.0, battery=0.3, battery_low=0.15, voltage=26.0,
+    effort=(10.0,),
+    tilt=0.8,
+    tumble=6.0,
+    free_fall=3.0,
+    free_fall_s=2.0,
+    flail_velocity=(4.0, 5.0),
+    flail_s=2.0,
+    temperature=80.0,
+    lost_rate=50.0,
+    battery=0.3,
+    battery_low=0.15,
+    voltage=26.0,
     command_age_s=2.0,
-)  # fmt: skip
+)
 
 
 def robot(**limits: Any) -> RobotDescription:
@@ -61,20 +71,34 @@ def state(
 def body(**changes: Any) -> BodyState:
     """Return the body of a robot that stands well, or not."""
     values: dict[str, Any] = {
-        "orientation": np.array([1.0, 0, 0, 0]), "angular_velocity": np.zeros(3),
-        "acceleration": np.array([0, 0, 9.81]), "foot_force": np.zeros(4), "temperature": np.full(2, 30.0),
-        "lost": np.zeros(2, dtype=np.int64), "battery": 0.8, "voltage": 29.5, "current": 1.0,
-        "sticks": np.zeros(4), "buttons": -1, **changes,
-    }  # fmt: skip
+        "orientation": np.array([1.0, 0, 0, 0]),
+        "angular_velocity": np.zeros(3),
+        "acceleration": np.array([0, 0, 9.81]),
+        "foot_force": np.zeros(4),
+        "temperature": np.full(2, 30.0),
+        "lost": np.zeros(2, dtype=np.int64),
+        "battery": 0.8,
+        "voltage": 29.5,
+        "current": 1.0,
+        "sticks": np.zeros(4),
+        "buttons": -1,
+        **changes,
+    }
     return BodyState(**values)
 
 
 def command(target: float = 0.0, **changes: float) -> JointCommand:
     """Return a command with the description's gains, or others."""
     values = {
-        "position_target": target, "velocity_target": 0.0, "stiffness": 80.0, "damping": 8.0, "effort": 0.0,
-        "effort_limit": 4.0, "speed_limit": 1.0, **changes,
-    }  # fmt: skip
+        "position_target": target,
+        "velocity_target": 0.0,
+        "stiffness": 80.0,
+        "damping": 8.0,
+        "effort": 0.0,
+        "effort_limit": 4.0,
+        "speed_limit": 1.0,
+        **changes,
+    }
     return JointCommand(**{name: np.array([value]) for name, value in values.items()})
 
 
@@ -148,9 +172,9 @@ def armed_with(description: RobotDescription, config: SafetyConfig | None = None
         ),
         ({"action_age_ns": 41 * MS}, "action_late", "the policy took 41.0 ms, at most 40 ms are allowed"),
         (
-            {"link_errors": 61},
-            "link_errors",
-            "61 link errors in 1 s: check cable and connectors",
+            {"transport_errors": 61},
+            "transport_errors",
+            "61 transport errors in 1 s: check cable and connectors",
         ),
     ],
 )
@@ -272,13 +296,13 @@ def test_easing_in_to_the_nanosecond(late: bool) -> None:
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_the_window_of_link_errors_to_the_nanosecond(late: bool) -> None:
+def test_the_window_of_transport_errors_to_the_nanosecond(late: bool) -> None:
     """0.3 x 200/s x 2 s = 120 are allowed in 2 s; the 121st counts until the first is older than 2 s."""
-    safety = armed_with(DESCRIPTION, SafetyConfig(link_window_s=2.0))
-    assert safety.step(cycle(T0 + S, link_errors=120), command()).send
+    safety = armed_with(DESCRIPTION, SafetyConfig(transport_error_window_s=2.0))
+    assert safety.step(cycle(T0 + S, transport_errors=120), command()).send
     now = T0 + 2 * S + late
-    verdict = safety.step(cycle(now, link_errors=121), command())
-    assert verdict.flags == (() if late else ("link_errors",))
+    verdict = safety.step(cycle(now, transport_errors=121), command())
+    assert verdict.flags == (() if late else ("transport_errors",))
 
 
 def test_faster_drift_than_any_clocks_becomes_age() -> None:
@@ -359,9 +383,14 @@ def test_after_easing_in_targets_pass_to_the_last_bit() -> None:
 def test_a_joint_at_its_limit_of_effort_stays_untouched_beside_one_beyond() -> None:
     """20 x 0.4 is 8.0 exactly, and 8.0 is allowed; the parts of the other may be small."""
     asked = JointCommand(
-        position_target=np.array([0.4, 0.04]), velocity_target=np.zeros(2), stiffness=np.full(2, 20.0),
-        damping=np.zeros(2), effort=np.array([0.0, 0.6]), effort_limit=np.ones(2), speed_limit=np.ones(2),
-    )  # fmt: skip
+        position_target=np.array([0.4, 0.04]),
+        velocity_target=np.zeros(2),
+        stiffness=np.full(2, 20.0),
+        damping=np.zeros(2),
+        effort=np.array([0.0, 0.6]),
+        effort_limit=np.ones(2),
+        speed_limit=np.ones(2),
+    )
     span = (np.full(2, -1.0), np.full(2, 1.0))
     made, _ = keep_effort(asked, np.zeros(2), np.zeros(2), np.array([8.0, 0.5]), span)
     assert made.position_target[0] == 0.4

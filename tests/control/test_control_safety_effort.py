@@ -22,9 +22,15 @@ LEGGED = dataclasses.replace(DESCRIPTION, limits=dataclasses.replace(DESCRIPTION
 def command(**changes: float | list[float]) -> JointCommand:
     """Return a command of no effort, or another."""
     values: dict[str, float | list[float]] = {
-        "position_target": 0.0, "velocity_target": 0.0, "stiffness": 0.0, "damping": 0.0, "effort": 0.0,
-        "effort_limit": 8.0, "speed_limit": 3.0, **changes,
-    }  # fmt: skip
+        "position_target": 0.0,
+        "velocity_target": 0.0,
+        "stiffness": 0.0,
+        "damping": 0.0,
+        "effort": 0.0,
+        "effort_limit": 8.0,
+        "speed_limit": 3.0,
+        **changes,
+    }
     return JointCommand(**{name: np.atleast_1d(np.asarray(value, float)) for name, value in values.items()})
 
 
@@ -35,15 +41,15 @@ def effort(made: JointCommand, position: FloatArray, velocity: FloatArray) -> Fl
 
 
 def keep(
-    asked: JointCommand, q: float, dq: float, most: float = 10.0, low: float = -9.0, high: float = 9.0
+    requested: JointCommand, q: float, dq: float, most: float = 10.0, low: float = -9.0, high: float = 9.0
 ) -> tuple[JointCommand, tuple[str, ...]]:
     """Limit the effort of one joint."""
     span = (np.array([low]), np.array([high]))
-    return keep_effort(asked, np.array([q]), np.array([dq]), np.array([most]), span)
+    return keep_effort(requested, np.array([q]), np.array([dq]), np.array([most]), span)
 
 
 @pytest.mark.parametrize(
-    ("asked", "q", "dq", "expected", "names"),
+    ("requested", "q", "dq", "expected", "names"),
     [
         # 20 (0.5 - 0) = 10 N·m is allowed, and so is -10.
         ({"stiffness": 20.0, "position_target": 0.5}, 0.0, 0.0, {}, ()),
@@ -138,10 +144,10 @@ def keep(
     ],
 )
 def test_effort_is_kept_by_hand_computed_amounts(
-    asked: dict[str, float], q: float, dq: float, expected: dict[str, float], names: tuple[str, ...]
+    requested: dict[str, float], q: float, dq: float, expected: dict[str, float], names: tuple[str, ...]
 ) -> None:
     """What pushes too far pays in the stated order; everything else stays exactly what it was."""
-    before = command(**asked)
+    before = command(**requested)
     after, clipped = keep(before, q, dq, low=-1.0, high=1.0)
     assert clipped == names
     for field in dataclasses.fields(JointCommand):
@@ -155,12 +161,17 @@ def test_effort_is_kept_by_hand_computed_amounts(
 
 def test_each_joint_pays_for_itself() -> None:
     """One joint over its limit does not change another, whatever their order."""
-    asked = command(
-        position_target=[0.9, 0.1, -0.9], stiffness=[20.0] * 3, damping=[1.0] * 3, velocity_target=[0.0] * 3,
-        effort=[0.0] * 3, effort_limit=[8.0] * 3, speed_limit=[3.0] * 3,
-    )  # fmt: skip
+    requested = command(
+        position_target=[0.9, 0.1, -0.9],
+        stiffness=[20.0] * 3,
+        damping=[1.0] * 3,
+        velocity_target=[0.0] * 3,
+        effort=[0.0] * 3,
+        effort_limit=[8.0] * 3,
+        speed_limit=[3.0] * 3,
+    )
     zeros, span = np.zeros(3), (np.full(3, -1.0), np.full(3, 1.0))
-    after, clipped = keep_effort(asked, zeros, zeros, np.array([10.0, 10.0, 8.0]), span)
+    after, clipped = keep_effort(requested, zeros, zeros, np.array([10.0, 10.0, 8.0]), span)
     np.testing.assert_allclose(after.position_target, [0.5, 0.1, -0.4], rtol=1e-8)
     assert after.position_target[1] == 0.1
     assert clipped == ("predicted_effort",)
@@ -169,13 +180,18 @@ def test_each_joint_pays_for_itself() -> None:
 def test_gains_of_any_joint_are_named() -> None:
     """One lowered gain among many is enough for its name."""
     for kp, kd, q, dq in (([20.0, 20.0], [0.0, 0.0], 2.0, 0.0), ([0.0, 0.0], [5.0, 5.0], 0.0, 4.0)):
-        asked = command(
-            position_target=[0.0, 0.0], stiffness=kp, damping=kd, velocity_target=[0.0] * 2,
-            effort=[0.0] * 2, effort_limit=[8.0] * 2, speed_limit=[3.0] * 2,
-        )  # fmt: skip
+        requested = command(
+            position_target=[0.0, 0.0],
+            stiffness=kp,
+            damping=kd,
+            velocity_target=[0.0] * 2,
+            effort=[0.0] * 2,
+            effort_limit=[8.0] * 2,
+            speed_limit=[3.0] * 2,
+        )
         span = (np.full(2, -1.0), np.full(2, 1.0))
         position, velocity = np.array([0.0, q]), np.array([0.0, dq])
-        assert keep_effort(asked, position, velocity, np.full(2, 10.0), span)[1] == (
+        assert keep_effort(requested, position, velocity, np.full(2, 10.0), span)[1] == (
             "predicted_effort",
             "gains",
         )
@@ -183,12 +199,17 @@ def test_gains_of_any_joint_are_named() -> None:
 
 def test_an_infinite_limit_changes_nothing() -> None:
     """A joint may be left without a limit beside one that has one."""
-    asked = command(
-        position_target=[0.9, 0.9], stiffness=[20.0] * 2, damping=[1.0] * 2, velocity_target=[0.0] * 2,
-        effort=[0.0] * 2, effort_limit=[8.0] * 2, speed_limit=[3.0] * 2,
-    )  # fmt: skip
+    requested = command(
+        position_target=[0.9, 0.9],
+        stiffness=[20.0] * 2,
+        damping=[1.0] * 2,
+        velocity_target=[0.0] * 2,
+        effort=[0.0] * 2,
+        effort_limit=[8.0] * 2,
+        speed_limit=[3.0] * 2,
+    )
     span = (np.full(2, -1.0), np.full(2, 1.0))
-    after, clipped = keep_effort(asked, np.zeros(2), np.zeros(2), np.array([math.inf, 10.0]), span)
+    after, clipped = keep_effort(requested, np.zeros(2), np.zeros(2), np.array([math.inf, 10.0]), span)
     np.testing.assert_allclose(after.position_target, [0.9, 0.5], rtol=1e-8)
     assert clipped == ("predicted_effort",)
 
@@ -218,34 +239,45 @@ def vector(part: st.SearchStrategy[float]) -> st.SearchStrategy[FloatArray]:
 
 
 @given(
-    target=vector(st.floats(-1.0, 1.0)), rate=vector(number), kp=vector(gain), kd=vector(gain),
-    push=vector(number), position=vector(st.floats(-3.0, 3.0)), velocity=vector(number),
+    target=vector(st.floats(-1.0, 1.0)),
+    rate=vector(number),
+    kp=vector(gain),
+    kd=vector(gain),
+    push=vector(number),
+    position=vector(st.floats(-3.0, 3.0)),
+    velocity=vector(number),
     most=vector(st.floats(0.5, 50.0)),
-)  # fmt: skip
+)
 @settings(deadline=None)
 def test_effort_never_exceeds_its_limit_and_nothing_changes_sign(
-    target: FloatArray, rate: FloatArray, kp: FloatArray, kd: FloatArray, push: FloatArray,
-    position: FloatArray, velocity: FloatArray, most: FloatArray,
-) -> None:  # fmt: skip
-    """Whatever is asked: effort and range hold, parts only shrink, and a good command passes untouched."""
+    target: FloatArray,
+    rate: FloatArray,
+    kp: FloatArray,
+    kd: FloatArray,
+    push: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    most: FloatArray,
+) -> None:
+    """Whatever comes: effort and range hold, parts only shrink, and a good command passes untouched."""
     ones = np.ones(SIZE)
-    asked = JointCommand(target, rate, kp, kd, push, ones, ones)
-    made, names = keep_effort(asked, position, velocity, most, (-ones, ones))
+    requested = JointCommand(target, rate, kp, kd, push, ones, ones)
+    made, names = keep_effort(requested, position, velocity, most, (-ones, ones))
     assert np.all(np.abs(effort(made, position, velocity)) <= most)
     assert np.all(np.abs(made.position_target) <= 1.0)
     assert np.all((0 <= made.stiffness) & (made.stiffness <= kp))
     assert np.all((0 <= made.damping) & (made.damping <= kd))
-    # The target stays between the measured position and what was asked, as far as the range allows.
+    # The target stays between the measured position and what was requested, as far as the range allows.
     inside = np.clip(position, -1.0, 1.0)
     low, high = np.minimum(inside, target), np.maximum(inside, target)
     assert np.all((low - 1e-12 <= made.position_target) & (made.position_target <= high + 1e-12))
     for before, after in ((rate, made.velocity_target), (push, made.effort)):
         assert np.all(after * before >= 0)
         assert np.all(np.abs(after) <= np.abs(before))
-    good = np.abs(effort(asked, position, velocity)) <= most
+    good = np.abs(effort(requested, position, velocity)) <= most
     assert bool(names) is not bool(good.all())
     for field in dataclasses.fields(JointCommand):
-        assert np.array_equal(getattr(made, field.name)[good], getattr(asked, field.name)[good])
+        assert np.array_equal(getattr(made, field.name)[good], getattr(requested, field.name)[good])
 
 
 # Inside the filter.
@@ -253,39 +285,44 @@ def test_effort_never_exceeds_its_limit_and_nothing_changes_sign(
 
 def test_the_filter_limits_effort_after_all_else() -> None:
     """Step and range cut the target to 0.25 first; 80 (0.25 - 0) - 8 x 0.5 = 16 N·m then leaves 0.175."""
-    asked = command(position_target=0.9, stiffness=80.0, damping=8.0)
-    made, clipped = SafetyFilter(LEGGED).clip(asked, np.zeros(1), np.zeros(1), np.array([0.5]))
+    requested = command(position_target=0.9, stiffness=80.0, damping=8.0)
+    made, clipped = SafetyFilter(LEGGED).clip(requested, np.zeros(1), np.zeros(1), np.array([0.5]))
     assert made.position_target[0] == pytest.approx(0.175, rel=1e-8)
     assert clipped == ("target_step", "target", "predicted_effort")
 
 
 def test_the_filter_keeps_target_and_effort_of_a_joint_outside_its_range() -> None:
     """At 0.5, outside -0.25..0.25: the target stays at 0.25 and kp goes down to 10 / 0.25 = 40."""
-    asked = command(position_target=0.0, stiffness=80.0)
-    made, clipped = SafetyFilter(LEGGED).clip(asked, np.zeros(1), np.array([0.5]), np.zeros(1))
+    requested = command(position_target=0.0, stiffness=80.0)
+    made, clipped = SafetyFilter(LEGGED).clip(requested, np.zeros(1), np.array([0.5]), np.zeros(1))
     assert made.position_target[0] == 0.25
     assert made.stiffness[0] == pytest.approx(40.0, rel=1e-8)
     assert clipped == ("predicted_effort", "gains")
-    made, clipped = SafetyFilter(LEGGED).clip(asked, np.zeros(1), np.array([-0.5]), np.zeros(1))
+    made, clipped = SafetyFilter(LEGGED).clip(requested, np.zeros(1), np.array([-0.5]), np.zeros(1))
     assert made.position_target[0] == -0.25
     assert made.stiffness[0] == pytest.approx(40.0, rel=1e-8)
 
 
 def test_robots_without_legs_know_no_predicted_effort() -> None:
     """The same command passes where the description says nothing of it."""
-    asked = command(position_target=0.25, stiffness=80.0)
-    made, clipped = SafetyFilter(DESCRIPTION).clip(asked, np.zeros(1), np.zeros(1), np.zeros(1))
+    requested = command(position_target=0.25, stiffness=80.0)
+    made, clipped = SafetyFilter(DESCRIPTION).clip(requested, np.zeros(1), np.zeros(1), np.zeros(1))
     assert (made.position_target[0], clipped) == (0.25, ())
 
 
 @pytest.mark.parametrize(
     ("limit", "value", "accepted"),
     [
-        (3.0, 3.0, True), (3.0, 4.0, True), (3.0, math.inf, False), (3.0, math.nan, False),
-        (math.inf, 3.0, True), (math.inf, math.inf, True), (math.inf, -math.inf, False),
+        (3.0, 3.0, True),
+        (3.0, 4.0, True),
+        (3.0, math.inf, False),
+        (3.0, math.nan, False),
+        (math.inf, 3.0, True),
+        (math.inf, math.inf, True),
+        (math.inf, -math.inf, False),
         (math.inf, math.nan, False),
     ],
-)  # fmt: skip
+)
 def test_a_speed_limit_may_be_infinite_where_the_robot_has_none(
     limit: float, value: float, accepted: bool
 ) -> None:

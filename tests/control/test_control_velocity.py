@@ -29,10 +29,18 @@ def state(sticks: tuple[float, float, float, float] | None = None) -> RobotState
     body = None
     if sticks is not None:
         body = BodyState(
-            orientation=np.array([1.0, 0, 0, 0]), angular_velocity=np.zeros(3), acceleration=np.zeros(3),
-            foot_force=np.zeros(4), temperature=np.zeros(1), lost=np.zeros(1, dtype=np.int64), battery=0.5,
-            voltage=28.0, current=1.0, sticks=np.array(sticks), buttons=0,
-        )  # fmt: skip
+            orientation=np.array([1.0, 0, 0, 0]),
+            angular_velocity=np.zeros(3),
+            acceleration=np.zeros(3),
+            foot_force=np.zeros(4),
+            temperature=np.zeros(1),
+            lost=np.zeros(1, dtype=np.int64),
+            battery=0.5,
+            voltage=28.0,
+            current=1.0,
+            sticks=np.array(sticks),
+            buttons=0,
+        )
     zeros = np.zeros(1)
     return RobotState(zeros, zeros, zeros, 0, 0, 0, -1, -1, Status.NONE, body)
 
@@ -74,12 +82,16 @@ def test_a_script_holds_each_line_until_the_next(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "first line"), ("t,x,y,yaw\n", "first line"), ("time_s,x,y,yaw\n", "no line"),
-        ("time_s,x,y,yaw\n0,1,0\n", "line 2"), ("time_s,x,y,yaw\n0,a,0,0\n", "line 2"),
-        ("time_s,x,y,yaw\n1,0,0,0\n1,0,0,0\n", "line 3"), ("time_s,x,y,yaw\n0,9,0,0\n", "line 2"),
+        ("", "first line"),
+        ("t,x,y,yaw\n", "first line"),
+        ("time_s,x,y,yaw\n", "no line"),
+        ("time_s,x,y,yaw\n0,1,0\n", "line 2"),
+        ("time_s,x,y,yaw\n0,a,0,0\n", "line 2"),
+        ("time_s,x,y,yaw\n1,0,0,0\n1,0,0,0\n", "line 3"),
+        ("time_s,x,y,yaw\n0,9,0,0\n", "line 2"),
         ("time_s,x,y,yaw\nnan,0,0,0\n", "line 2"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_script_names_its_line(tmp_path: Path, text: str, words: str) -> None:
     """The message says where the mistake is."""
     path = tmp_path / "walk.csv"

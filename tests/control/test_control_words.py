@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from deal_hw.control.handover import HEARTBEAT, Beat, StatusReceiver, StatusSender, socket_pair
+from deal_hw.control.process_channel import HEARTBEAT, Beat, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.supervisor import ChildEnd, Supervisor
 
 CHILD = """
@@ -16,7 +16,7 @@ import json, os, signal, socket, sys
 
 signal.alarm(20)  # Whoever says nothing to this process waits no longer.
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.handover import StatusSender
+from deal_hw.control.process_channel import StatusSender
 
 orders = json.load(sys.stdin)
 status = StatusSender(socket.socket(fileno=orders["status_fd"]))
@@ -87,9 +87,12 @@ class Run:
         self.passive_calls = 0
         self._told = False
         self.supervisor = Supervisor(
-            module="deal_hw_listening_child", plan={"robot": "none"}, port_fd=port_fd, passive=self._passive,
+            module="deal_hw_listening_child",
+            plan={"robot": "none"},
+            port_fd=port_fd,
+            passive=self._passive,
             on_beat=self._on_beat,
-        )  # fmt: skip
+        )
 
     def _passive(self, phase: str, in_vain: bool) -> bool:
         self.passive_calls += 1

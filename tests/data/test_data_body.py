@@ -52,9 +52,17 @@ def state(sample: int, with_body: bool = True) -> RobotState:
     joints = np.arange(12.0) + 1e-3 * sample
     stamp_ns = sample * (CYCLE_NS // STATES_EACH)
     return RobotState(
-        joints, -joints, 2 * joints, START_NS + stamp_ns + 400_000, stamp_ns, sample, -1, -1, Status.ARMED,
+        joints,
+        -joints,
+        2 * joints,
+        START_NS + stamp_ns + 400_000,
+        stamp_ns,
+        sample,
+        -1,
+        -1,
+        Status.ARMED,
         body(sample) if with_body else None,
-    )  # fmt: skip
+    )
 
 
 def cycle(number: int, with_body: bool = True) -> CycleRecord:
@@ -120,10 +128,18 @@ def test_the_body_comes_back_number_for_number(write: Callable[..., Path]) -> No
     assert_rows(got, np.arange(T))
     shapes = {field.name: getattr(got, field.name).shape for field in dataclasses.fields(BodyTrajectory)}
     assert shapes == {
-        "orientation": (T, 4), "angular_velocity": (T, 3), "acceleration": (T, 3), "foot_force": (T, 4),
-        "temperature": (T, 12), "lost": (T, 12), "battery": (T,), "voltage": (T,), "current": (T,),
-        "sticks": (T, 4), "buttons": (T,),
-    }  # fmt: skip
+        "orientation": (T, 4),
+        "angular_velocity": (T, 3),
+        "acceleration": (T, 3),
+        "foot_force": (T, 4),
+        "temperature": (T, 12),
+        "lost": (T, 12),
+        "battery": (T,),
+        "voltage": (T,),
+        "current": (T,),
+        "sticks": (T, 4),
+        "buttons": (T,),
+    }
     assert got.buttons.dtype == np.int64
 
 
@@ -188,8 +204,15 @@ def test_the_body_is_the_last_channel() -> None:
     """Repair names channels by their number: what was added later must not move those before."""
     topics = list(CHANNELS)
     assert topics[:8] == [
-        "/robot", "/state", "/command", "/command/asked", "/cycle", "/events", "/wire/rx", "/wire/tx",
-    ]  # fmt: skip
+        "/robot",
+        "/state",
+        "/command",
+        "/command/requested",
+        "/cycle",
+        "/events",
+        "/wire/rx",
+        "/wire/tx",
+    ]
     assert topics[8] == "/body"
 
 

@@ -117,7 +117,7 @@ def test_commands_that_never_arrive_fail(make_trajectory: MakeTrajectory) -> Non
     found = verdict(replace(sound, command_sequence=sound.command_sequence // 3 * 3), "commands")
     assert found.severity is Severity.FAIL
     assert "% of the commands were seen in force" in found.message
-    nothing = {name: getattr(sound, name)[:0] for name in ("sent_s", "sent_sequence", "asked_position")}
+    nothing = {name: getattr(sound, name)[:0] for name in ("sent_s", "sent_sequence", "requested_position")}
     nothing["position_target"] = sound.position_target[:0]
     assert verdict(replace(sound, **nothing), "commands").severity is Severity.WARN
 
@@ -129,12 +129,12 @@ def test_clamping_by_the_device_is_data_and_by_us_is_flagged(make_trajectory: Ma
     found = verdict(replace(sound, status=status), "clamped_by_device")
     assert found.severity is Severity.OK
     assert "effort 25.0%" in found.message
-    asked = sound.asked_position.copy()
+    asked = sound.requested_position.copy()
     asked[:20] += 0.2
-    found = verdict(replace(sound, asked_position=asked), "clamped_by_us")
+    found = verdict(replace(sound, requested_position=asked), "clamped_by_us")
     assert found.severity is Severity.WARN
     assert "changed 20 of 200 commands" in found.message
-    rounding = replace(sound, asked_position=sound.asked_position + 0.5e-6)
+    rounding = replace(sound, requested_position=sound.requested_position + 0.5e-6)
     assert verdict(rounding, "clamped_by_us").severity is Severity.OK
 
 

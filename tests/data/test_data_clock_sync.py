@@ -62,9 +62,25 @@ def test_truth_lies_within_the_uncertainty(
     empty = np.zeros((800, 1))
     commands = np.zeros((200, 1))
     trajectory = Trajectory(
-        ("cart",), ("cart",), receive_s, device_s, empty, empty, empty, np.zeros(800, dtype=np.int64),
-        in_force, age_s, sent_s, np.arange(200), commands, commands, commands, commands, commands, commands,
-    )  # fmt: skip
+        ("cart",),
+        ("cart",),
+        receive_s,
+        device_s,
+        empty,
+        empty,
+        empty,
+        np.zeros(800, dtype=np.int64),
+        in_force,
+        age_s,
+        sent_s,
+        np.arange(200),
+        commands,
+        commands,
+        commands,
+        commands,
+        commands,
+        commands,
+    )
     sync = synchronize(trajectory)
     assert sync.jumps == ()
     assert abs(sync.drift_ppm - drift_ppm) <= sync.drift_uncertainty_ppm + 1e-6

@@ -22,10 +22,19 @@ def table(position: FloatArray, command: FloatArray) -> Table:
     names = tuple(f"joint{i}" for i in range(position.shape[1]))
     time = np.arange(len(position), dtype=np.float64) * 0.02
     return Table(
-        joint_names=names, actuated=names, units=("rad",) * len(names), time_s=time, position=position,
-        velocity=None, effort=None, command_s=time, target=command, orientation=None, gyro=None,
+        joint_names=names,
+        actuated=names,
+        units=("rad",) * len(names),
+        time_s=time,
+        position=position,
+        velocity=None,
+        effort=None,
+        command_s=time,
+        target=command,
+        orientation=None,
+        gyro=None,
         source={"file": "r", "part": ""},
-    )  # fmt: skip
+    )
 
 
 def wish(seconds: float, seed: int) -> FloatArray:

@@ -392,9 +392,18 @@ def test_index_with_a_wrong_field_is_refused(tmp_path: Path, place: str, value: 
     index = tmp_path / "dataset.json"
     values = json.loads(index.read_text())
     episode = {
-        "file": "episodes/000000.mcap", "purpose": "", "policy_digest": "", "wall_utc": "", "duration_s": 0.0,
-        "states": 0, "commands": 0, "cycles": 0, "verdicts": [], "excitation": None, "clock": None,
-    }  # fmt: skip
+        "file": "episodes/000000.mcap",
+        "purpose": "",
+        "policy_digest": "",
+        "wall_utc": "",
+        "duration_s": 0.0,
+        "states": 0,
+        "commands": 0,
+        "cycles": 0,
+        "verdicts": [],
+        "excitation": None,
+        "clock": None,
+    }
     values[place] = [{**episode, **value}] if place == "episodes" and isinstance(value, dict) else value
     if place == "description":
         values["digest"] = digest_of(value)

@@ -22,6 +22,7 @@ from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.telemetry_checks import Severity, worst
 from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.install import install_line
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL = ROOT.parent / "shared" / "data" / "real"
@@ -199,7 +200,7 @@ def test_so101_converter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_go2_converter(tmp_path: Path) -> None:
     """The torch file's three arrays come through; another file is refused."""
-    import torch
+    torch = pytest.importorskip("torch", reason=install_line("calib"))
 
     convert = tool("convert_go2_suspended")
     q = np.arange(60.0).reshape(5, 12)

@@ -29,11 +29,20 @@ def robot(table: Table, rate_hz: float, per_sample: int) -> RobotDescription:
     """Return a description with the table's joints and a device rate that is a multiple of its rate."""
     A, J = len(table.actuated), len(table.joint_names)
     return dataclasses.replace(
-        DESCRIPTION, name="imported", joint_names=table.joint_names, actuated=table.actuated,
-        position_units=table.units, default_position=(0.0,) * J, stiffness=(20.0,) * A, damping=(1.5,) * A,
-        effort_limit=(9.0,) * A, speed_limit=(30.0,) * A, control_rate_hz=rate_hz, state_rate_hz=rate_hz,
+        DESCRIPTION,
+        name="imported",
+        joint_names=table.joint_names,
+        actuated=table.actuated,
+        position_units=table.units,
+        default_position=(0.0,) * J,
+        stiffness=(20.0,) * A,
+        damping=(1.5,) * A,
+        effort_limit=(9.0,) * A,
+        speed_limit=(30.0,) * A,
+        control_rate_hz=rate_hz,
+        state_rate_hz=rate_hz,
         device_rate_hz=rate_hz * per_sample,
-    )  # fmt: skip
+    )
 
 
 def jittered(table: Table, share: float, seed: int = 0) -> Table:
@@ -196,10 +205,19 @@ def test_any_clock_gives_consistent_trajectories(
     keep = np.array([i not in lost for i in range(400)])
     time_s = time_s[keep] - time_s[0]
     table = Table(
-        joint_names=("a",), actuated=("a",), units=("rad",), time_s=time_s, position=time_s[:, None],
-        velocity=None, effort=None, command_s=time_s, target=time_s[:, None], orientation=None, gyro=None,
+        joint_names=("a",),
+        actuated=("a",),
+        units=("rad",),
+        time_s=time_s,
+        position=time_s[:, None],
+        velocity=None,
+        effort=None,
+        command_s=time_s,
+        target=time_s[:, None],
+        orientation=None,
+        gyro=None,
         source={"file": "x", "part": ""},
-    )  # fmt: skip
+    )
     for part in to_trajectories(table):
         trajectory = part.trajectory
         index = trajectory.device_s / trajectory.metadata["import"]["period_s"]

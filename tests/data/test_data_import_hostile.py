@@ -91,8 +91,9 @@ def test_what_is_not_wanted_is_not_read(tmp_path: Path) -> None:
     found = read_npz(path)
     assert list(found.arrays) == ["time"]
     assert sorted(found.notes) == [
-        "picture is left out: uint8 (2, 2, 3)", "thing is left out: Python objects, which could run anything"
-    ]  # fmt: skip
+        "picture is left out: uint8 (2, 2, 3)",
+        "thing is left out: Python objects, which could run anything",
+    ]
 
 
 @pytest.mark.parametrize("mutation", range(60))
@@ -174,12 +175,19 @@ def bomb(levels: int) -> str:
 @pytest.mark.parametrize(
     "text",
     [
-        bomb(8), "a: &a [*a]", "[" * 4000, "a: " + "x" * 20_000, "a: " + ":".join(["1"] * 5000),
-        "x: &x {a: 1}\ny: {<<: [*x, *nothing]}", "a: !!python/object/apply:os.getcwd []", "- " * 3000, "\0",
+        bomb(8),
+        "a: &a [*a]",
+        "[" * 4000,
+        "a: " + "x" * 20_000,
+        "a: " + ":".join(["1"] * 5000),
+        "x: &x {a: 1}\ny: {<<: [*x, *nothing]}",
+        "a: !!python/object/apply:os.getcwd []",
+        "- " * 3000,
+        "\0",
         "a: ]",
     ],
     ids=range(10),
-)  # fmt: skip
+)
 def test_hostile_yaml_is_one_short_line(tmp_path: Path, text: str) -> None:
     """An alias bomb printed 312 MB; deep, endless and executable YAML are refused alike."""
     path = tmp_path / "columns.yaml"
@@ -258,9 +266,16 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
 
 @pytest.mark.parametrize(
     "error",
-    [KeyError("a"), RecursionError(), MemoryError(), ValueError("two\nlines"), OverflowError("x" * 5000),
-     UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"), NotImplementedError()],
-)  # fmt: skip
+    [
+        KeyError("a"),
+        RecursionError(),
+        MemoryError(),
+        ValueError("two\nlines"),
+        OverflowError("x" * 5000),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"),
+        NotImplementedError(),
+    ],
+)
 def test_whatever_a_parser_raises_is_one_line(error: Exception) -> None:
     """The file, what it should be, what is wrong, what to do; the cause stays for --traceback."""
     with pytest.raises(DatasetError, match=r"^f cannot be read as JSON: .+; write another$") as caught:

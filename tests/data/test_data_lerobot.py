@@ -34,12 +34,19 @@ def some_table(samples: int, joints: int, actuated: int, rate_hz: float, seed: i
     time_s = np.arange(samples) / rate_hz
     names = tuple(f"joint_{i}" for i in range(joints))
     return Table(
-        joint_names=names, actuated=names[:actuated], units=("rad",) * joints, time_s=time_s,
+        joint_names=names,
+        actuated=names[:actuated],
+        units=("rad",) * joints,
+        time_s=time_s,
         position=rng.integers(-999, 999, (samples, joints)) / 256.0,
-        velocity=rng.integers(-999, 999, (samples, joints)) / 256.0, effort=None, command_s=time_s,
-        target=rng.integers(-999, 999, (samples, actuated)) / 256.0, orientation=None, gyro=None,
+        velocity=rng.integers(-999, 999, (samples, joints)) / 256.0,
+        effort=None,
+        command_s=time_s,
+        target=rng.integers(-999, 999, (samples, actuated)) / 256.0,
+        orientation=None,
+        gyro=None,
         source={"file": "x", "part": ""},
-    )  # fmt: skip
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -98,8 +105,9 @@ def test_layout(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
     assert file.num_row_groups == 2
     episodes = pq.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [(e["dataset_from_index"], e["dataset_to_index"], e["length"]) for e in episodes] == [
-        (0, 799, 799), (799, 1598, 799),
-    ]  # fmt: skip
+        (0, 799, 799),
+        (799, 1598, 799),
+    ]
     assert episodes[1]["tasks"] == ["swing up"] and episodes[1]["data/file_index"] == 0
     stats = json.loads((tmp_path / "out/meta/stats.json").read_text())
     position = make_trajectory().position[1:].astype(np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 import sys
 from collections.abc import Callable
 
@@ -18,6 +19,7 @@ from deal_hw.data.checks.plausibility import examine, require
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.telemetry_checks import Severity, Verdict, worst
 from deal_hw.errors import DatasetError, MissingExtraError
+from deal_hw.install import install_line
 
 MakeTable = Callable[..., Table]
 LIMITS = np.array([[-1.0, 1.0]] * 3)
@@ -271,5 +273,5 @@ def test_best_assignment_is_the_best(score: np.ndarray) -> None:
 def test_without_scipy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, make_table: MakeTable) -> None:
     """The base install has no scipy; importing recordings of others needs it, and says what to install."""
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(MissingExtraError, match=r"scipy is not installed.*deal-hw\[sim\]"):
+    with pytest.raises(MissingExtraError, match="scipy is not installed.*" + re.escape(install_line("sim"))):
         examine(make_table())

@@ -58,7 +58,7 @@ def records(draw: st.DrawFn) -> CycleRecord:
         start_ns=draw(INT64),
         states=tuple(draw(st.lists(state, max_size=4))),
         action=draw(st.none() | st.integers(0, 4).flatmap(arrays)),
-        asked=draw(st.none() | command),
+        requested=draw(st.none() | command),
         sent=draw(st.none() | command),
         sent_sequence=draw(INT64),
         sent_ns=draw(INT64),

@@ -53,7 +53,7 @@ def test_commands_asked_and_sent_come_back(write_episode: WriteEpisode) -> None:
     number = np.arange(CYCLES)
     np.testing.assert_array_equal(trajectory.sent_sequence, number)
     np.testing.assert_allclose(trajectory.sent_s, 0.02 * number + 0.019 - 0.0004, atol=1e-12)
-    np.testing.assert_array_equal(trajectory.asked_position[:, 0], 0.1 + 1e-3 * number)
+    np.testing.assert_array_equal(trajectory.requested_position[:, 0], 0.1 + 1e-3 * number)
     np.testing.assert_array_equal(trajectory.position_target[:, 0], 0.09 + 1e-3 * number)
     for name, value in (("stiffness", 80), ("damping", 8), ("effort_limit", 4), ("speed_limit", 1)):
         np.testing.assert_array_equal(getattr(trajectory, name), np.full((CYCLES, 1), value), err_msg=name)
@@ -115,12 +115,12 @@ def test_dry_run_has_asked_but_no_sent(tmp_path: Path, make_cycle: MakeCycle) ->
     """Where nothing was sent, the trajectory has no command and the cycles keep what was asked."""
     path = tmp_path / "dry.mcap"
     record = make_cycle(0)
-    dry = CycleRecord(0, 0, 0, states=record.states, asked=record.asked)
+    dry = CycleRecord(0, 0, 0, states=record.states, requested=record.requested)
     with EpisodeRecorder(path, DESCRIPTION.to_json(), {}, VirtualClock()) as recorder:
         recorder.write(dry)
     episode = read_episode(path)
     assert episode.trajectory.position_target.shape == (0, 1)
-    np.testing.assert_array_equal(episode.cycles.asked_position, [[0.1]])
+    np.testing.assert_array_equal(episode.cycles.requested_position, [[0.1]])
 
 
 def test_chunks_close_every_50_ms(write_episode: WriteEpisode) -> None:

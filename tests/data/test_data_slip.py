@@ -121,9 +121,16 @@ def real(name: str) -> Recording:
 
 @pytest.mark.parametrize(
     "name",
-    ["go2_suspended/train.npz", "so101/multisine.npz", "so101/prbs_excitation.npz", "so101/step_response.npz",
-     "so101/friction_gravity.npz", "so101/slow_precision.npz", "so101/random_waypoints.npz"],
-)  # fmt: skip
+    [
+        "go2_suspended/train.npz",
+        "so101/multisine.npz",
+        "so101/prbs_excitation.npz",
+        "so101/step_response.npz",
+        "so101/friction_gravity.npz",
+        "so101/slow_precision.npz",
+        "so101/random_waypoints.npz",
+    ],
+)
 def test_real_recordings_are_clean(name: str) -> None:
     """The suspended Go2 and motions of an SO-101, some with contacts, are not accused."""
     recording = real(name)

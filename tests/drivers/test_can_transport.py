@@ -271,14 +271,14 @@ def test_a_kernel_without_can_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 # The adapters that python-can drives.
 
 
-class ScriptedBus(can.BusABC):
+class FakeBus(can.BusABC):
     """A bus that gives what the test put in, frames or errors."""
 
     def __init__(self, script: list[can.Message | Exception]) -> None:
         self.script = script
         self.sent: list[can.Message] = []
         self.refuse: Exception | None = None
-        super().__init__(channel="scripted")
+        super().__init__(channel="fake")
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Keep the frame, or raise what the test wants."""
@@ -297,14 +297,14 @@ class ScriptedBus(can.BusABC):
 
 
 @pytest.fixture
-def scripted(
+def fake(
     monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[Callable[..., tuple[PythonCanTransport, ScriptedBus]]]:
+) -> Iterator[Callable[..., tuple[PythonCanTransport, FakeBus]]]:
     """Return a function that makes an open transport over a bus with a script."""
     opened: list[PythonCanTransport] = []
 
-    def make(*script: can.Message | Exception, wall_ns: int = 0) -> tuple[PythonCanTransport, ScriptedBus]:
-        bus = ScriptedBus(list(script))
+    def make(*script: can.Message | Exception, wall_ns: int = 0) -> tuple[PythonCanTransport, FakeBus]:
+        bus = FakeBus(list(script))
         monkeypatch.setattr(can, "Bus", lambda **kwargs: bus)
         monkeypatch.setattr(can_transport, "check_link", lambda channel: None)
         clock = VirtualClock(5 * SECOND_NS)
@@ -340,44 +340,44 @@ def error_frame(kind: int, controller: int = 0) -> can.Message:
 
 
 def test_adapter_stamps_become_ours_by_their_age(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]],
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]],
 ) -> None:
     """Wall 100 s, adapter 99.75 s: received 250 ms ago, so at 4.75 s of our clock, which stands at 5 s."""
-    transport, _ = scripted(frame(stamp_s=99.75), wall_ns=100 * SECOND_NS)
+    transport, _ = fake(frame(stamp_s=99.75), wall_ns=100 * SECOND_NS)
     assert transport.receive(0.0).stamp_ns == 4_750_000_000
 
 
 @pytest.mark.parametrize("stamp_s", [98.9, 100.1, 0.0])
 def test_stamps_that_cannot_be_are_replaced(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]], stamp_s: float
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]], stamp_s: float
 ) -> None:
     """Too old, of the future, or counted from power-on: the time of reading."""
-    transport, _ = scripted(frame(stamp_s=stamp_s), wall_ns=100 * SECOND_NS)
+    transport, _ = fake(frame(stamp_s=stamp_s), wall_ns=100 * SECOND_NS)
     assert transport.receive(0.0).stamp_ns == 5 * SECOND_NS
 
 
 def test_stamps_of_an_adapter_do_not_go_back(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]],
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]],
 ) -> None:
     """A wall clock that was set between two frames changes no order."""
-    transport, _ = scripted(frame(stamp_s=99.9), frame(stamp_s=99.5), wall_ns=100 * SECOND_NS)
+    transport, _ = fake(frame(stamp_s=99.9), frame(stamp_s=99.5), wall_ns=100 * SECOND_NS)
     assert transport.receive(0.0).stamp_ns == transport.receive(0.0).stamp_ns == 4_900_000_000
 
 
 def test_extended_remote_and_fd_frames_are_foreign(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]],
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]],
 ) -> None:
     """Only classic data frames with an 11-bit id come through."""
     remote = can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True)
-    transport, _ = scripted(frame(extended=True), remote, frame(is_fd=True), frame(b"mine"))
+    transport, _ = fake(frame(extended=True), remote, frame(is_fd=True), frame(b"mine"))
     assert transport.receive(0.0).payload == b"mine"
 
 
 def test_bus_off_is_a_lost_bus_until_it_is_opened_again(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]],
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]],
 ) -> None:
     """Neither reading nor sending goes on; the message says how the kernel restarts a controller."""
-    transport, bus = scripted(error_frame(0x040))
+    transport, bus = fake(error_frame(0x040))
     with pytest.raises(TransportLostError, match=r"bus-off.*restart-ms"):
         transport.receive(0.0)
     with pytest.raises(TransportLostError, match="bus-off"):
@@ -390,15 +390,18 @@ def test_bus_off_is_a_lost_bus_until_it_is_opened_again(
 @pytest.mark.parametrize(
     ("kind", "controller", "words"),
     [
-        (0x020, 0, "acknowledges"), (0x004, 0x01, "receive buffer"), (0x004, 0x02, "transmit buffer"),
-        (0x004, 0x20, "error-passive"), (0x008, 0, "bit rate"),
+        (0x020, 0, "acknowledges"),
+        (0x004, 0x01, "receive buffer"),
+        (0x004, 0x02, "transmit buffer"),
+        (0x004, 0x20, "error-passive"),
+        (0x008, 0, "bit rate"),
     ],
-)  # fmt: skip
+)
 def test_error_frames_are_counted_and_said(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]], kind: int, controller: int, words: str
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]], kind: int, controller: int, words: str
 ) -> None:
     """They end no episode; what they say is in the next timeout's message."""
-    transport, _ = scripted(error_frame(kind, controller))
+    transport, _ = fake(error_frame(kind, controller))
     with pytest.raises(TransportTimeoutError, match=words):
         transport.receive(0.0)
     assert transport.error_frames == 1
@@ -412,10 +415,10 @@ def test_error_frames_are_counted_and_said(
     ],
 )
 def test_a_full_transmit_buffer_is_a_timeout(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]], refusal: Exception
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]], refusal: Exception
 ) -> None:
     """It names the usual reason: nobody acknowledges."""
-    transport, bus = scripted()
+    transport, bus = fake()
     bus.refuse = refusal
     with pytest.raises(TransportTimeoutError, match="acknowledges"):
         transport.send(Message("123", b"x", 0))
@@ -425,10 +428,10 @@ def test_a_full_transmit_buffer_is_a_timeout(
     "failure", [can.CanOperationError("Failed to receive", errno.ENETDOWN), OSError(errno.ENODEV, "gone")]
 )
 def test_an_adapter_that_vanishes_is_lost(
-    scripted: Callable[..., tuple[PythonCanTransport, ScriptedBus]], failure: Exception
+    fake: Callable[..., tuple[PythonCanTransport, FakeBus]], failure: Exception
 ) -> None:
     """Whatever python-can raises becomes an error of ours."""
-    transport, bus = scripted(failure)
+    transport, bus = fake(failure)
     bus.refuse = failure
     with pytest.raises(TransportLostError):
         transport.receive(0.0)

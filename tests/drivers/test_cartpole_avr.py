@@ -49,9 +49,13 @@ class Board(Chip):
         self.state = State(*[0] * 10)
 
     def run(
-        self, ticks: int, data: bytes = b"", cart: int = 0, pole: int = 0,
+        self,
+        ticks: int,
+        data: bytes = b"",
+        cart: int = 0,
+        pole: int = 0,
         switches: tuple[bool, bool] = (False, False),
-    ) -> list[protocol.AnyMessage]:  # fmt: skip
+    ) -> list[protocol.AnyMessage]:
         """Run some ticks with counts for each; return what was said beside the states."""
         found: list[protocol.AnyMessage] = []
         for _ in range(ticks):
@@ -296,7 +300,9 @@ class Bench:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_robot_with_hidden_truth_homes_arms_and_follows(seed: int) -> None:
     """Homing finds the middle within 2.5 mm and the pole upright; the cart then gets where it is sent."""
-    bench = Bench(candidate_truth("realistic", np.random.default_rng(seed), seed=seed, xi=3.0, refused=0))
+    bench = Bench(
+        candidate_truth("realistic", np.random.default_rng(seed), seed=seed, range_ratio=3.0, refused=0)
+    )
     robot = bench.robot
     robot.connect()
     robot.home(20.0)

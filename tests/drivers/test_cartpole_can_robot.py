@@ -39,20 +39,20 @@ from deal_hw.errors import (
     VersionMismatchError,
     WrongDeviceError,
 )
+from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
-from deal_hw.testing.scripted_device import ScriptedDevice
 from deal_hw.transport import Message, WireOptions
 from deal_hw.types import RobotState, Status
 
 MS = 1_000_000
 
 
-def scripted(message: protocol.AnyMessage | None) -> CartpoleRobot:
+def fake(message: protocol.AnyMessage | None) -> CartpoleRobot:
     """Return a driver in front of a node that always says the same."""
     clock = VirtualClock()
     answer = b"" if message is None else CanLink().encode(message)
-    return CartpoleRobot(VirtualTransport(ScriptedDevice(answer), clock), clock, link=CanLink)
+    return CartpoleRobot(VirtualTransport(FakeDevice(answer), clock), clock, link=CanLink)
 
 
 def info(kind: str = "cartpole", version: int = 1) -> protocol.Info:
@@ -69,9 +69,9 @@ class TestCartpoleOnCan(RobotSuite):
 
         return RobotBench(
             robot=robot,
-            foreign=scripted(info("toaster")),
-            newer=scripted(info(version=2)),
-            silent=scripted(None),
+            foreign=fake(info("toaster")),
+            newer=fake(info(version=2)),
+            silent=fake(None),
             unplug=wire.unplug,
             corrupt=fault.corrupt_next,
         )
@@ -81,7 +81,7 @@ def test_a_node_that_sends_but_does_not_answer_is_another_device() -> None:
     """States without an info: the message asks for the firmware's DBC."""
     state = protocol.State(0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
     with pytest.raises(WrongDeviceError, match="another DBC"):
-        scripted(state).connect()
+        fake(state).connect()
 
 
 def test_two_devices_under_one_number_end_a_run() -> None:
@@ -119,8 +119,17 @@ def test_the_wire_changes_no_sample() -> None:
                     state = robot.read_state(0.0)
                 except TransportTimeoutError:
                     break
-                found.append((*state.position, *state.velocity, state.effort[0], state.device_ns,
-                              state.command_sequence, state.command_age_ns, int(state.status)))  # fmt: skip
+                found.append(
+                    (
+                        *state.position,
+                        *state.velocity,
+                        state.effort[0],
+                        state.device_ns,
+                        state.command_sequence,
+                        state.command_age_ns,
+                        int(state.status),
+                    )
+                )
         runs.append(found)
     assert len(runs[0]) > 700
     assert runs[0] == runs[1]
@@ -189,7 +198,7 @@ def test_commands_and_states_pass_the_adapter() -> None:
     assert wait(robot, lambda state: state.command_sequence == 0).status & Status.ARMED
     robot.passive()
     wait(robot, lambda state: Status.ARMED not in state.status)
-    assert robot.link_errors == 0
+    assert robot.transport_errors == 0
 
 
 def test_bus_off_is_lost_and_passive_gets_through_once_it_is_over() -> None:
@@ -281,7 +290,7 @@ def test_five_percent_of_corrupt_and_lost_lines_are_survived() -> None:
             assert abs(state.position[0]) < 0.41
             assert abs(state.position[1]) < 10
     assert sequences == sorted(set(sequences))
-    assert robot.link_errors > 50
+    assert robot.transport_errors > 50
 
 
 # Plumbing.
@@ -355,10 +364,15 @@ def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
     with EmulatorProcess("cartpole", "--transport", transport, "--profile", "ideal", "--nominal") as emulator:
         report = collect(
             Collect(
-                robot="cartpole", port=emulator.port, link=LinkOptions(transport=transport),
-                out=tmp_path / "run", profile="hold", seconds=1.0, quiet=True,
+                robot="cartpole",
+                port=emulator.port,
+                link=LinkOptions(transport=transport),
+                out=tmp_path / "run",
+                profile="hold",
+                seconds=1.0,
+                quiet=True,
             )
-        )  # fmt: skip
+        )
     assert [episode.outcome.value for episode in report.episodes] == ["finished"]
     trajectory = Dataset.open(tmp_path / "run" / "dataset").read(0).trajectory
     assert trajectory.position.shape[0] >= 180

@@ -19,21 +19,28 @@ from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
 from deal_hw.types import Status
 
 MS = 1_000_000
-FUZZED = candidate_truth("realistic", np.random.default_rng(1), seed=1, xi=5.0, refused=0)
+FUZZED = candidate_truth("realistic", np.random.default_rng(1), seed=1, range_ratio=5.0, refused=0)
 COMMANDS = st.one_of(
     st.builds(
         lambda *v: protocol.encode(Target(*v)),
-        *(st.integers(*bounds) for bounds in (
-            (0, 2**32 - 2), (-(2**31), 2**31 - 1), (0, 2**32 - 1), (0, 2**32 - 1), (0, 2**16 - 1),
-            (0, 2**32 - 1),
-        )),
+        *(
+            st.integers(*bounds)
+            for bounds in (
+                (0, 2**32 - 2),
+                (-(2**31), 2**31 - 1),
+                (0, 2**32 - 1),
+                (0, 2**32 - 1),
+                (0, 2**16 - 1),
+                (0, 2**32 - 1),
+            )
+        ),
     ),
     st.builds(
         lambda kind, request: protocol.encode(kind(request)),
         st.sampled_from([protocol.Hello, protocol.Arm, protocol.Stop, protocol.Home]),
         st.integers(0, 255),
     ),
-)  # fmt: skip
+)
 
 
 def messages(data: bytes) -> list[protocol.AnyMessage]:
@@ -319,7 +326,7 @@ def test_the_trajectory_equals_that_of_the_position_actuator_of_the_mjcf(seed: i
     The calibrator models the robot so. The motion goes through both limits, dry friction and a fallen pole.
     """
     rng = np.random.default_rng(seed)
-    truth = candidate_truth("ideal", rng, seed=seed, xi=5.0, refused=0)
+    truth = candidate_truth("ideal", rng, seed=seed, range_ratio=5.0, refused=0)
     device = armed_device(truth, keep_truth=True)
     targets = np.repeat(np.rint(rng.uniform(-0.25, 0.25, 15) * 1e6).astype(int), 10)
     for sequence, position_um in enumerate(targets):

@@ -54,10 +54,14 @@ def script(seed: int, ticks: int) -> Iterator[tuple[bytes, Motor, Reading]]:
                 sequence += rng.random() < 0.9
                 data += protocol.encode(
                     protocol.Target(
-                        sequence, rng.randint(-500_000, 500_000), rng.randint(0, 160_000),
-                        rng.randint(0, 16_000), rng.randint(0, 8_000), rng.randint(0, 3_000_000),
+                        sequence,
+                        rng.randint(-500_000, 500_000),
+                        rng.randint(0, 160_000),
+                        rng.randint(0, 16_000),
+                        rng.randint(0, 8_000),
+                        rng.randint(0, 3_000_000),
                     )
-                )  # fmt: skip
+                )
             elif kind < 0.65:
                 data += rng.randbytes(20) + b"\0"
             else:
@@ -89,8 +93,9 @@ def outputs(firmware: Firmware, seed: int, ticks: int = 3000) -> Iterator[tuple[
 
 
 @pytest.mark.parametrize(
-    ("seed", "recorded"), [(0, "e4b52a0a03a95585"), (1, "ddf512606437f997"), (2, "28e61e054e37046d")],
-)  # fmt: skip
+    ("seed", "recorded"),
+    [(0, "e4b52a0a03a95585"), (1, "ddf512606437f997"), (2, "28e61e054e37046d")],
+)
 def test_outputs_are_the_recorded_ones(seed: int, recorded: str) -> None:
     """Bytes, forces and modes of 3000 ticks of commands, garbage and watchdog stops are as recorded."""
     delays = random.Random(seed)
@@ -177,7 +182,7 @@ def pair(truth: Truth, seed: int, delays: tuple[int, int]) -> tuple[Controller, 
 @pytest.mark.parametrize("seed", range(6))
 def test_recorded_inputs_give_the_same_outputs(seed: int) -> None:
     """3000 ticks of commands, garbage and watchdog stops; hidden trims, commands late by 0 to 28 ticks."""
-    truth = candidate_truth("realistic", np.random.default_rng(seed), seed=seed, xi=5.0, refused=0)
+    truth = candidate_truth("realistic", np.random.default_rng(seed), seed=seed, range_ratio=5.0, refused=0)
     python, core = pair(truth, seed, (0, 0) if seed == 0 else (seed, 28))
     modes = []
     for ours, theirs in zip(outputs(python, seed), outputs(core, seed), strict=True):
@@ -193,25 +198,31 @@ MESSAGES = st.one_of(
     st.builds(lambda *v: protocol.encode(Target(*v)), st.integers(0, 3) | U32, I32, U32, U32, U16, U32),
     st.builds(
         lambda *v: protocol.encode(Target(*v)),
-        st.integers(0, 2**32 - 2), st.integers(-400_000, 400_000), st.integers(0, 200_000),
-        st.integers(0, 20_000), st.integers(0, 8000), st.integers(0, 3_000_000),
+        st.integers(0, 2**32 - 2),
+        st.integers(-400_000, 400_000),
+        st.integers(0, 200_000),
+        st.integers(0, 20_000),
+        st.integers(0, 8000),
+        st.integers(0, 3_000_000),
     ),
     st.builds(
         lambda kind, request: protocol.encode(kind(request)),
-        st.sampled_from([protocol.Arm, protocol.Arm, protocol.Home, protocol.Stop]), st.integers(0, 3),
+        st.sampled_from([protocol.Arm, protocol.Arm, protocol.Home, protocol.Stop]),
+        st.integers(0, 3),
     ),
     st.builds(lambda *v: protocol.encode(protocol.Hello(*v)), st.integers(0, 255), st.integers(0, 255)),
     st.binary(max_size=70),
     st.binary(max_size=70).map(lambda data: data + b"\0"),
-)  # fmt: skip
+)
 TICKS = st.lists(st.tuples(st.lists(MESSAGES, max_size=3), MOTORS, READINGS, st.sampled_from((1, 3, 210))))
 
 
 @needs_compiler
 @settings(deadline=None, max_examples=300)
 @given(TICKS, st.tuples(*[st.integers(0, 2**32 - 1) | st.just(65536)] * 4), st.booleans())
-def test_any_inputs_give_the_same_outputs(ticks: list[tuple[list[bytes], Motor, Reading, int]],
-                                          trims: tuple[int, int, int, int], homed: bool) -> None:  # fmt: skip
+def test_any_inputs_give_the_same_outputs(
+    ticks: list[tuple[list[bytes], Motor, Reading, int]], trims: tuple[int, int, int, int], homed: bool
+) -> None:
     """Any bytes, positions, gains and trims of any size, armed from the start or not."""
     sent = Settings(*trims, 7, 0)
     both: list[Firmware] = [Controller(IntegerServo(sent), 7, lambda: 2), HostFirmware(sent, lambda: 2)]
@@ -236,8 +247,17 @@ def test_test_vectors_of_the_protocol_page() -> None:
     rows = re.findall(r"^\| `(\w+)\((.+?)\)` \| `([0-9a-f ]+)` \|", PAGE.read_text(), re.MULTILINE)
     frames = [bytes.fromhex(text) for _, _, text in rows]
     assert [name for name, _, _ in rows] == [
-        "Hello", "Info", "Arm", "Stop", "Home", "Ack", "Target", "Target", "State", "State",
-    ]  # fmt: skip
+        "Hello",
+        "Info",
+        "Arm",
+        "Stop",
+        "Home",
+        "Ack",
+        "Target",
+        "Target",
+        "State",
+        "State",
+    ]
     hello, info, arm, stop, home, refused, *targets, first_state, _ = frames
     still = Motor(0.0, 0.0)
     core = HostFirmware(settings_of(nominal_truth(seed=3), 0), lambda: 0)
@@ -277,9 +297,11 @@ def test_a_full_queue_keeps_the_newest_target() -> None:
 @pytest.mark.parametrize("profile", ["ideal", "realistic"])
 def test_the_core_moves_the_same_robot_as_the_float_servo(profile: str) -> None:
     """One second of random targets with a falling pole: at most 10 um and 1 mrad apart."""
-    truth = candidate_truth(profile, np.random.default_rng(5), seed=5, xi=5.0, refused=0)
-    devices = [CartpoleDevice(truth, keep_truth=True),
-               CartpoleDevice(truth, keep_truth=True, firmware=HostFirmware.of)]  # fmt: skip
+    truth = candidate_truth(profile, np.random.default_rng(5), seed=5, range_ratio=5.0, refused=0)
+    devices = [
+        CartpoleDevice(truth, keep_truth=True),
+        CartpoleDevice(truth, keep_truth=True, firmware=HostFirmware.of),
+    ]
     paths = []
     for device in devices:
         rng = np.random.default_rng(0)

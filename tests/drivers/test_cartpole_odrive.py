@@ -29,9 +29,9 @@ from deal_hw.errors import (
     TransportTimeoutError,
     WrongDeviceError,
 )
+from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
-from deal_hw.testing.scripted_device import ScriptedDevice
 from deal_hw.types import RobotState, Status
 
 MS = 1_000_000
@@ -45,10 +45,10 @@ def frames(data: bytes) -> list[tuple[int, bytes]]:
     return [(identifier, payload[:length]) for identifier, length, payload in FRAME.iter_unpack(data)]
 
 
-def scripted(answer: bytes, parts: OdriveSettings = PARTS) -> OdriveRobot:
+def fake(answer: bytes, parts: OdriveSettings = PARTS) -> OdriveRobot:
     """Return a driver in front of nodes that always say the same."""
     clock = VirtualClock()
-    return OdriveRobot(VirtualTransport(ScriptedDevice(answer), clock), clock, parts)
+    return OdriveRobot(VirtualTransport(FakeDevice(answer), clock), clock, parts)
 
 
 def heartbeat(state: int = IDLE, errors: int = 0) -> bytes:
@@ -96,9 +96,9 @@ class TestOdriveRobot(RobotSuite):
 
         return RobotBench(
             robot=wire.robot,
-            foreign=scripted(heartbeat() + encoder_info("toaster")),
-            newer=scripted(heartbeat() + encoder_info(version=2)),
-            silent=scripted(b""),
+            foreign=fake(heartbeat() + encoder_info("toaster")),
+            newer=fake(heartbeat() + encoder_info(version=2)),
+            silent=fake(b""),
             unplug=wire.virtual.unplug,
             corrupt=fault.corrupt_next,
         )
@@ -262,11 +262,15 @@ def test_nothing_on_the_bus_makes_the_link_fail(junk: list[tuple[int, int, bytes
 @settings(deadline=None)
 @given(
     st.builds(
-        protocol.Target, st.integers(0, 2**32 - 2), st.integers(-(2**31), 2**31 - 1),
-        st.integers(0, 2**32 - 1), st.integers(1, 2**32 - 1), st.integers(0, 2**16 - 1),
+        protocol.Target,
+        st.integers(0, 2**32 - 2),
+        st.integers(-(2**31), 2**31 - 1),
+        st.integers(0, 2**32 - 1),
+        st.integers(1, 2**32 - 1),
+        st.integers(0, 2**16 - 1),
         st.integers(0, 2**32 - 1),
     )
-)  # fmt: skip
+)
 def test_every_target_makes_finite_frames(target: protocol.Target) -> None:
     """Whatever the safety filter lets through, and more."""
     for _, data in frames(OdriveLink(PARTS, VirtualClock()).encode(target)):
@@ -340,9 +344,9 @@ def test_an_error_of_the_drive_is_decoded() -> None:
 def test_a_wrong_node_is_named() -> None:
     """Without the drive's heartbeat, or without the encoder's answer."""
     with pytest.raises(WrongDeviceError, match="no heartbeat of an ODrive at node 0"):
-        scripted(encoder_info()).connect()
+        fake(encoder_info()).connect()
     with pytest.raises(WrongDeviceError, match="the pole encoder at node 2 does not answer"):
-        scripted(heartbeat()).connect()
+        fake(heartbeat()).connect()
 
 
 def test_two_encoders_under_one_number_are_a_fault() -> None:
@@ -367,7 +371,7 @@ def test_five_percent_of_lost_frames_are_survived() -> None:
             sequences.append(state.sequence)
             assert abs(state.position[0]) < 0.41
     assert sequences == sorted(set(sequences))
-    assert robot.link_errors > 20
+    assert robot.transport_errors > 20
 
 
 # Ports and runs.

@@ -13,17 +13,17 @@ from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
+from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
-from deal_hw.testing.scripted_device import ScriptedDevice
 from deal_hw.transport import Message, Transport
 from deal_hw.types import Status
 
 
-def scripted(answer: bytes) -> CartpoleRobot:
+def fake(answer: bytes) -> CartpoleRobot:
     """Return a driver in front of a device that always says the same."""
     clock = VirtualClock()
-    return CartpoleRobot(VirtualTransport(ScriptedDevice(answer), clock), clock)
+    return CartpoleRobot(VirtualTransport(FakeDevice(answer), clock), clock)
 
 
 def info(kind: str = "cartpole", version: int = 1) -> bytes:
@@ -56,9 +56,9 @@ class TestCartpoleRobot(RobotSuite):
 
         return RobotBench(
             robot=wire.robot,
-            foreign=scripted(info("toaster")),
-            newer=scripted(info(version=2)),
-            silent=scripted(b""),
+            foreign=fake(info("toaster")),
+            newer=fake(info(version=2)),
+            silent=fake(b""),
             unplug=wire.virtual.unplug,
             corrupt=fault.corrupt_next,
         )
@@ -67,21 +67,21 @@ class TestCartpoleRobot(RobotSuite):
 def test_bytes_that_are_no_frames_are_another_device() -> None:
     """A talkative device that is no cart-pole raises WrongDeviceError and names the baud rate."""
     with pytest.raises(WrongDeviceError, match="1000000"):
-        scripted(b"GRBL 1.1 ['$' for help]\r\n").connect()
+        fake(b"GRBL 1.1 ['$' for help]\r\n").connect()
 
 
 def test_an_older_device_is_told_from_a_newer_one() -> None:
     """The message says which side is to be updated, and the device's firmware."""
     with pytest.raises(Exception, match=r"firmware 2\.3\.4.*version 0.*update the device's firmware"):
-        scripted(info(version=0)).connect()
+        fake(info(version=0)).connect()
     with pytest.raises(Exception, match="update deal-hw"):
-        scripted(info(version=2)).connect()
+        fake(info(version=2)).connect()
 
 
 def test_a_failed_connect_closes_the_port() -> None:
     """After an error the transport is closed, so that another attempt starts afresh."""
     wire = Wire()
-    robot = scripted(b"")
+    robot = fake(b"")
     for _ in range(2):
         with pytest.raises(TransportTimeoutError):
             robot.connect()
@@ -132,7 +132,7 @@ def test_five_percent_of_corrupt_frames_in_both_directions_are_survived() -> Non
     faults = [FrameFaults(FaultRates(corrupt=0.05), np.random.default_rng(seed)) for seed in (1, 2)]
     wire = Wire(lambda transport: FaultyTransport(transport, received=faults[0], sent=faults[1]))
     robot = wire.armed()
-    before = robot.link_errors
+    before = robot.transport_errors
     sequences = []
     for i in range(500):
         robot.send_command(default_command(robot, 0.05 * (i % 2)))
@@ -142,7 +142,7 @@ def test_five_percent_of_corrupt_frames_in_both_directions_are_survived() -> Non
             assert abs(state.position[0]) < 0.41
     assert sequences == sorted(set(sequences))
     # Each corrupt frame counts as corrupt and as a gap in the sequence.
-    assert 100 < robot.link_errors - before < 300
+    assert 100 < robot.transport_errors - before < 300
     assert wire.device.frame_errors > 5
     assert robot.resent <= 5
 
@@ -233,7 +233,7 @@ def test_a_device_that_restarted_is_one_error() -> None:
         protocol.encode(protocol.State(n, n * 5000, 0, 0, 0, 0, 0, 0, protocol.NO_COMMAND, 0))
         for n in (100, 0, 1)
     ]
-    robot = scripted(info() + b"".join(states))
+    robot = fake(info() + b"".join(states))
     robot.connect()
     assert [robot.read_state(0.1).sequence for _ in range(3)] == [100, 0, 1]
-    assert robot.link_errors == 1
+    assert robot.transport_errors == 1

@@ -23,7 +23,7 @@ def test_a_seed_decides_the_truth(profile: str) -> None:
 def test_candidates_lie_in_the_inner_part_of_the_range() -> None:
     """Within 80 % of the range's half width, |ln ratio| <= 0.8 ln 5; latency 5 to 25 ticks."""
     rng = np.random.default_rng(0)
-    truths = [candidate_truth("sensor", rng, seed=0, xi=5.0, refused=0) for _ in range(300)]
+    truths = [candidate_truth("sensor", rng, seed=0, range_ratio=5.0, refused=0) for _ in range(300)]
     for parameter in k9_space():
         ratios = np.log([t.parameters[parameter.name] / parameter.nominal for t in truths])
         assert np.max(np.abs(ratios)) <= 0.8 * np.log(5) + 1e-12
@@ -37,7 +37,7 @@ def test_candidates_lie_in_the_inner_part_of_the_range() -> None:
 
 def test_the_ideal_profile_has_no_latency() -> None:
     """Ideal means equations only."""
-    truth = candidate_truth("ideal", np.random.default_rng(1), seed=1, xi=5.0, refused=0)
+    truth = candidate_truth("ideal", np.random.default_rng(1), seed=1, range_ratio=5.0, refused=0)
     assert truth.latency_s == 0.0
 
 
@@ -66,7 +66,7 @@ def test_settings_that_make_no_sense_are_refused() -> None:
     with pytest.raises(UnknownNameError, match="ideal, sensor, realistic"):
         draw_truth("perfect", 0)
     with pytest.raises(ConfigurationError, match="above 1"):
-        draw_truth("ideal", 0, xi=1.0)
+        draw_truth("ideal", 0, range_ratio=1.0)
     with pytest.raises(ConfigurationError, match="seed"):
         draw_truth("ideal", -1)
 

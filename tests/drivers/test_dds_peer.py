@@ -99,14 +99,14 @@ def test_a_0102_user_and_we_as_robot_exchange_commands_and_states(dds_peer: Path
     """The other way round, as our emulator serves a client of the vendor's SDK."""
     wire = DdsTransport("127.0.0.1", MonotonicClock(), WireOptions(domain=dds_domain))
     wire.declare(publish=[LOW_STATE], subscribe=[LOW_COMMAND])
-    scripted, received = FakeGo2(), 0
+    fake, received = FakeGo2(), 0
     with wire, running(dds_peer, "user", dds_domain, 60) as user:
         while received < MESSAGES:
             command = decode_low_command(wire.receive(10.0).payload)
             assert command.stiffness.max() == 0.0
             received += 1
-            scripted.tick_ms = 2 * received
-            wire.send(Message(LOW_STATE, encode_low_state(scripted.state()), 0))
+            fake.tick_ms = 2 * received
+            wire.send(Message(LOW_STATE, encode_low_state(fake.state()), 0))
     assert user.returncode == 0
     assert user.warnings == ""
     assert user.report["received"] > MESSAGES // 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import select
 import signal
 import socket
@@ -31,6 +32,7 @@ from deal_hw.errors import (
     UnknownNameError,
     VersionMismatchError,
 )
+from deal_hw.install import install_line
 from deal_hw.testing.transport_suite import TopicPair, TopicTransportSuite
 from deal_hw.transport import Message, WireOptions
 
@@ -116,7 +118,7 @@ def test_without_cyclonedds_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     load_types.cache_clear()
     wire = make(1, publish=("rt/lowcmd",))
-    with pytest.raises(MissingExtraError, match=r"deal-hw\[dds\]"):
+    with pytest.raises(MissingExtraError, match=re.escape(install_line("dds"))):
         wire.open()
 
 

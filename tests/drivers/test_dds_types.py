@@ -24,10 +24,17 @@ from deal_hw.errors import VersionMismatchError
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 IDL = Path(__file__).resolve().parent / "peer_0102/go2_messages.idl"
 WORDS = {
-    "octet": "octet", "boolean": "boolean", "string": "string", "float": "float32", "short": "int16",
-    "unsigned short": "uint16", "long": "int32", "unsigned long": "uint32", "long long": "int64",
+    "octet": "octet",
+    "boolean": "boolean",
+    "string": "string",
+    "float": "float32",
+    "short": "int16",
+    "unsigned short": "uint16",
+    "long": "int32",
+    "unsigned long": "uint32",
+    "long long": "int64",
     "sequence<octet>": "sequence<octet>",
-}  # fmt: skip
+}
 
 
 def as_uint8(structs: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str]]:

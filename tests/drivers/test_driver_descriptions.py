@@ -42,10 +42,10 @@ SIZES = {
     ("go2", "paper"): 24,
     ("go2", "walk"): 29,
     ("go2", "paper-swapped"): 24,
-    ("go2_hung", "default"): 48,
-    ("go2_hung", "biased"): 60,
-    ("go2_hung", "shared"): 12,
-    ("go2_hung", "linkage"): 56,
+    ("go2_on_stand", "default"): 48,
+    ("go2_on_stand", "biased"): 60,
+    ("go2_on_stand", "shared"): 12,
+    ("go2_on_stand", "linkage"): 56,
     ("go2_suspended", "default"): 48,
     ("go2_suspended", "biased"): 60,
     ("go2_suspended", "shared"): 12,
@@ -115,8 +115,8 @@ def test_space_has_its_size_and_fits_its_model(robot: str, name: str) -> None:
         kind = KIND_TABLE[p.kind]
         index = getattr(model, kind.element)(p.elements[0]).id
         assert p.unit == kind.unit_of(model, index)
-    for xi in (3.0, 20.0):
-        wide = space.with_ratio(xi)
+    for range_ratio in (3.0, 20.0):
+        wide = space.with_ratio(range_ratio)
         check_space(model, wide)
         assert np.all((wide.nominal >= wide.low) & (wide.nominal <= wide.high))
         assert np.all((wide.center > wide.low) & (wide.center < wide.high))
@@ -135,7 +135,7 @@ def test_default_preset_is_what_the_model_has(robot: str) -> None:
 
 @pytest.mark.parametrize(("robot", "name"), EVERY)
 def test_members_all_over_the_range_stay_finite(robot: str, name: str) -> None:
-    """Half a second of steps under random commands, batch as the calibrator uses it; truth at xi = 5."""
+    """Half a second of steps under random commands, batch as the calibrator uses it; range ratio 5."""
     description = robot_description(robot)
     loaded, space = load_model(description), _space(robot, name)
     batch = ServoBatch(loaded, space, 8, threads=1)
@@ -195,9 +195,7 @@ def test_only_feet_and_trunk_can_touch_the_floor_and_nothing_itself() -> None:
     model = load_model(robot_description("go2")).model
     floor = model.geom("floor").id
     touching = [g for g in range(model.ngeom) if model.geom_contype[g] & model.geom_conaffinity[floor]]
-    assert {model.geom(g).name for g in touching} == {
-        "trunk", "FL_foot", "FR_foot", "RL_foot", "RR_foot"
-    }  # fmt: skip
+    assert {model.geom(g).name for g in touching} == {"trunk", "FL_foot", "FR_foot", "RL_foot", "RR_foot"}
     assert not np.delete(model.geom_conaffinity, floor).any()
 
 
@@ -256,7 +254,7 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
     for name in set(DESCRIPTIONS) - set(ROBOTS):
         with pytest.raises(ConfigurationError, match=f"{name!r}.*no driver yet.*cartpole"):
             make_robot(name, "serial", "x", MonotonicClock())
-    with pytest.raises(UnknownNameError, match=r"cartpole, go2, go2_hung, ant"):
+    with pytest.raises(UnknownNameError, match=r"cartpole, go2, go2_on_stand, ant"):
         robot_description("gotwo")
     with pytest.raises(UnknownNameError, match="go2_suspended"):
         parameter_spaces("gotwo")

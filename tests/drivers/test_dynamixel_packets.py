@@ -39,7 +39,7 @@ from deal_hw.drivers.cartpole.dynamixel.samples import SampleGrid, TickClock
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
-from deal_hw.testing.scripted_device import ScriptedDevice
+from deal_hw.testing.fake_device import FakeDevice
 
 RANDOM_INPUTS = 100_000
 
@@ -160,7 +160,7 @@ def test_hostile_answers_to_single_questions(data: bytes) -> None:
 def bus_that_hears(answer: bytes) -> Bus:
     """Return a bus on which every question is answered with these bytes."""
     clock = VirtualClock()
-    transport = VirtualTransport(ScriptedDevice(answer), clock)
+    transport = VirtualTransport(FakeDevice(answer), clock)
     transport.open()
     return Bus(transport, clock, 1_000_000, 0.003)
 
@@ -185,18 +185,41 @@ def test_signs_of_a_block() -> None:
     """Registers come without sign: -1 as 65535, -4096 as 4294963200."""
     table = bytearray(256)
     for address, data in (
-        (64, b"\x01"), (70, b"\x20"), (80, b"\x67\x03"), (84, b"\x46\x00"), (98, b"\xff"),
-        (102, b"\xb9\x02"), (112, b"\x66\x06\0\0"), (116, b"\x00\xf0\xff\xff"), (120, b"\xff\x7f"),
-        (123, b"\x02"), (126, b"\xff\xff"), (128, b"\xfd\xff\xff\xff"), (132, b"\x01\x00\x00\x80"),
-    ):  # fmt: skip
+        (64, b"\x01"),
+        (70, b"\x20"),
+        (80, b"\x67\x03"),
+        (84, b"\x46\x00"),
+        (98, b"\xff"),
+        (102, b"\xb9\x02"),
+        (112, b"\x66\x06\0\0"),
+        (116, b"\x00\xf0\xff\xff"),
+        (120, b"\xff\x7f"),
+        (123, b"\x02"),
+        (126, b"\xff\xff"),
+        (128, b"\xfd\xff\xff\xff"),
+        (132, b"\x01\x00\x00\x80"),
+    ):
         table[address : address + len(data)] = data
     block = Block.unpack(bytes(table[BLOCK_ADDRESS : BLOCK_ADDRESS + BLOCK_BYTES]))
     assert block == Block(
-        torque_enable=1, led=0, hardware_error=0x20, d_gain=871, i_gain=0, p_gain=70, bus_watchdog=0xFF,
-        goal_pwm=0, goal_current=697, profile_acceleration=0, profile_velocity=1638, goal_position=-4096,
-        tick_ms=32767, moving_status=2, present_current=-1, present_velocity=-3,
+        torque_enable=1,
+        led=0,
+        hardware_error=0x20,
+        d_gain=871,
+        i_gain=0,
+        p_gain=70,
+        bus_watchdog=0xFF,
+        goal_pwm=0,
+        goal_current=697,
+        profile_acceleration=0,
+        profile_velocity=1638,
+        goal_position=-4096,
+        tick_ms=32767,
+        moving_status=2,
+        present_current=-1,
+        present_velocity=-3,
         present_position=-(2**31) + 1,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("model", [1190, 1200, 1020, 1030, 1060, 1070])
@@ -248,8 +271,13 @@ def test_samples_fall_on_the_nearest_point_of_the_grid() -> None:
     """5 ms points: a tick early or late is moved, a second one for a point left out, a gap keeps numbers."""
     grid = SampleGrid(5)
     assert [(grid.place(t), grid.number) for t in (100, 105, 111, 114, 115, 132)] == [
-        (0, 0), (0, 1), (-1, 2), (1, 3), (None, 3), (-2, 6),
-    ]  # fmt: skip
+        (0, 0),
+        (0, 1),
+        (-1, 2),
+        (1, 3),
+        (None, 3),
+        (-2, 6),
+    ]
     grid.begin()
     assert (grid.place(137), grid.number) == (0, 7)
 

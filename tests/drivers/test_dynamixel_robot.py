@@ -188,7 +188,7 @@ def test_states_stand_on_a_regular_grid() -> None:
     periods = np.diff([state.device_ns for state in states[1:]])
     assert set(periods) == {5_000_000}
     assert len(states) in (200, 201)
-    assert wire.robot.link_errors == 0
+    assert wire.robot.transport_errors == 0
 
 
 def test_gains_and_limits_go_out_when_they_change_only() -> None:
@@ -244,10 +244,10 @@ def test_a_lost_command_is_counted_and_all_of_the_next_is_sent() -> None:
     transport = robot._transport
     assert isinstance(transport, Deaf)
     transport.deaf = True
-    before, errors = robot.last_sequence, robot.link_errors
+    before, errors = robot.last_sequence, robot.transport_errors
     states = wire.run(1, target=0.03)
     assert {state.command_sequence for state in states[-3:]} == {before}
-    assert robot.link_errors == errors + 1
+    assert robot.transport_errors == errors + 1
     states = wire.run(1, target=0.04)
     assert states[-1].command_sequence == before + 2
 
@@ -348,7 +348,7 @@ def test_five_percent_of_corrupt_packets_in_both_directions_are_survived() -> No
     assert numbers == sorted(set(numbers))
     assert robot.fault == ""
     assert all(abs(state.position[0]) < 0.41 for state in states)
-    assert 50 < robot.link_errors < 200
+    assert 50 < robot.transport_errors < 200
     assert wire.device.frame_errors > 20
 
 
@@ -361,7 +361,7 @@ def test_servos_that_know_no_fast_read_are_asked_one_after_the_other() -> None:
     assert not robot.info.fast_sync_read
     states = wire.run(10)
     assert len(states) >= 39
-    assert robot.link_errors == 0
+    assert robot.transport_errors == 0
 
 
 @pytest.mark.parametrize(

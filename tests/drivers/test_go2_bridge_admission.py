@@ -294,9 +294,12 @@ def test_at_the_limits_commands_pass(frame: LowStateFrame) -> None:
     low, high = np.array(DESCRIPTION.limits.target).T
     for target in (low, high):
         command = LowCommand(
-            target.astype(np.float32).astype(float), ZERO, np.full(12, 1.0),
-            np.array(DESCRIPTION.limits.damping), ZERO,
-        )  # fmt: skip
+            target.astype(np.float32).astype(float),
+            ZERO,
+            np.full(12, 1.0),
+            np.array(DESCRIPTION.limits.damping),
+            ZERO,
+        )
         assert limits.complaint(command, frame) == ""
 
 

@@ -45,7 +45,7 @@ def test_the_models_step_is_the_motors_period(description: RobotDescription) -> 
     """Simulated at the rate of the motors, whatever the shared model's own step."""
     robot = load_model(description)
     assert math.isclose(robot.step_s * description.device_rate_hz, 1.0)
-    assert description.steps_per_control == {"go2": 10, "go2_hung": 20}[description.name]
+    assert description.steps_per_control == {"go2": 10, "go2_on_stand": 20}[description.name]
     for foot in description.feet:
         robot.model.geom(foot)
 

@@ -172,8 +172,8 @@ def test_wrong_options_are_refused_before_anything_opens() -> None:
         Emulate(robot="go2", transport="serial")
     with pytest.raises(UnknownNameError, match="robot to emulate 'spot'; known: cartpole, go2"):
         Emulate(robot="spot")
-    with pytest.raises(ConfigurationError, match="cartpole on serial has no --suspended, --push, --port"):
-        Emulate(go2=Go2Options(suspended=True, faults=Go2Faults(push=5.0)), port="lo")
+    with pytest.raises(ConfigurationError, match="cartpole on serial has no --on-stand, --push, --port"):
+        Emulate(go2=Go2Options(on_stand=True, faults=Go2Faults(push=5.0)), port="lo")
     with pytest.raises(ConfigurationError, match="emulate go2 has no --link, --vanish-after-s"):
         Emulate(robot="go2", link=Path("x"), vanish_after_s=1.0)
     with pytest.raises(ConfigurationError, match="--tick-start-ms -1 ms: allowed are 0 to 4294967295 ms"):
@@ -218,9 +218,20 @@ def test_over_zenoh_as_a_process(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
     revealed = tmp_path / "truth.json"
     process = EmulatorProcess(
-        "go2", "--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--seed", "3", "--start", "standing",
-        "--hot-after-s", "0", "--reveal-to", str(revealed),
-    )  # fmt: skip
+        "go2",
+        "--transport",
+        "zenoh",
+        "--port",
+        "tcp/127.0.0.1:0",
+        "--seed",
+        "3",
+        "--start",
+        "standing",
+        "--hot-after-s",
+        "0",
+        "--reveal-to",
+        str(revealed),
+    )
     with process:
         client = make_transport("zenoh", process.port, WireOptions())
         asked = topics.request("motion_switcher")

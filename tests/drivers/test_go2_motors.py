@@ -110,7 +110,7 @@ def test_a_truth_speaks_the_names_of_the_parameter_sets() -> None:
 
 
 def test_draws_lie_in_the_range_and_are_all_different() -> None:
-    """With xi = 2 every factor lies within 2**-0.8 and 2**0.8; latencies within the profile's."""
+    """With range ratio 2 every factor lies within 2**-0.8 and 2**0.8; latencies within the profile's."""
     truths = [draw_truth("sensor", seed) for seed in range(50)]
     factors = np.array([truth.stiffness for truth in truths])
     assert 2**-0.8 <= factors.min() < 0.6
@@ -123,8 +123,8 @@ def test_draws_lie_in_the_range_and_are_all_different() -> None:
 
 def test_bad_settings_of_a_truth_are_refused() -> None:
     """A ratio of 1, a negative seed, an unknown profile and eleven joints are errors."""
-    with pytest.raises(ConfigurationError, match=r"xi is a ratio above 1, got 1\.0"):
-        draw_truth("ideal", 0, xi=1.0)
+    with pytest.raises(ConfigurationError, match=r"the range ratio must be above 1, got 1\.0"):
+        draw_truth("ideal", 0, range_ratio=1.0)
     with pytest.raises(ConfigurationError, match="a seed is 0 or more, got -1"):
         draw_truth("ideal", -1)
     with pytest.raises(UnknownNameError, match="unknown profile 'dream'; known: ideal, sensor, realistic"):

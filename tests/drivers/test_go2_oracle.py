@@ -293,24 +293,36 @@ def test_decoded_state_equals_the_oracle(seed: int) -> None:
     message = random_message(LowStateIdl, 1180, seed)
     state = decode_low_state(signed(message, STATE_STRUCT)).values()
     for ours, theirs in (
-        ("position", "q"), ("velocity", "dq"), ("acceleration", "ddq"), ("effort", "tau_est"),
-        ("temperature", "temperature"), ("lost", "lost"), ("mode", "mode"),
-    ):  # fmt: skip
+        ("position", "q"),
+        ("velocity", "dq"),
+        ("acceleration", "ddq"),
+        ("effort", "tau_est"),
+        ("temperature", "temperature"),
+        ("lost", "lost"),
+        ("mode", "mode"),
+    ):
         np.testing.assert_array_equal(getattr(state, ours)[IN_WIRE_ORDER], motors(message, theirs), ours)
     imu, bms = message.imu_state, message.bms_state
     for ours, expected in (
-        (state.orientation, imu.quaternion), (state.angular_velocity, imu.gyroscope),
-        (state.specific_force, imu.accelerometer), (state.rpy, imu.rpy),
+        (state.orientation, imu.quaternion),
+        (state.angular_velocity, imu.gyroscope),
+        (state.specific_force, imu.accelerometer),
+        (state.rpy, imu.rpy),
         (state.imu_temperature, imu.temperature),
         (state.foot_force[LEGS_IN_WIRE_ORDER], message.foot_force),
         (state.foot_force_estimate[LEGS_IN_WIRE_ORDER], message.foot_force_est),
         (state.tick_ms, message.tick),
-        (state.battery_percent, bms.soc), (state.battery_current_ma, bms.current),
-        (state.battery_status, bms.status), (state.battery_cycles, bms.cycle),
-        (state.cell_voltage_mv, bms.cell_vol), (state.voltage, message.power_v),
+        (state.battery_percent, bms.soc),
+        (state.battery_current_ma, bms.current),
+        (state.battery_status, bms.status),
+        (state.battery_cycles, bms.cycle),
+        (state.cell_voltage_mv, bms.cell_vol),
+        (state.voltage, message.power_v),
         (state.current, message.power_a),
-        (state.level, message.level_flag), (state.serial, message.sn), (state.version, message.version),
-    ):  # fmt: skip
+        (state.level, message.level_flag),
+        (state.serial, message.sn),
+        (state.version, message.version),
+    ):
         np.testing.assert_array_equal(ours, expected)
     assert state.remote == bytes(message.wireless_remote)
 
@@ -326,17 +338,32 @@ def random_state(seed: int) -> LowState:
         return rng.integers(low, high, count)
 
     return LowState(
-        position=reals(12), velocity=reals(12), acceleration=reals(12), effort=reals(12),
-        temperature=whole(0, 256, 12), lost=whole(0, 2**32, 12), mode=whole(0, 256, 12), orientation=reals(4),
-        angular_velocity=reals(3), specific_force=reals(3), rpy=reals(3),
+        position=reals(12),
+        velocity=reals(12),
+        acceleration=reals(12),
+        effort=reals(12),
+        temperature=whole(0, 256, 12),
+        lost=whole(0, 2**32, 12),
+        mode=whole(0, 256, 12),
+        orientation=reals(4),
+        angular_velocity=reals(3),
+        specific_force=reals(3),
+        rpy=reals(3),
         imu_temperature=int(rng.integers(256)),
-        foot_force=whole(-(2**15), 2**15, 4), foot_force_estimate=whole(-(2**15), 2**15, 4),
-        tick_ms=int(rng.integers(2**32)), remote=rng.integers(0, 256, 40, dtype=np.uint8).tobytes(),
-        battery_percent=int(rng.integers(101)), battery_current_ma=int(rng.integers(-(2**31), 2**31)),
-        battery_status=int(rng.integers(256)), battery_cycles=int(rng.integers(2**16)),
-        cell_voltage_mv=whole(0, 2**16, 15), voltage=float(reals(1)[0]), current=float(reals(1)[0]),
-        serial=(int(rng.integers(2**32)), 2), version=(3, int(rng.integers(2**32))),
-    )  # fmt: skip
+        foot_force=whole(-(2**15), 2**15, 4),
+        foot_force_estimate=whole(-(2**15), 2**15, 4),
+        tick_ms=int(rng.integers(2**32)),
+        remote=rng.integers(0, 256, 40, dtype=np.uint8).tobytes(),
+        battery_percent=int(rng.integers(101)),
+        battery_current_ma=int(rng.integers(-(2**31), 2**31)),
+        battery_status=int(rng.integers(256)),
+        battery_cycles=int(rng.integers(2**16)),
+        cell_voltage_mv=whole(0, 2**16, 15),
+        voltage=float(reals(1)[0]),
+        current=float(reals(1)[0]),
+        serial=(int(rng.integers(2**32)), 2),
+        version=(3, int(rng.integers(2**32))),
+    )
 
 
 @few
@@ -350,25 +377,57 @@ def test_encoded_state_equals_the_oracle(seed: int) -> None:
     used = [
         MotorState(mode, q, dq, ddq, tau, q, dq, ddq, temperature, lost, [0, 0])
         for mode, q, dq, ddq, tau, temperature, lost in zip(
-            wire["mode"], wire["position"], wire["velocity"], wire["acceleration"], wire["effort"],
-            wire["temperature"], wire["lost"], strict=True,
+            wire["mode"],
+            wire["position"],
+            wire["velocity"],
+            wire["acceleration"],
+            wire["effort"],
+            wire["temperature"],
+            wire["lost"],
+            strict=True,
         )
-    ]  # fmt: skip
+    ]
     spare = [MotorState(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, [0, 0]) for _ in range(8)]
     message = LowStateIdl(
-        [0xFE, 0xEF], 0xFF, 0, list(state.serial), list(state.version), 0,
+        [0xFE, 0xEF],
+        0xFF,
+        0,
+        list(state.serial),
+        list(state.version),
+        0,
         ImuState(
-            state.orientation.tolist(), state.angular_velocity.tolist(), state.specific_force.tolist(),
-            state.rpy.tolist(), state.imu_temperature,
+            state.orientation.tolist(),
+            state.angular_velocity.tolist(),
+            state.specific_force.tolist(),
+            state.rpy.tolist(),
+            state.imu_temperature,
         ),
         used + spare,
         BmsState(
-            0, 0, state.battery_status, state.battery_percent, state.battery_current_ma, state.battery_cycles,
-            [0, 0], [0, 0], state.cell_voltage_mv.tolist(),
+            0,
+            0,
+            state.battery_status,
+            state.battery_percent,
+            state.battery_current_ma,
+            state.battery_cycles,
+            [0, 0],
+            [0, 0],
+            state.cell_voltage_mv.tolist(),
         ),
-        state.foot_force[LEGS_IN_WIRE_ORDER].tolist(), state.foot_force_estimate[LEGS_IN_WIRE_ORDER].tolist(),
-        state.tick_ms, list(state.remote), 0, 0.0, 0, 0, state.voltage, state.current, [0] * 4, 0, 0,
-    )  # fmt: skip
+        state.foot_force[LEGS_IN_WIRE_ORDER].tolist(),
+        state.foot_force_estimate[LEGS_IN_WIRE_ORDER].tolist(),
+        state.tick_ms,
+        list(state.remote),
+        0,
+        0.0,
+        0,
+        0,
+        state.voltage,
+        state.current,
+        [0] * 4,
+        0,
+        0,
+    )
     assert encode_low_state(state) == signed(message, STATE_STRUCT)
 
 
@@ -382,15 +441,32 @@ def random_command(seed: int) -> LowCommand:
 def command_message(command: LowCommand) -> LowCmd:
     """Return the same command for pycdr2: 12 motors in wire order, 8 with the vendor's stop values."""
     rows = zip(
-        command.mode, command.position, command.velocity, command.effort, command.stiffness, command.damping,
+        command.mode,
+        command.position,
+        command.velocity,
+        command.effort,
+        command.stiffness,
+        command.damping,
         strict=True,
-    )  # fmt: skip
+    )
     listed = [MotorCmd(int(mode), *map(float, rest), [0, 0, 0]) for mode, *rest in rows]
     spare = [MotorCmd(1, 2.146e9, 16000.0, 0.0, 0.0, 0.0, [0, 0, 0]) for _ in range(8)]
     return LowCmd(
-        [0xFE, 0xEF], 0xFF, 0, [0, 0], [0, 0], 0, [listed[j] for j in IN_WIRE_ORDER] + spare,
-        BmsCmd(0, [0] * 3), [0] * 40, [0] * 12, [0, 0], 0, 0, 0,
-    )  # fmt: skip
+        [0xFE, 0xEF],
+        0xFF,
+        0,
+        [0, 0],
+        [0, 0],
+        0,
+        [listed[j] for j in IN_WIRE_ORDER] + spare,
+        BmsCmd(0, [0] * 3),
+        [0] * 40,
+        [0] * 12,
+        [0, 0],
+        0,
+        0,
+        0,
+    )
 
 
 @few
@@ -414,9 +490,13 @@ def test_decoded_command_equals_the_oracle(seed: int) -> None:
         motor.reserve = [0] * 3
     command = decode_low_command(signed(message, COMMAND_STRUCT))
     for ours, theirs in (
-        ("position", "q"), ("velocity", "dq"), ("stiffness", "kp"), ("damping", "kd"), ("effort", "tau"),
+        ("position", "q"),
+        ("velocity", "dq"),
+        ("stiffness", "kp"),
+        ("damping", "kd"),
+        ("effort", "tau"),
         ("mode", "mode"),
-    ):  # fmt: skip
+    ):
         np.testing.assert_array_equal(getattr(command, ours)[IN_WIRE_ORDER], motors(message, theirs), ours)
 
 

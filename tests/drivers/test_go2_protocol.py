@@ -31,24 +31,42 @@ from deal_hw.errors import ConfigurationError, FrameError
 def command(**changes: object) -> LowCommand:
     """Return a command whose every number tells its joint."""
     values: dict[str, object] = {
-        "position": np.arange(12.0), "velocity": np.arange(12.0) + 100, "stiffness": np.arange(12.0) + 200,
-        "damping": np.arange(12.0) + 300, "effort": np.arange(12.0) + 400,
-    }  # fmt: skip
+        "position": np.arange(12.0),
+        "velocity": np.arange(12.0) + 100,
+        "stiffness": np.arange(12.0) + 200,
+        "damping": np.arange(12.0) + 300,
+        "effort": np.arange(12.0) + 400,
+    }
     return LowCommand(**{**values, **changes})  # type: ignore[arg-type]
 
 
 def state(**changes: object) -> LowState:
     """Return a state whose every number tells its joint."""
     values: dict[str, object] = {
-        "position": np.arange(12.0), "velocity": np.arange(12.0) + 100, "acceleration": np.arange(12.0) + 200,
-        "effort": np.arange(12.0) + 300, "temperature": np.arange(12) + 30, "lost": np.arange(12),
-        "mode": np.ones(12, np.int64), "orientation": np.array([1.0, 0.0, 0.0, 0.0]),
-        "angular_velocity": np.array([0.1, 0.2, 0.3]), "specific_force": np.array([0.0, 0.0, 9.81]),
-        "rpy": np.zeros(3), "imu_temperature": 61, "foot_force": np.array([10, 20, 30, 40]),
-        "foot_force_estimate": np.array([11, 21, 31, 41]), "tick_ms": 0x01020304, "remote": bytes(40),
-        "battery_percent": 77, "battery_current_ma": -1500, "battery_status": 8, "battery_cycles": 12,
-        "cell_voltage_mv": np.full(15, 3900), "voltage": 29.5, "current": 1.25,
-    }  # fmt: skip
+        "position": np.arange(12.0),
+        "velocity": np.arange(12.0) + 100,
+        "acceleration": np.arange(12.0) + 200,
+        "effort": np.arange(12.0) + 300,
+        "temperature": np.arange(12) + 30,
+        "lost": np.arange(12),
+        "mode": np.ones(12, np.int64),
+        "orientation": np.array([1.0, 0.0, 0.0, 0.0]),
+        "angular_velocity": np.array([0.1, 0.2, 0.3]),
+        "specific_force": np.array([0.0, 0.0, 9.81]),
+        "rpy": np.zeros(3),
+        "imu_temperature": 61,
+        "foot_force": np.array([10, 20, 30, 40]),
+        "foot_force_estimate": np.array([11, 21, 31, 41]),
+        "tick_ms": 0x01020304,
+        "remote": bytes(40),
+        "battery_percent": 77,
+        "battery_current_ma": -1500,
+        "battery_status": 8,
+        "battery_cycles": 12,
+        "cell_voltage_mv": np.full(15, 3900),
+        "voltage": 29.5,
+        "current": 1.25,
+    }
     return LowState(**{**values, **changes})  # type: ignore[arg-type]
 
 

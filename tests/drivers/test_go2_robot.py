@@ -130,7 +130,7 @@ def test_a_failed_connect_closes_the_transport() -> None:
         wire.topics.receive(0.0)
     wire.device.talks = True
     wire.robot.connect()
-    assert wire.robot.link_errors == 0
+    assert wire.robot.transport_errors == 0
 
 
 def test_nothing_works_before_connecting() -> None:
@@ -170,7 +170,7 @@ def test_broken_states_are_counted(change: Callable[[bytes], list[bytes]], error
     wire.robot.read_state(0.1)
     wire.spoil_once(change)
     states = drained(wire.robot, 10)
-    assert wire.robot.link_errors == errors
+    assert wire.robot.transport_errors == errors
     steps = np.diff([state.device_ns for state in states]) // MS
     assert set(steps.tolist()) <= {2, 4}
     assert np.diff([state.sequence for state in states]).tolist() == (steps // 2).tolist()
@@ -191,7 +191,7 @@ def test_an_overtaken_state_is_dropped() -> None:
     wire.topics.tamper = swap
     states = drained(wire.robot, 5)
     # One gap before the newer of the two, and the older.
-    assert wire.robot.link_errors == 2
+    assert wire.robot.transport_errors == 2
     assert (np.diff([state.device_ns for state in states]) > 0).all()
 
 
@@ -204,7 +204,7 @@ def test_a_clock_that_stops_ends_in_a_timeout_that_says_so() -> None:
     wire.robot.read_state(0.1)
     with pytest.raises(TransportTimeoutError, match="clock stands still"):
         wire.robot.read_state(0.1)
-    assert wire.robot.link_errors >= 45
+    assert wire.robot.transport_errors >= 45
 
 
 def test_the_clock_may_wrap() -> None:
@@ -214,7 +214,7 @@ def test_the_clock_may_wrap() -> None:
     wire.robot.connect()
     states = drained(wire.robot, 20)
     assert set(np.diff([state.device_ns for state in states]).tolist()) == {2 * MS}
-    assert wire.robot.link_errors == 0
+    assert wire.robot.transport_errors == 0
 
 
 def test_a_robot_that_was_restarted_is_lost() -> None:
@@ -257,7 +257,7 @@ def test_head_and_checksum_can_be_left_alone() -> None:
     robot.home(5.0)
     robot.arm(1.0)
     assert robot.read_state(0.1).position.shape == (12,)
-    assert robot.link_errors == 0 and len(wire.device.heard) == 1
+    assert robot.transport_errors == 0 and len(wire.device.heard) == 1
 
 
 @pytest.mark.parametrize(
@@ -332,17 +332,25 @@ def test_a_command_reaches_the_motors_as_it_was() -> None:
     wire = FakeBench(mode="")
     robot = wire.armed()
     wish = dataclasses.replace(
-        default_command(robot), position_target=np.arange(12) / 7, velocity_target=np.arange(12) / 11,
-        stiffness=np.arange(12, dtype=np.float64) + 1.3, damping=np.arange(12.0) / 13,
-        effort=np.arange(12.0) / 17, effort_limit=np.zeros(12), speed_limit=np.zeros(12),
-    )  # fmt: skip
+        default_command(robot),
+        position_target=np.arange(12) / 7,
+        velocity_target=np.arange(12) / 11,
+        stiffness=np.arange(12, dtype=np.float64) + 1.3,
+        damping=np.arange(12.0) / 13,
+        effort=np.arange(12.0) / 17,
+        effort_limit=np.zeros(12),
+        speed_limit=np.zeros(12),
+    )
     sent = robot.send_command(wish)
     robot.read_state(0.1)
     _, heard = wire.device.heard[-1]
     for ours, theirs in (
-        ("position_target", "position"), ("velocity_target", "velocity"), ("stiffness", "stiffness"),
-        ("damping", "damping"), ("effort", "effort"),
-    ):  # fmt: skip
+        ("position_target", "position"),
+        ("velocity_target", "velocity"),
+        ("stiffness", "stiffness"),
+        ("damping", "damping"),
+        ("effort", "effort"),
+    ):
         np.testing.assert_array_equal(getattr(sent, ours), getattr(heard, theirs), ours)
         np.testing.assert_allclose(getattr(sent, ours), getattr(wish, ours), rtol=1e-7)
     assert sent.effort_limit.tolist() == list(DRIVER.effort_limit)
@@ -489,7 +497,7 @@ def test_the_robot_on_a_stand_is_another_description() -> None:
     """Same wire; no floor, a level stand, the gains of the suspended recording."""
     wire = FakeBench(Go2OnStandRobot, mode="")
     robot = wire.armed()
-    assert robot.description.name == "go2_hung"
+    assert robot.description.name == "go2_on_stand"
     assert robot.description.floating_base is None
     assert robot.description.limits.legs is not None and robot.description.limits.legs.tilt == 0.35
     assert robot.description.stiffness == (20.0,) * 12

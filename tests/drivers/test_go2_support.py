@@ -110,13 +110,15 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
     "lying, leaning a little": (Support.FLOOR, states(RESTING, **leaning(0.3))),
     "standing": (Support.FLOOR, states(STANDING, load=WEIGHT_N)),
     "standing, dead foot sensors": (
-        Support.FLOOR, states(STANDING, load=WEIGHT_N, foot_force=np.zeros(4, np.int64))
+        Support.FLOOR,
+        states(STANDING, load=WEIGHT_N, foot_force=np.zeros(4, np.int64)),
     ),
     "standing, efforts read a third low": (Support.FLOOR, states(STANDING, load=0.67 * WEIGHT_N)),
     "hanging": (Support.HELD, states(LEGS_DOWN)),
     "hanging, held in the standing pose": (Support.HELD, states(STANDING, load=-12.0)),
     "hanging, feet sensors with offsets": (
-        Support.HELD, states(LEGS_DOWN, foot_force=np.array((30, 17, 22, 0)))
+        Support.HELD,
+        states(LEGS_DOWN, foot_force=np.array((30, 17, 22, 0))),
     ),
     "hanging, one sensor stuck": (Support.HELD, states(LEGS_DOWN, foot_force=np.array((400, 0, 0, 0)))),
     "hanging, one leg left folded": (Support.HELD, states(ONE_FOLDED)),
@@ -124,9 +126,7 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
     "hanging, legs left half folded": (Support.UNDECIDED, states(HALF_FOLDED)),
     "feet on the floor, half in a sling": (Support.UNDECIDED, states(STANDING, load=0.4 * WEIGHT_N)),
     "legs pulled down": (Support.UNDECIDED, states(STANDING, load=-0.4 * WEIGHT_N)),
-    "limp legs on the floor": (
-        Support.UNDECIDED, states(STANDING, foot_force=np.array((90, 80, 20, 20)))
-    ),
+    "limp legs on the floor": (Support.UNDECIDED, states(STANDING, foot_force=np.array((90, 80, 20, 20)))),
     "on its side": (Support.UNDECIDED, states(STANDING, **leaning(1.5))),
     "the reported case": (Support.UNDECIDED, states(RESTING, **leaning(0.85))),
     "on its back": (Support.UNDECIDED, states(STANDING, **leaning(3.1))),
@@ -134,16 +134,18 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
     "walking": (Support.UNDECIDED, states(STANDING, load=WEIGHT_N, velocity=np.full(12, 2.0))),
     "falling": (Support.UNDECIDED, states(STANDING, specific_force=np.array((0.0, 0.0, 1.0)))),
     "orientation upside down": (
-        Support.UNDECIDED, states(LEGS_DOWN, specific_force=np.array((0.0, 0.0, -9.81)))
+        Support.UNDECIDED,
+        states(LEGS_DOWN, specific_force=np.array((0.0, 0.0, -9.81))),
     ),
     "orientation frozen": (
-        Support.UNDECIDED, states(LEGS_DOWN, specific_force=leaning(0.3)["specific_force"])
+        Support.UNDECIDED,
+        states(LEGS_DOWN, specific_force=leaning(0.3)["specific_force"]),
     ),
     "no orientation": (Support.UNDECIDED, states(LEGS_DOWN, orientation=np.zeros(4))),
     "a broken encoder": (Support.UNDECIDED, states(np.where(np.arange(12) == 4, np.nan, LEGS_DOWN))),
     "few states": (Support.UNDECIDED, states(LEGS_DOWN, count=49)),
     "no states": (Support.UNDECIDED, []),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -193,9 +195,17 @@ def test_an_emulated_robot_is_told_with_a_margin(
     sent = device.advance_to(800_000_000)
     frames = [decode_low_state(payload) for topic, payload in sent if topic == topics.LOW_STATE][-150:]
     tight = SupportConfig(
-        held_reach_m=0.25, lying_reach_m=0.08, unloaded=0.12, loaded=0.75, foot_pressed=30.0, level_rad=0.1,
-        joint_rad_s=0.4, body_rad_s=0.2, force_m_s2=0.3, sensors_rad=0.1,
-    )  # fmt: skip
+        held_reach_m=0.25,
+        lying_reach_m=0.08,
+        unloaded=0.12,
+        loaded=0.75,
+        foot_pressed=30.0,
+        level_rad=0.1,
+        joint_rad_s=0.4,
+        body_rad_s=0.2,
+        force_m_s2=0.3,
+        sensors_rad=0.1,
+    )
     assert read_support(frames, tight).support is (Support.HELD if on_stand else Support.FLOOR)
 
 
@@ -215,7 +225,7 @@ def test_a_stand_is_refused_by_the_floors_robot(start: Any, sport: str) -> None:
     """Nothing is commanded, sport mode keeps the robot, and being made passive sends nothing either."""
     device = Go2Device(draw_truth("realistic", 1), on_stand=True, start=start, sport=sport)
     robot, clock = rig(Go2Robot, device)
-    with pytest.raises(SafetyError, match=r"holds the robot in the air.*go2_hung.*--no-support-check"):
+    with pytest.raises(SafetyError, match=r"holds the robot in the air.*go2_on_stand.*--no-support-check"):
         robot.home(20.0)
     make_passive(robot, clock)
     assert (device.log.accepted, device.sport_name) == (0, sport)

@@ -59,9 +59,13 @@ class Counting:
         """Run the loop for a short while."""
         description = self.robot.description
         loop = ControlLoop(
-            self.robot, HoldBehaviour(description), Safety(description), self.clock, lambda record: True,
+            self.robot,
+            HoldBehaviour(description),
+            Safety(description),
+            self.clock,
+            lambda record: True,
             LoopConfig(duration_s=0.4, dry_run=dry_run, hand_back=True, passive=PassiveConfig(timeout_s=0.2)),
-        )  # fmt: skip
+        )
         return loop.run().outcome
 
 

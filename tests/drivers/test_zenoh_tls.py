@@ -29,10 +29,26 @@ def openssl(*arguments: object) -> None:
 def make_ca(folder: Path, name: str) -> Path:
     """Make an authority as docs/go2-zenoh.md does, and return its certificate; its key lies beside it."""
     openssl(
-        "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", 30,
-        "-subj", f"/CN={name}", "-keyout", folder / f"{name}.key", "-out", folder / f"{name}.pem",
-        "-addext", "basicConstraints=critical,CA:TRUE", "-addext", "keyUsage=critical,keyCertSign,cRLSign",
-    )  # fmt: skip
+        "req",
+        "-x509",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:P-256",
+        "-nodes",
+        "-days",
+        30,
+        "-subj",
+        f"/CN={name}",
+        "-keyout",
+        folder / f"{name}.key",
+        "-out",
+        folder / f"{name}.pem",
+        "-addext",
+        "basicConstraints=critical,CA:TRUE",
+        "-addext",
+        "keyUsage=critical,keyCertSign,cRLSign",
+    )
     return folder / f"{name}.pem"
 
 
@@ -41,16 +57,39 @@ def make_certificate(ca: Path, name: str, address: str) -> WireOptions:
     folder = ca.parent
     key, request, certificate = (folder / f"{name}.{end}" for end in ("key", "csr", "pem"))
     openssl(
-        "req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-subj", f"/CN={name}",
-        "-keyout", key, "-out", request,
-    )  # fmt: skip
+        "req",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:P-256",
+        "-nodes",
+        "-subj",
+        f"/CN={name}",
+        "-keyout",
+        key,
+        "-out",
+        request,
+    )
     (folder / f"{name}.ext").write_text(
         f"subjectAltName=IP:{address}\nextendedKeyUsage=serverAuth,clientAuth\nbasicConstraints=CA:FALSE\n"
     )
     openssl(
-        "x509", "-req", "-days", 30, "-in", request, "-CA", ca, "-CAkey", ca.with_suffix(".key"),
-        "-CAcreateserial", "-extfile", folder / f"{name}.ext", "-out", certificate,
-    )  # fmt: skip
+        "x509",
+        "-req",
+        "-days",
+        30,
+        "-in",
+        request,
+        "-CA",
+        ca,
+        "-CAkey",
+        ca.with_suffix(".key"),
+        "-CAcreateserial",
+        "-extfile",
+        folder / f"{name}.ext",
+        "-out",
+        certificate,
+    )
     return WireOptions(ca=ca, certificate=certificate, key=key)
 
 

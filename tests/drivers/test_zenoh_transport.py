@@ -382,9 +382,12 @@ def test_a_process_that_raises_in_the_middle_ends(endpoint: str, side: str) -> N
         process = stack.enter_context(
             subprocess.Popen(
                 [sys.executable, "-c", textwrap.dedent(EXIT_SCRIPT), endpoint, side],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
             )
-        )  # fmt: skip
+        )
         stack.callback(process.kill)
         assert process.stdout is not None
         assert process.stdout.readline() == "open\n"

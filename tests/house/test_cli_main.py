@@ -22,9 +22,19 @@ from deal_hw.install import install_line
 
 ROOT = Path(__file__).resolve().parents[2]
 WIRES_AND_SIMULATORS = (
-    "can", "cantools", "cyclonedds", "dynamixel_easy_sdk", "dynamixel_sdk", "mujoco", "onnxruntime",
-    "rerun", "scipy", "serial", "torch", "zenoh",
-)  # fmt: skip
+    "can",
+    "cantools",
+    "cyclonedds",
+    "dynamixel_easy_sdk",
+    "dynamixel_sdk",
+    "mujoco",
+    "onnxruntime",
+    "rerun",
+    "scipy",
+    "serial",
+    "torch",
+    "zenoh",
+)
 HEAVY = ("numpy", "rich", "tyro", *WIRES_AND_SIMULATORS)
 
 
@@ -83,7 +93,7 @@ def test_unknown_verb_lists_the_verbs_and_the_nearest(capsys: pytest.CaptureFixt
     assert out == ""
     assert err == (
         "deal-hw: error: unknown verb 'calibrat'; known: collect, calibrate, train, deploy, inspect, demo, "
-        "excite, emulate, bridge, keys, data, replay, doctor, bench; did you mean 'calibrate'?\n"
+        "design-excitation, emulate, bridge, keys, data, replay, doctor, bench; did you mean 'calibrate'?\n"
     )
 
 

@@ -12,7 +12,7 @@ from import_graph import imports, module_name, package_folders
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 SERVICES = ("control", "data", "sim", "testing", "viz")
-VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema")
+VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema", "install", "child_process")
 CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")
 LAYER = {
     **dict.fromkeys(("deal_hw", *VOCABULARY), 0),
@@ -223,7 +223,7 @@ def test_repository_keeps_the_order() -> None:
         ("deal_hw/control/x.py", "import time\nnow = time.time()", "time.time() jumps"),
         ("calib/x.py", "x = 1\n" * 601, "more than 600"),
     ],
-)  # fmt: skip
+)
 def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None:
     """Each kind of breach is found, and found once."""
     (found,) = violations({path: source})

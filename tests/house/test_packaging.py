@@ -22,9 +22,15 @@ LEAVES = ("calib", "drivers", "policies")
 FOLDERS = ("deal_hw", *LEAVES)
 
 BASE_FOLDERS = (
-    "deal_hw", "deal_hw/control", "deal_hw/data", "deal_hw/data/checks", "deal_hw/data/export",
-    "deal_hw/data/importing", "deal_hw/data/recording", "drivers/transports",
-)  # fmt: skip
+    "deal_hw",
+    "deal_hw/control",
+    "deal_hw/data",
+    "deal_hw/data/checks",
+    "deal_hw/data/export",
+    "deal_hw/data/importing",
+    "deal_hw/data/recording",
+    "drivers/transports",
+)
 BASE_MODULES = (
     "deal_hw.cli.main",
     "deal_hw.cli.bridge",
@@ -47,9 +53,22 @@ BASE_MODULES = (
     "deal_hw.drivers.go2.robot",
 )
 EXTRAS = (
-    "torch", "mujoco", "scipy", "rerun", "gymnasium", "stable_baselines3", "onnx", "onnxscript", "matplotlib",
-    "psutil", "pytest", "hypothesis", "cryptography", "cyclonedds", "zenoh",
-)  # fmt: skip
+    "torch",
+    "mujoco",
+    "scipy",
+    "rerun",
+    "gymnasium",
+    "stable_baselines3",
+    "onnx",
+    "onnxscript",
+    "matplotlib",
+    "psutil",
+    "pytest",
+    "hypothesis",
+    "cryptography",
+    "cyclonedds",
+    "zenoh",
+)
 """Zenoh comes with the base install, but only a robot that is reached over it needs it loaded."""
 
 IMPORT_BASE = """
@@ -218,9 +237,21 @@ def test_the_wheel_calibrates_a_robot_in_a_clean_environment(wheel: Path, tmp_pa
     assert done.returncode == 0, done.stderr
     model, (recording, *_), other = write(make_robot("pendulum", seed=0), tmp_path / "robot", seconds=8.0)
     done = run(
-        [where / "bin" / "deal-hw", "calibrate", "--model", model, "--data", recording, "--holdout", other,
-         "--out", "found", "--threads", "1"]
-    )  # fmt: skip
+        [
+            where / "bin" / "deal-hw",
+            "calibrate",
+            "--model",
+            model,
+            "--data",
+            recording,
+            "--holdout",
+            other,
+            "--out",
+            "found",
+            "--threads",
+            "1",
+        ]
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert [path.name for path in (tmp_path / "found").rglob("calibrated.xml")]
     line = "import deal_hw; print(deal_hw.__file__)"

@@ -35,8 +35,8 @@ from deal_hw.cli.run_plan import RunPlan
 from deal_hw.cli.supervised import run_episodes
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import HoldBehaviour
-from deal_hw.control.handover import Beat
 from deal_hw.control.loop import ControlLoop, LoopConfig
+from deal_hw.control.process_channel import Beat
 from deal_hw.control.safety import Safety
 from deal_hw.data.importing.load import load_tables
 from deal_hw.data.recording.dataset import Dataset
@@ -284,7 +284,7 @@ def test_a_second_run_is_refused_and_does_not_take_over(
     [(Go2OnStandRobot, False, "on the floor"), (Go2Robot, True, "holds the robot in the air")],
 )
 def test_robot_and_model_must_agree(kind: type[Go2Robot], on_stand: bool, words: str) -> None:
-    """`collect go2_hung` with the robot on the floor was accepted, and ended at 0.85 rad of tilt."""
+    """`collect go2_on_stand` with the robot on the floor was accepted, and ended at 0.85 rad of tilt."""
     device = Go2Device(draw_truth("realistic", 1), on_stand=on_stand)
     clock = VirtualClock(S)
     robot = kind(VirtualTopics(device, clock), clock)
@@ -574,7 +574,7 @@ OUT_OF_RANGE: Iterable[Callable[[], object]] = (
     lambda: Calibrate(dataset=Path("d"), latency=12.0),
     lambda: Calibrate(dataset=Path("d"), latency=float("nan")),
     lambda: Calibrate(dataset=Path("d"), seed=-1),
-    lambda: Collect(robot="cartpole", port="p", out=Path("o"), vigor=float("nan")),
+    lambda: Collect(robot="cartpole", port="p", out=Path("o"), excitation_level=float("nan")),
     lambda: Collect(robot="cartpole", port="p", out=Path("o"), seconds=float("nan")),
 )
 
@@ -588,5 +588,5 @@ def test_numbers_out_of_range_are_refused(make: Callable[[], object]) -> None:
 
 def test_a_negative_seed_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A traceback of numpy."""
-    assert main(["excite", "cartpole", "--out", str(tmp_path / "o"), "--seed", "-1"]) == 2
+    assert main(["design-excitation", "cartpole", "--out", str(tmp_path / "o"), "--seed", "-1"]) == 2
     assert capsys.readouterr().err.count("\n") == 1

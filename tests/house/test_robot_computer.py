@@ -21,9 +21,17 @@ from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 
 EXTRAS = (
-    "torch", "mujoco", "scipy", "rerun", "gymnasium", "stable_baselines3", "onnx", "matplotlib", "pyarrow",
+    "torch",
+    "mujoco",
+    "scipy",
+    "rerun",
+    "gymnasium",
+    "stable_baselines3",
+    "onnx",
+    "matplotlib",
+    "pyarrow",
     "cyclonedds",
-)  # fmt: skip
+)
 REFUSE = f"""
 import sys
 
@@ -175,8 +183,12 @@ def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, por
         pytest.skip(f"{own} is not installed")
     done = subprocess.run(
         [sys.executable, "-c", REACH_GO2, transport, free_port(port), "97"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
     told = json.loads(done.stdout)
     networks = {"zenoh", "cyclonedds"}
     heavy = set(EXTRAS) - networks

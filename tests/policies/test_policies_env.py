@@ -32,9 +32,11 @@ def test_reward_by_hand() -> None:
     env = CartPoleEnv(DESCRIPTION, POINT, 2, task=task)
     # 5 * 0.02 + 0.1 * 0.3 + 4 * 0.1^2 + 0.5 * (0.4 - 0.2)^2 = 0.1 + 0.03 + 0.04 + 0.02 = 0.19; and 0 at rest.
     reward = env.reward(
-        np.array([[-0.1, 0.02], [0.0, 0.0]]), np.array([[-0.3, 9.0], [0.0, 0.0]]), np.array([[0.4], [0.0]]),
+        np.array([[-0.1, 0.02], [0.0, 0.0]]),
+        np.array([[-0.3, 9.0], [0.0, 0.0]]),
+        np.array([[0.4], [0.0]]),
         np.array([[0.2], [0.0]]),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(reward, [math.exp(-0.19) - 1.0, 0.0], atol=1e-12)
 
 

@@ -78,11 +78,18 @@ def test_batched_evaluation_tells_who_balances() -> None:
     rng = np.random.default_rng(0)
     good, bad = (
         evaluate_batch(
-            Feedback(gain), DESCRIPTION, SPACE, theta, latency, rng, seconds=3.0, start_position=start,
+            Feedback(gain),
+            DESCRIPTION,
+            SPACE,
+            theta,
+            latency,
+            rng,
+            seconds=3.0,
+            start_position=start,
             sensor=EXACT_SENSOR,
         )
         for gain in (1.0, 0.0)
-    )  # fmt: skip
+    )
     assert [r.fell for r in good] == [False, False]
     assert [r.fell for r in bad] == [True, True]
     assert max(r.angle_error_rad for r in good) < 0.04 < min(r.angle_error_rad for r in bad)

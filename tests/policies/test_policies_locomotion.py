@@ -142,9 +142,16 @@ def test_go2_feet_are_paid_for_following_the_clock() -> None:
     """
     for standing, wanted in ((1.0, 1.0), (0.0, 1.0 - 1.0 / math.pi)):
         env = make(
-            "go2", 4, standing=standing, zeroed=0.0, push_ticks=NEVER, command_ticks=NEVER, start_speed=0.0,
-            start_noise_rad=0.0, payload_kg=(0.0, 0.0),
-        )  # fmt: skip
+            "go2",
+            4,
+            standing=standing,
+            zeroed=0.0,
+            push_ticks=NEVER,
+            command_ticks=NEVER,
+            start_speed=0.0,
+            start_noise_rad=0.0,
+            payload_kg=(0.0, 0.0),
+        )
         env.reset(seed=1)
         env.step(np.zeros((4, 12)))
         env.measures()
@@ -199,10 +206,13 @@ def test_go2_targets_are_those_of_the_filter_that_deploys(monkeypatch: pytest.Mo
         for i in range(3):
             wanted = JointCommand(
                 position_target=np.array(GO2.default_position) + np.array(spec.action_scale) * action[i],
-                velocity_target=np.zeros(12), effort=np.zeros(12), stiffness=np.array(spec.stiffness),
-                damping=np.array(spec.damping), effort_limit=np.array(spec.effort_limit),
+                velocity_target=np.zeros(12),
+                effort=np.zeros(12),
+                stiffness=np.array(spec.stiffness),
+                damping=np.array(spec.damping),
+                effort_limit=np.array(spec.effort_limit),
                 speed_limit=np.array(spec.speed_limit),
-            )  # fmt: skip
+            )
             command, clipped = filters.clip(wanted, previous[i], seen[0][i], seen[1][i])
             np.testing.assert_allclose(sent[-1][i], command.position_target, atol=1e-12)
             previous[i] = command.position_target

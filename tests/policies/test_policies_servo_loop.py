@@ -29,7 +29,7 @@ def nominal(count: int = 1) -> np.ndarray:
 
 
 @pytest.mark.parametrize("latency_ticks", [0, 7, 20, 33, 45])
-def test_loop_equals_an_open_loop_rollout(latency_ticks: int) -> None:
+def test_loop_equals_a_rollout_without_feedback(latency_ticks: int) -> None:
     """Five periods of random targets give the states of one rollout in which the same targets act later."""
     rng = np.random.default_rng(latency_ticks)
     theta = SPACE.sample(rng, 2)

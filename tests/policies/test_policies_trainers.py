@@ -38,9 +38,16 @@ def upright_seconds(policy: Policy) -> float:
     start[:, 1] = np.linspace(-0.05, 0.05, 6)
     theta = np.repeat(SPACE.nominal[None], 6, axis=0)
     results = evaluate_batch(
-        policy, DESCRIPTION, SPACE, theta, np.zeros(6), np.random.default_rng(0), seconds=5.0,
-        start_position=start, sensor=EXACT_SENSOR,
-    )  # fmt: skip
+        policy,
+        DESCRIPTION,
+        SPACE,
+        theta,
+        np.zeros(6),
+        np.random.default_rng(0),
+        seconds=5.0,
+        start_position=start,
+        sensor=EXACT_SENSOR,
+    )
     return float(np.mean([r.upright_s for r in results]))
 
 
@@ -119,9 +126,12 @@ def test_a_training_that_diverges_is_stopped_and_keeps_its_checkpoint(
         PpoTrainer().train(make(), config, np.random.default_rng(0), files=TrainingFiles(checkpoint=file))
     steps: list[int] = []
     PpoTrainer().train(
-        make(), PpoConfig(steps=1_152, hidden=(8,)), np.random.default_rng(0),
-        lambda status: steps.append(status.steps), TrainingFiles(checkpoint=file, resume=True),
-    )  # fmt: skip
+        make(),
+        PpoConfig(steps=1_152, hidden=(8,)),
+        np.random.default_rng(0),
+        lambda status: steps.append(status.steps),
+        TrainingFiles(checkpoint=file, resume=True),
+    )
     assert steps == [1_152]
 
 

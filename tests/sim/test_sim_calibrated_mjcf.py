@@ -87,9 +87,13 @@ def write_model(folder: Path) -> Path:
     (folder / "meshes").mkdir()
     top = TOP.replace("  <asset>", '  <include file="parts/toe.xml"/>\n  <asset>')
     for name, text in (
-        ("walker.xml", top), ("parts/defaults.xml", DEFAULTS), ("parts/leg.xml", LEG), ("parts/toe.xml", TOE),
-        ("meshes/shell.obj", tetrahedron(0.3)), ("parts/toe.obj", tetrahedron(0.05)),
-    ):  # fmt: skip
+        ("walker.xml", top),
+        ("parts/defaults.xml", DEFAULTS),
+        ("parts/leg.xml", LEG),
+        ("parts/toe.xml", TOE),
+        ("meshes/shell.obj", tetrahedron(0.3)),
+        ("parts/toe.obj", tetrahedron(0.05)),
+    ):
         (folder / name).write_text(text, encoding="utf-8")
     return folder / "walker.xml"
 
@@ -151,8 +155,10 @@ def test_changed_includes_are_written_beside_and_others_are_referred_to(tmp_path
     written = write(path, target, change)
     assert written.dof_damping[written.joint("knee").dofadr] == 0.75 and written.opt.timestep == 0.001
     assert sorted(p.name for p in target.parent.iterdir()) == [
-        "calibrated.xml", "calibrated_leg.xml", "calibrated_toe.xml",
-    ]  # fmt: skip
+        "calibrated.xml",
+        "calibrated_leg.xml",
+        "calibrated_toe.xml",
+    ]
     text = target.read_text()
     assert 'file="../../robot/parts/defaults.xml"' in text and 'meshdir="../../robot/meshes"' in text
     toe = (target.parent / "calibrated_toe.xml").read_text()

@@ -35,9 +35,15 @@ def delays(robot: RobotModel) -> ParameterSpace:
 
     def parameter(name: str, elements: tuple[str, ...]) -> Parameter:
         return Parameter(
-            name=name, kind="command_delay", elements=elements, unit="s", nominal=0.0, low=0.0, high=0.05,
+            name=name,
+            kind="command_delay",
+            elements=elements,
+            unit="s",
+            nominal=0.0,
+            low=0.0,
+            high=0.05,
             scale="linear",
-        )  # fmt: skip
+        )
 
     return ParameterSpace([parameter("one", (one,)), parameter("others", others)])
 
@@ -93,9 +99,13 @@ def test_a_part_of_a_step_is_mixed(robot: RobotModel) -> None:
     batch = ServoBatch(robot, space, 1, threads=1)
     batch.set_parameters(np.array([[0.0025, 0.004]]))
     recording = record_target(
-        robot, space, space.nominal, lambda x, v, t: np.array(DESCRIPTION.default_position), seconds=0.1,
+        robot,
+        space,
+        space.nominal,
+        lambda x, v, t: np.array(DESCRIPTION.default_position),
+        seconds=0.1,
         rng=np.random.default_rng(0),
-    ).episode  # fmt: skip
+    ).episode
     steps = recording.steps
     ramp = np.repeat(np.arange(1.0, steps + 1)[:, None], 12, axis=1)
     episode = dataclasses.replace(recording, target=ramp, start_setpoint=np.zeros(12))

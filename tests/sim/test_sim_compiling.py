@@ -29,14 +29,19 @@ HOSTILE = {
     "no XML": ("<worldbody", "does not compile: XML parse error"),
     "include": ("<include file='nothere.xml'/>", "does not compile: .*nothere.xml"),
     "mesh": ("<asset><mesh name='a' file='nothere.stl'/></asset>", "does not compile: .*nothere.stl"),
-    "not a number": ("<worldbody><body pos='nan 0 0'><joint/><geom size='1'/></body></worldbody>",
-                     "holds a number that is not finite"),
+    "not a number": (
+        "<worldbody><body pos='nan 0 0'><joint/><geom size='1'/></body></worldbody>",
+        "holds a number that is not finite",
+    ),
     "timestep": (f"<option timestep='0'/><worldbody>{JOINT}</worldbody>", "has a timestep of 0 s"),
     "arena": (f"<size memory='100K'/><worldbody>{PILE}</worldbody>", "cannot be simulated: .*<size memory"),
-    "unstable": (f"<worldbody>{JOINT}</worldbody><actuator><general joint='j' biastype='affine' "
-                 "biasprm='1e25 0 0'/></actuator>", "diverges in its first 10 steps"),
+    "unstable": (
+        f"<worldbody>{JOINT}</worldbody><actuator><general joint='j' biastype='affine' "
+        "biasprm='1e25 0 0'/></actuator>",
+        "diverges in its first 10 steps",
+    ),
     "depth": ("<worldbody>" + "<body>" * 3000 + "</body>" * 3000 + "</worldbody>", "nesting is too deep"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

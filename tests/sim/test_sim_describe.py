@@ -56,11 +56,18 @@ def hold(robot: RobotModel, target: tuple[float, float], position: tuple[float, 
     steps = 10 * (T - 1)
     rows = np.ones((steps, 2))
     return Episode(
-        step_s=robot.step_s, sample=10 * np.arange(T), position=np.tile(position, (T, 1)),
-        velocity=np.zeros((T, 2)), target=rows * target, stiffness=rows * robot.description.stiffness,
-        damping=rows * robot.description.damping, effort_limit=rows * np.inf, speed_limit=rows * np.inf,
-        usable=np.ones(T, dtype=bool), start_setpoint=np.array(target),
-    )  # fmt: skip
+        step_s=robot.step_s,
+        sample=10 * np.arange(T),
+        position=np.tile(position, (T, 1)),
+        velocity=np.zeros((T, 2)),
+        target=rows * target,
+        stiffness=rows * robot.description.stiffness,
+        damping=rows * robot.description.damping,
+        effort_limit=rows * np.inf,
+        speed_limit=rows * np.inf,
+        usable=np.ones(T, dtype=bool),
+        start_setpoint=np.array(target),
+    )
 
 
 def test_description_holds_what_the_model_says(tmp_path: Path) -> None:

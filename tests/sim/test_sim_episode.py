@@ -109,11 +109,18 @@ def test_short_gaps_are_filled_by_a_spline_and_long_ones_by_lines() -> None:
     time_s = 0.02 * np.arange(200)
     motion = np.sin(2 * np.pi * 3.0 * time_s)
     whole = Episode(
-        step_s=0.02, sample=kept, position=motion[kept, None], velocity=motion[kept, None],
-        target=np.zeros((200, 1)), stiffness=np.ones((200, 1)), damping=np.zeros((200, 1)),
-        effort_limit=np.ones((200, 1)), speed_limit=np.ones((200, 1)), usable=np.ones(len(kept), dtype=bool),
+        step_s=0.02,
+        sample=kept,
+        position=motion[kept, None],
+        velocity=motion[kept, None],
+        target=np.zeros((200, 1)),
+        stiffness=np.ones((200, 1)),
+        damping=np.zeros((200, 1)),
+        effort_limit=np.ones((200, 1)),
+        speed_limit=np.ones((200, 1)),
+        usable=np.ones(len(kept), dtype=bool),
         start_setpoint=np.zeros(1),
-    )  # fmt: skip
+    )
     filled = fill_gaps(whole)
     assert filled.reported is not None and np.flatnonzero(~filled.reported).tolist() == [
         104,

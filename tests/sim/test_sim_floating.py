@@ -27,9 +27,12 @@ from deal_hw.types import FloatArray
 
 VECTORS = hnp.arrays(np.float64, (5, 3), elements=st.floats(-1.7, 1.7))
 SENSING = Sensing(
-    joint_std=DESCRIPTION.sensor.noise, joint_resolution=DESCRIPTION.sensor.resolution,
-    orientation_std=ORIENTATION_NOISE_RAD, gyro_std=GYRO_NOISE_RAD_S, feet=FEET,
-)  # fmt: skip
+    joint_std=DESCRIPTION.sensor.noise,
+    joint_resolution=DESCRIPTION.sensor.resolution,
+    orientation_std=ORIENTATION_NOISE_RAD,
+    gyro_std=GYRO_NOISE_RAD_S,
+    feet=FEET,
+)
 
 
 @pytest.fixture(scope="module")
@@ -199,11 +202,17 @@ def test_an_encoder_bias_moves_what_is_reported_and_what_the_servo_holds(robot: 
     biased = ParameterSpace(
         [
             Parameter(
-                name="FL_calf.bias", kind="encoder_bias", elements=("FL_calf_joint",), unit="rad",
-                nominal=0.0, low=-0.1, high=0.1, scale="linear",
+                name="FL_calf.bias",
+                kind="encoder_bias",
+                elements=("FL_calf_joint",),
+                unit="rad",
+                nominal=0.0,
+                low=-0.1,
+                high=0.1,
+                scale="linear",
             )
         ]
-    )  # fmt: skip
+    )
     batch = ServoBatch(robot, biased, 2, threads=1)
     batch.set_parameters(np.array([[0.0], [0.05]]))
     pose = np.array(DESCRIPTION.default_position)

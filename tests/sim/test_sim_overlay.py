@@ -192,7 +192,13 @@ def _head(trajectory: Trajectory, count: int) -> Trajectory:
 
 def _rows(trajectory: Trajectory, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Trajectory:
     names = (
-        "receive_s", "device_s", "position", "velocity", "effort", "status", "command_sequence",
+        "receive_s",
+        "device_s",
+        "position",
+        "velocity",
+        "effort",
+        "status",
+        "command_sequence",
         "command_age_s",
-    )  # fmt: skip
+    )
     return dataclasses.replace(trajectory, **{name: getattr(trajectory, name)[rows] for name in names})

@@ -75,9 +75,15 @@ def _parameter(kind: str, element: str | None = None, nominal: float | None = No
         )
     value = VALUES.get(kind, 1.3) if nominal is None else nominal
     return Parameter(
-        name=f"{element}.{kind}", kind=kind, elements=(element,), unit=found.unit, nominal=value,
-        low=value / 2, high=value * 2, scale=found.scale,
-    )  # fmt: skip
+        name=f"{element}.{kind}",
+        kind=kind,
+        elements=(element,),
+        unit=found.unit,
+        nominal=value,
+        low=value / 2,
+        high=value * 2,
+        scale=found.scale,
+    )
 
 
 def _single(model: mujoco.MjModel, space: ParameterSpace, theta: np.ndarray) -> mujoco.MjModel:
@@ -145,9 +151,15 @@ def test_centre_of_mass_moves_by_the_offset(model: mujoco.MjModel) -> None:
 
 def _offset(body: str, axis: str, value: float) -> Parameter:
     return Parameter(
-        name=f"{body}.{axis}", kind=f"body_ipos_{axis}", elements=(body,), unit="m", nominal=value,
-        low=-0.05, high=0.05, scale="linear",
-    )  # fmt: skip
+        name=f"{body}.{axis}",
+        kind=f"body_ipos_{axis}",
+        elements=(body,),
+        unit="m",
+        nominal=value,
+        low=-0.05,
+        high=0.05,
+        scale="linear",
+    )
 
 
 def _acceleration(model: mujoco.MjModel) -> np.ndarray:
@@ -320,8 +332,12 @@ def test_unknown_kind_lists_all_kinds_and_the_nearest() -> None:
         find_kind("dof_dampin")
     assert all(name in str(caught.value) for name in (*KINDS, *DEVICE_KINDS))
     assert set(DEVICE_KINDS) == {
-        "servo_speed_limit", "command_delay", "servo_play", "encoder_bias", "sensor_noise"
-    }  # fmt: skip
+        "servo_speed_limit",
+        "command_delay",
+        "servo_play",
+        "encoder_bias",
+        "sensor_noise",
+    }
 
 
 @pytest.mark.parametrize(("torque", "moves"), [(0.19, False), (0.21, True)])
@@ -361,9 +377,15 @@ def test_baseline_is_what_writing_it_back_keeps(name: str, model: mujoco.MjModel
     value = kind.baseline(model, index)
     changed = copy.copy(model)
     wide = Parameter(
-        name="x", kind=name, elements=(element,), unit="", nominal=value, low=value - 1, high=value + 1,
+        name="x",
+        kind=name,
+        elements=(element,),
+        unit="",
+        nominal=value,
+        low=value - 1,
+        high=value + 1,
         scale="linear",
-    )  # fmt: skip
+    )
     apply_parameters(ModelFields(changed, model), ParameterSpace([wide]), np.array([[value]]))
     for field in kind.writes:
         np.testing.assert_allclose(getattr(changed, field), getattr(model, field), rtol=1e-12, err_msg=field)

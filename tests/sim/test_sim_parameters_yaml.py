@@ -42,8 +42,10 @@ def test_dry_friction_is_searched_wider() -> None:
 
 def test_pattern_together_gives_one_parameter_for_all() -> None:
     """Symmetry: one value for the four calves."""
-    space = _entry("kind: servo_stiffness, elements: ['F?_calf*', RL_calf_joint, 'R*_calf_joint'], "
-                   "group: together, name: calf.stiffness, ratio: 2")  # fmt: skip
+    space = _entry(
+        "kind: servo_stiffness, elements: ['F?_calf*', RL_calf_joint, 'R*_calf_joint'], "
+        "group: together, name: calf.stiffness, ratio: 2"
+    )
     p = space["calf.stiffness"]
     assert p.elements == ("FL_calf_joint", "FR_calf_joint", "RL_calf_joint", "RR_calf_joint")
     assert (p.low, p.high) == (20.0, 80.0)
@@ -190,11 +192,18 @@ def _parameters(draw: st.DrawFn, number: int) -> Parameter:
         kind, "N·m/rad"
     )
     return Parameter(
-        name=f"p{number}." + draw(st.text(min_size=0, max_size=5)).replace("\x00", ""), kind=kind,
-        elements=(JOINTS[number],), unit=unit, nominal=nominal, low=low, high=high, scale=scale,
-        known=draw(st.booleans()), prior_mean=nominal if prior else None,
+        name=f"p{number}." + draw(st.text(min_size=0, max_size=5)).replace("\x00", ""),
+        kind=kind,
+        elements=(JOINTS[number],),
+        unit=unit,
+        nominal=nominal,
+        low=low,
+        high=high,
+        scale=scale,
+        known=draw(st.booleans()),
+        prior_mean=nominal if prior else None,
         prior_std=draw(st.floats(1e-3, 10)) if prior else None,
-    )  # fmt: skip
+    )
 
 
 @settings(max_examples=60, deadline=None)

@@ -68,8 +68,11 @@ def test_all_drawable_kinds_are_read(tmp_path: Path) -> None:
     scene = read_scene(load_model(dataclasses.replace(DESCRIPTION, mjcf=file)))
     found = {shape.name: shape for shape in scene.shapes}
     assert {found[name].kind for name in ("ball", "egg", "tube", "wedge")} == {
-        "sphere", "ellipsoid", "cylinder", "mesh",
-    }  # fmt: skip
+        "sphere",
+        "ellipsoid",
+        "cylinder",
+        "mesh",
+    }
     assert not {"floor", "hull", "unseen"} & set(found)
     np.testing.assert_allclose(found["egg"].size, [0.01, 0.02, 0.03])
     np.testing.assert_allclose(found["tube"].color, [1, 0, 0, 0.5])

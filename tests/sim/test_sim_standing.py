@@ -17,7 +17,7 @@ from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.scene import body_poses, read_scene
 from deal_hw.sim.recordings.overlay import Overlay, compute_overlay
-from deal_hw.sim.recordings.standing import chart_base, sensed_base
+from deal_hw.sim.recordings.standing import sensed_base, tangent_base
 from deal_hw.testing.standing_episode import standing_episode
 from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 
@@ -165,5 +165,5 @@ def test_chart_coordinates_become_poses() -> None:
     half = np.sqrt(0.5)
     position = np.array([[1.0, 2.0, 3.0, np.pi / 2, 0, 0, 9.0, 9.0]])
     np.testing.assert_allclose(
-        chart_base(position, np.array([[half, half, 0, 0]])), [[1, 2, 3, 0, 1, 0, 0]], atol=1e-12
+        tangent_base(position, np.array([[half, half, 0, 0]])), [[1, 2, 3, 0, 1, 0, 0]], atol=1e-12
     )

@@ -19,10 +19,18 @@ def episode(lost: tuple[int, ...] = ()) -> Episode:
     sample = 2 * kept
     one = np.ones((2 * SAMPLES, 1))
     return Episode(
-        step_s=1e-3, sample=sample, position=1e-3 * sample[:, None], velocity=np.ones((len(sample), 1)),
-        target=one, stiffness=one, damping=one, effort_limit=one, speed_limit=one,
-        usable=np.ones(len(sample), dtype=bool), start_setpoint=np.zeros(1),
-    )  # fmt: skip
+        step_s=1e-3,
+        sample=sample,
+        position=1e-3 * sample[:, None],
+        velocity=np.ones((len(sample), 1)),
+        target=one,
+        stiffness=one,
+        damping=one,
+        effort_limit=one,
+        speed_limit=one,
+        usable=np.ones(len(sample), dtype=bool),
+        start_setpoint=np.zeros(1),
+    )
 
 
 def test_every_fifth_sample_of_500_hz_is_100_hz() -> None:

@@ -18,8 +18,11 @@ def test_one_way_times_count_what_both_sides_noted() -> None:
 def test_a_spread_is_least_median_longest() -> None:
     """Milliseconds, and how many."""
     assert measure_bridge._spread([3.0, 1.0, 2.0]) == {
-        "times": 3, "least_ms": 1.0, "median_ms": 2.0, "longest_ms": 3.0,
-    }  # fmt: skip
+        "times": 3,
+        "least_ms": 1.0,
+        "median_ms": 2.0,
+        "longest_ms": 3.0,
+    }
 
 
 @pytest.mark.parametrize("number", [1, 4711, 1_000_003])

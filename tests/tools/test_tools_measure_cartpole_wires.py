@@ -31,5 +31,5 @@ def test_a_row_counts_every_command() -> None:
     row = measure("can", 50, 1.0)
     assert row["commands"] == 50
     assert row["named"] >= 40
-    assert row["link_errors"] == 0
+    assert row["transport_errors"] == 0
     assert f"| can | 50 | 1 | {row['round_trip_ms']['p50']:.2f} /" in table([row])

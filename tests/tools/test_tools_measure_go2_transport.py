@@ -33,7 +33,7 @@ def test_a_mark_is_read_back_from_a_message_of_the_right_size(topic: str, number
 
 
 def test_arrivals_count_gaps_disorder_and_age() -> None:
-    """Of 1 to 7, numbers 2, 3 and 6 never come, 4 comes twice, 1 comes again late; greetings do not count."""
+    """Of 1 to 7, numbers 2, 3 and 6 never come, 4 comes twice, 1 comes again late; hellos do not count."""
     arrivals = Arrivals()
     for number, age_ms in ((0, 0), (1, 1), (4, 2), (4, 2), (5, 150), (1, 3), (7, 1)):
         arrivals.note(number, 1_000_000_000, 1_000_000_000 + age_ms * 1_000_000)
@@ -53,13 +53,24 @@ def controller_values(frozen: bool) -> dict[str, object]:
         "cycles_without_link": 0,
     }
     return {
-        "cadence": {"period": SPREAD, "lateness": SPREAD, "skipped_periods": 0},
-        "period_error": SPREAD, "quiet": part, "frozen": part if frozen else None, "sent": 1000,
+        "loop_timing": {"period": SPREAD, "lateness": SPREAD, "skipped_periods": 0},
+        "period_error": SPREAD,
+        "quiet": part,
+        "frozen": part if frozen else None,
+        "sent": 1000,
         "states": {
-            "count": 990, "newest": 1000, "disordered": 0, "stale": 0, "gaps": [101, 10], "age": SPREAD,
+            "count": 990,
+            "newest": 1000,
+            "disordered": 0,
+            "stale": 0,
+            "gaps": [101, 10],
+            "age": SPREAD,
         },
-        "states_touched": [100, 250], "cpu_share": 0.1, "scheduling": "default", "warnings": ["w"],
-    }  # fmt: skip
+        "states_touched": [100, 250],
+        "cpu_share": 0.1,
+        "scheduling": "default",
+        "warnings": ["w"],
+    }
 
 
 def robot_values() -> dict[str, object]:
@@ -67,9 +78,13 @@ def robot_values() -> dict[str, object]:
     gaps = [90, 20, 200, 200, 900, 1]
     commands = {"count": 779, "newest": 1000, "disordered": 0, "stale": 3, "gaps": gaps, "age": SPREAD}
     return {
-        "cadence": {}, "sent": 1000, "commands": commands, "cpu_share": 0.2, "scheduling": "default",
+        "loop_timing": {},
+        "sent": 1000,
+        "commands": commands,
+        "cpu_share": 0.2,
+        "scheduling": "default",
         "warnings": ["w"],
-    }  # fmt: skip
+    }
 
 
 def test_losses_around_a_freeze_are_counted_apart() -> None:

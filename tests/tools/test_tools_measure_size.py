@@ -65,9 +65,19 @@ def test_recordings_have_the_length_that_is_asked_for(tmp_path: Path) -> None:
 def test_a_stopped_calibration_is_said() -> None:
     """The row of a run that reached its limit before any fit was shown."""
     row: dict[str, Any] = {
-        "joints": 7, "parameters": 41, "fitted_s": 60.0, "seed": 0, "seconds": 600.0, "cpu_s": 900.0,
-        "peak_mib": 500.0, "load_before": 1.0, "load_after": 2.0, "error": "", "stopped": True, "said": ["a"],
-    }  # fmt: skip
+        "joints": 7,
+        "parameters": 41,
+        "fitted_s": 60.0,
+        "seed": 0,
+        "seconds": 600.0,
+        "cpu_s": 900.0,
+        "peak_mib": 500.0,
+        "load_before": 1.0,
+        "load_after": 2.0,
+        "error": "",
+        "stopped": True,
+        "said": ["a"],
+    }
     assert words(row).endswith("load 1.0 to 2.0, stopped at the limit\n  a")
 
 

@@ -10,9 +10,13 @@ from measure_wire_calibration import measure, table
 def row(transport: str, error_percent: float) -> dict[str, Any]:
     """Return a row of a run that went through."""
     return {
-        "transport": transport, "error": "", "error_percent": error_percent, "median_percent": 0.5,
-        "interval_percent": 1.5, "coverage90": 0.875,
-    }  # fmt: skip
+        "transport": transport,
+        "error": "",
+        "error_percent": error_percent,
+        "median_percent": 0.5,
+        "interval_percent": 1.5,
+        "coverage90": 0.875,
+    }
 
 
 def test_medians_and_their_share_of_serial() -> None:

@@ -35,16 +35,27 @@ def test_a_late_cycle_that_the_machine_slept_through_is_not_held_against_the_wir
     """10 ms late, 9.5 of them in a pause: half a millisecond counts, shown as 1 ms, the least."""
     spread = {"p50_s": 1e-4, "p99_s": 1e-3, "max_s": 0.01}
     part = {
-        "cycle_delay": spread, "work": spread, "send": spread, "state_age": spread, "cycles_without_link": 0,
+        "cycle_delay": spread,
+        "work": spread,
+        "send": spread,
+        "state_age": spread,
+        "cycles_without_link": 0,
         "late": [100 * MS, 110 * MS],
-    }  # fmt: skip
+    }
     stream = {"count": 1, "newest": 1, "disordered": 0, "stale": 0, "gaps": [], "age": spread}
     controller = {
-        "cadence": {"period": spread, "lateness": spread, "skipped_periods": 0}, "period_error": spread,
-        "quiet": {**part, "late": []}, "frozen": part, "sent": 1, "states": stream, "states_touched": [0, 0],
-        "cpu_share": 0.1, "scheduling": "default", "warnings": [],
+        "loop_timing": {"period": spread, "lateness": spread, "skipped_periods": 0},
+        "period_error": spread,
+        "quiet": {**part, "late": []},
+        "frozen": part,
+        "sent": 1,
+        "states": stream,
+        "states_touched": [0, 0],
+        "cpu_share": 0.1,
+        "scheduling": "default",
+        "warnings": [],
         "account": Account([Pause(0, 100 * MS, 109 * MS + MS // 2)]),
-    }  # fmt: skip
+    }
     robot = {"sent": 1, "commands": stream, "cpu_share": 0.1, "scheduling": "default", "warnings": []}
     settings = TransportBench(seconds=10.0, freeze_at=1.0)
     row = summary(settings, controller, robot)

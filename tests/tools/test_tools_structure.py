@@ -76,8 +76,11 @@ def test_lines(counted: dict[str, Any]) -> None:
     """Blank lines and comments count; tools are shown beside."""
     # calib: 1 + 2 (pipeline) + 2 (far) + 8 (noise) + 12 (solver) + 5 (steps) = 30; deal_hw: 3 + 1 + 2 = 6.
     assert counted["lines_by_package"] == {
-        "calib": 13, "calib/fit": 17, "deal_hw": 3, "deal_hw/cli": 3,
-    }  # fmt: skip
+        "calib": 13,
+        "calib/fit": 17,
+        "deal_hw": 3,
+        "deal_hw/cli": 3,
+    }
     assert counted["summary"]["calib/ lines"] == 30
     assert counted["summary"]["product lines"] == 36
     assert counted["summary"]["lines of tools/"] == 2

@@ -95,7 +95,7 @@ def shown(
         lost=np.zeros(100, dtype=np.int64),
         safety_state=("active",) * 75 + ("passive",) * 25,
         action=np.zeros((100, 1)),
-        asked_position=np.zeros((100, 1)),
+        requested_position=np.zeros((100, 1)),
     )
     rrd = tmp_path_factory.mktemp("viz") / "episode.rrd"
     write_episode(rrd, trajectory, DESCRIPTION, cycles=cycles, overlay=overlay, result=result, name="shown")
@@ -127,7 +127,7 @@ def record(path: Path, trajectory: Trajectory) -> Path:
                     deadline_ns=sent_ns,
                     start_ns=sent_ns,
                     states=tuple(_state(trajectory, i) for i in range(first, edges[number + 1])),
-                    asked=command,
+                    requested=command,
                     sent=command,
                     sent_sequence=int(sequence),
                     sent_ns=sent_ns,
@@ -142,9 +142,14 @@ def record(path: Path, trajectory: Trajectory) -> Path:
 def _command(trajectory: Trajectory, i: int) -> JointCommand:
     zeros = np.zeros(1)
     return JointCommand(
-        trajectory.position_target[i], zeros, trajectory.stiffness[i], trajectory.damping[i], zeros,
-        trajectory.effort_limit[i], trajectory.speed_limit[i],
-    )  # fmt: skip
+        trajectory.position_target[i],
+        zeros,
+        trajectory.stiffness[i],
+        trajectory.damping[i],
+        zeros,
+        trajectory.effort_limit[i],
+        trajectory.speed_limit[i],
+    )
 
 
 def _state(trajectory: Trajectory, i: int) -> RobotState:

@@ -138,8 +138,12 @@ def test_the_robot_stands_on_the_floor_and_leans(
 def test_the_layout_opens_with_the_body(recording: Trajectory) -> None:
     """A tab of legs, IMU, feet, battery, temperature; none where there is no body."""
     assert tabs(inspect_blueprint(recording, DRIVER, ())) == [
-        "Body", "Motion", "Velocity", "Commands", "Cadence [ms]",
-    ]  # fmt: skip
+        "Body",
+        "Motion",
+        "Velocity",
+        "Commands",
+        "loop timing [ms]",
+    ]
     bare = dataclasses.replace(recording, body=None)
     assert tabs(inspect_blueprint(bare, ON_STAND, ("nominal",)))[0] == "Motion"
 

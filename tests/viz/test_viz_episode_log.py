@@ -116,15 +116,18 @@ def test_commands_stand_where_the_device_received_them(rrd: Rrd, shown: Any) -> 
     np.testing.assert_allclose(device, 0.02 * np.arange(len(sent)) + 0.4e-3, atol=1e-9)
     np.testing.assert_allclose(host, t.sent_s, atol=1e-9)
     np.testing.assert_array_equal(sent, t.position_target[:, 0])
-    np.testing.assert_array_equal(rrd.scalars("/commands/cart/asked")[2], t.asked_position[:, 0])
+    np.testing.assert_array_equal(rrd.scalars("/commands/cart/asked")[2], t.requested_position[:, 0])
 
 
-def test_cadence_is_in_milliseconds(rrd: Rrd) -> None:
+def test_loop_timing_is_in_milliseconds(rrd: Rrd) -> None:
     """Periods, lateness and the age of the state are there in ms."""
     for name, expected in (
-        ("command_period", 20.002), ("state_period", 5.0005), ("lateness", 0.2), ("state_age", 1.1),
-    ):  # fmt: skip
-        np.testing.assert_allclose(rrd.scalars(f"/cadence/{name}")[2], expected, rtol=1e-6)
+        ("command_period", 20.002),
+        ("state_period", 5.0005),
+        ("lateness", 0.2),
+        ("state_age", 1.1),
+    ):
+        np.testing.assert_allclose(rrd.scalars(f"/loop_timing/{name}")[2], expected, rtol=1e-6)
 
 
 def test_status_is_written_where_it_changes(rrd: Rrd) -> None:
@@ -141,8 +144,9 @@ def test_status_is_written_where_it_changes(rrd: Rrd) -> None:
 def test_events_are_a_text_log(rrd: Rrd) -> None:
     """Events stand at their time since the first sample; what stops the robot is a warning."""
     assert [row[0] for row in rrd.column("/events", "TextLog:text")] == [
-        "armed: the motors follow commands", "passive: operator stop",
-    ]  # fmt: skip
+        "armed: the motors follow commands",
+        "passive: operator stop",
+    ]
     assert [row[0] for row in rrd.column("/events", "TextLog:level")] == ["INFO", "WARN"]
     assert rrd.column("/events", "host_time") == [0, 1_500_000_000]
     # The host's clock runs 0.01 % fast and a sample takes 0.3 ms: 1.5 s / 1.0001 - 0.3 ms / 1.0001.
@@ -209,7 +213,7 @@ def test_episode_without_predictions(trajectory: Trajectory, tmp_path: Path) -> 
         command_age_s=np.full_like(trajectory.command_age_s, np.nan),
         sent_s=np.zeros(0),
         sent_sequence=np.zeros(0, dtype=np.int64),
-        asked_position=none,
+        requested_position=none,
         position_target=none,
         events=(),
     )

@@ -52,10 +52,14 @@ def test_result_file_is_as_good_as_its_folder(episode_file: Path, calibration: P
     """--calibration takes result.json, and --window and --latency reach the predictions."""
     report = inspect(
         Inspect(
-            episode=episode_file, calibration=calibration / "result.json", save=tmp_path / "a.rrd",
-            window=0.1, latency=0.0, quiet=True,
+            episode=episode_file,
+            calibration=calibration / "result.json",
+            save=tmp_path / "a.rrd",
+            window=0.1,
+            latency=0.0,
+            quiet=True,
         )
-    )  # fmt: skip
+    )
     assert report.overlay is not None
     assert report.overlay.window_s == pytest.approx(0.1)
     assert report.overlay.predictions["calibrated"].latency_s == 0.0

@@ -63,9 +63,25 @@ _ODD_CELLS = (
     "[" * 2000,
 )
 _ODD_WORDS = (
-    "&a [*a]", "*nothing", "!!python/object/apply:os.getcwd []", "1e400", "9" * 5000, "-.nan", "[[[[",
-    "{a: b}", "2024-13-41", "~", "!!binary x", "<<: *x", "1:1:1", "'", "\t", "0x" + "f" * 300, "elbow*", "-0",
-)  # fmt: skip
+    "&a [*a]",
+    "*nothing",
+    "!!python/object/apply:os.getcwd []",
+    "1e400",
+    "9" * 5000,
+    "-.nan",
+    "[[[[",
+    "{a: b}",
+    "2024-13-41",
+    "~",
+    "!!binary x",
+    "<<: *x",
+    "1:1:1",
+    "'",
+    "\t",
+    "0x" + "f" * 300,
+    "elbow*",
+    "-0",
+)
 
 
 def import_recording(path: Path) -> None:
@@ -150,9 +166,11 @@ def make_mcap(folder: Path) -> list[bytes]:
             stamp = {"sec": 5, "nanosec": row * 10_000_000}
             for topic in ("/joint_states", "/joint_command"):
                 message = {
-                    "header": {"stamp": stamp, "frame_id": ""}, "name": ["a", "b"],
-                    "position": [0.1 * row, -row], "velocity": [],
-                }  # fmt: skip
+                    "header": {"stamp": stamp, "frame_id": ""},
+                    "name": ["a", "b"],
+                    "position": [0.1 * row, -row],
+                    "velocity": [],
+                }
                 writer.write_message(topic, schema, message, row * 10_000_000, row * 10_000_000)
         writer.finish()
         found.append(buffer.getvalue())
@@ -184,12 +202,14 @@ def make_lerobot(folder: Path) -> list[bytes]:
 
 _FEATURE = {"dtype": "float32", "shape": [2], "names": ["a", "b"]}
 _INFO = {
-    "codebase_version": "v3.0", "fps": 100,
+    "codebase_version": "v3.0",
+    "fps": 100,
     "features": {
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-        "observation.state": _FEATURE, "action": _FEATURE,
+        "observation.state": _FEATURE,
+        "action": _FEATURE,
     },
-}  # fmt: skip
+}
 
 
 def read_lerobot(path: Path) -> None:
@@ -242,11 +262,20 @@ def make_result(folder: Path) -> list[bytes]:
     K = len(space)
     interval = np.stack([space.low, space.high], axis=1)
     result = CalibrationResult(
-        method="fuzz", space=space, estimate=space.nominal, interval=interval, covariance=np.eye(K) * 0.01,
-        verdicts=tuple(["weak"] * K), latency_s=0.01, chi2=1.0, heldout_nrmse={"nominal": 0.1},
+        method="fuzz",
+        space=space,
+        estimate=space.nominal,
+        interval=interval,
+        covariance=np.eye(K) * 0.01,
+        verdicts=tuple(["weak"] * K),
+        latency_s=0.01,
+        chi2=1.0,
+        heldout_nrmse={"nominal": 0.1},
         alarms=(Alarm("a", "b", "c"),),
-        advice=({"sentence": "b"},), null_directions=("c",), provenance={"seed": 1},
-    )  # fmt: skip
+        advice=({"sentence": "b"},),
+        null_directions=("c",),
+        provenance={"seed": 1},
+    )
     return [json.dumps(result.to_json()).encode()]
 
 
@@ -297,16 +326,22 @@ KINDS: dict[str, Kind] = {
     ),
     "foreign-mcap": FileKind(make=make_mcap, read=import_recording, name="a.mcap", mutations=(damage_bytes,)),
     "lerobot-data": FileKind(
-        make=make_lerobot, read=read_lerobot, name="set/data/chunk-000/file-000.parquet",
+        make=make_lerobot,
+        read=read_lerobot,
+        name="set/data/chunk-000/file-000.parquet",
         mutations=(damage_bytes,),
     ),
     "lerobot-info": FileKind(
-        make=lambda folder: [json.dumps(_INFO).encode()], read=read_lerobot, name="set/meta/info.json",
+        make=lambda folder: [json.dumps(_INFO).encode()],
+        read=read_lerobot,
+        name="set/meta/info.json",
         mutations=(damage_json, damage_bytes),
     ),
     "parameters": FileKind(
         make=_texts(template(_MODEL), yaml.safe_dump({"parameters": [{"kind": "damping", "elements": "*"}]})),
-        read=lambda path: read_space(path, _MODEL), name="p.yaml", mutations=(damage_lines, damage_bytes),
+        read=lambda path: read_space(path, _MODEL),
+        name="p.yaml",
+        mutations=(damage_lines, damage_bytes),
     ),
     "columns": FileKind(
         make=_texts(_COLUMNS), read=read_column_map, name="c.yaml", mutations=(damage_lines, damage_bytes)
@@ -319,15 +354,20 @@ KINDS: dict[str, Kind] = {
     ),
     "truth": FileKind(
         make=lambda folder: [json.dumps(nominal_truth().to_json()).encode()],
-        read=partial(read_truth, parse=Truth.from_json), name="truth.json",
+        read=partial(read_truth, parse=Truth.from_json),
+        name="truth.json",
         mutations=(damage_json, damage_bytes),
     ),
     "checkpoint": FileKind(
         make=lambda folder: [pack({"identity": "id", "run": {"a": np.ones(9), "b": [1, {"c": 2.0}]}})],
-        read=_checkpoint, name="checkpoint.npz", mutations=(damage_bytes,),
+        read=_checkpoint,
+        name="checkpoint.npz",
+        mutations=(damage_bytes,),
     ),
     "mjcf": FileKind(
-        make=lambda folder: [DESCRIPTION.mjcf.read_bytes()], read=read_model, name="robot.xml",
+        make=lambda folder: [DESCRIPTION.mjcf.read_bytes()],
+        read=read_model,
+        name="robot.xml",
         mutations=(damage_attributes, damage_bytes),
     ),
-}  # fmt: skip
+}

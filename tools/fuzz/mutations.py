@@ -81,9 +81,32 @@ def _part(rng: random.Random, data: bytearray) -> tuple[int, int]:
 _DEEP = "@deep@"
 """Stands for 100,000 nested lists, which json.dumps cannot write."""
 _ODD_VALUES: tuple[Any, ...] = (
-    None, True, False, "", "x", "\ud800", "\0", "a\nb\x1b[31m", 0, -1, 1e308, float("nan"), float("inf"),
-    -0.0, 1 << 63, 10**30, [], {}, [[]], [None], {"": None}, [1.0, "x"], "1.0", "../../etc/passwd", _DEEP,
-)  # fmt: skip
+    None,
+    True,
+    False,
+    "",
+    "x",
+    "\ud800",
+    "\0",
+    "a\nb\x1b[31m",
+    0,
+    -1,
+    1e308,
+    float("nan"),
+    float("inf"),
+    -0.0,
+    1 << 63,
+    10**30,
+    [],
+    {},
+    [[]],
+    [None],
+    {"": None},
+    [1.0, "x"],
+    "1.0",
+    "../../etc/passwd",
+    _DEEP,
+)
 
 
 def damage_json(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:

@@ -45,20 +45,46 @@ def make_cycle(number: int, body: bool = False) -> CycleRecord:
         return np.sin(0.1 * number + np.arange(size, dtype=np.float64))
 
     sensed = BodyState(
-        orientation=values(4), angular_velocity=values(3), acceleration=values(3), sticks=values(4),
-        foot_force=values(4), temperature=values(2), lost=np.zeros(2, dtype=np.int64), battery=0.9,
-        voltage=28.0, current=1.0, buttons=0,
-    )  # fmt: skip
+        orientation=values(4),
+        angular_velocity=values(3),
+        acceleration=values(3),
+        sticks=values(4),
+        foot_force=values(4),
+        temperature=values(2),
+        lost=np.zeros(2, dtype=np.int64),
+        battery=0.9,
+        voltage=28.0,
+        current=1.0,
+        buttons=0,
+    )
     state = RobotState(
-        values(2), values(2), values(2), start_ns, start_ns - 1_000_000, number, number - 1, 1_000_000,
-        Status.ARMED, sensed if body else None,
-    )  # fmt: skip
+        values(2),
+        values(2),
+        values(2),
+        start_ns,
+        start_ns - 1_000_000,
+        number,
+        number - 1,
+        1_000_000,
+        Status.ARMED,
+        sensed if body else None,
+    )
     command = JointCommand(*(values(1) for _ in range(7)))
     return CycleRecord(
-        number, start_ns, start_ns, (state,), values(1), command, command, number, start_ns, 1000, "ACTIVE",
+        number,
+        start_ns,
+        start_ns,
+        (state,),
+        values(1),
+        command,
+        command,
+        number,
+        start_ns,
+        1000,
+        "ACTIVE",
         events=(Event(start_ns, "note", "words", {"joint": "cart"}),) if number % 4 == 0 else (),
         wire=(Message("rx", bytes([number]) * 30, start_ns), Message("tx", b"\1\2", start_ns)),
-    )  # fmt: skip
+    )
 
 
 def make_episode(path: Path, cycles: int, body: bool = False, torn: bool = False) -> bytes:

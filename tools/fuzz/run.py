@@ -72,9 +72,16 @@ def make_input(kind: Kind, seeds: Sequence[bytes], seed: int, number: int) -> by
 
 
 def _child(
-    kind: Kind, seeds: Sequence[bytes], numbers: range, seed: int, shared: mmap.mmap, writing: int,
-    limit_s: float, limit_bytes: int, folder: str,
-) -> None:  # fmt: skip
+    kind: Kind,
+    seeds: Sequence[bytes],
+    numbers: range,
+    seed: int,
+    shared: mmap.mmap,
+    writing: int,
+    limit_s: float,
+    limit_bytes: int,
+    folder: str,
+) -> None:
     """Read inputs until one fails; ends the process."""
     failure = ""
     try:

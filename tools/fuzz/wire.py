@@ -26,7 +26,7 @@ from deal_hw.drivers.go2.messages.remote import (
     decode_wireless,
     encode_remote,
     encode_wireless,
-)  # fmt: skip
+)
 from deal_hw.drivers.go2.messages.rpc import (
     Request,
     Response,
@@ -48,12 +48,16 @@ def _serial_stream() -> list[bytes]:
     frames = [
         serial.encode(message)
         for message in (
-            serial.Hello(1), serial.Info(1, "cartpole", (1, 2, 3), 1000, 200, 0x1234), serial.Arm(2),
-            serial.Ack(2, serial.MessageType.ARM, serial.Result.DONE), serial.Home(3), serial.Stop(4),
+            serial.Hello(1),
+            serial.Info(1, "cartpole", (1, 2, 3), 1000, 200, 0x1234),
+            serial.Arm(2),
+            serial.Ack(2, serial.MessageType.ARM, serial.Result.DONE),
+            serial.Home(3),
+            serial.Stop(4),
             serial.Target(5, 100_000, 80_000, 8_000, 4_000, 1_000_000),
             serial.State(6, 5_000_000, 1000, -2000, 3000, -4000, 500, 3, 5, 900),
         )
-    ]  # fmt: skip
+    ]
     return [b"\0" + b"".join(frames), frames[-1], frames[1]]
 
 

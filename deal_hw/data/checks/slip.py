@@ -184,10 +184,18 @@ class _Grid:
         now = x[rows] - x.mean(axis=0)
         common = np.concatenate([now, x[rows] - x[rows - speed], np.ones((len(rows), 1))], axis=1)
         return cls(
-            start_s=start, period_s=period, position=x, sums=sums, rows=rows, ahead=ahead, tap=tap,
-            taps=np.arange(-ahead, ahead, tap), step=step, shifts=np.arange(-reach, reach + 1) * step,
+            start_s=start,
+            period_s=period,
+            position=x,
+            sums=sums,
+            rows=rows,
+            ahead=ahead,
+            tap=tap,
+            taps=np.arange(-ahead, ahead, tap),
+            step=step,
+            shifts=np.arange(-reach, reach + 1) * step,
             common=common,
-        )  # fmt: skip
+        )
 
 
 def _recorded(

@@ -204,10 +204,23 @@ def read_column_map(path: Path) -> ColumnMap:
 
 def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
     """Return the column map in plain YAML values; errors as :func:`read_column_map`."""
-    top = _mapping("column map", values, {
-        "time", "command_time", "position", "target", "velocity", "effort", "joints", "unit", "target_unit",
-        "orientation", "gyro",
-    })  # fmt: skip
+    top = _mapping(
+        "column map",
+        values,
+        {
+            "time",
+            "command_time",
+            "position",
+            "target",
+            "velocity",
+            "effort",
+            "joints",
+            "unit",
+            "target_unit",
+            "orientation",
+            "gyro",
+        },
+    )
     for name in ("time", "joints"):
         if name not in top:
             raise ConfigurationError(
@@ -257,9 +270,18 @@ def _time(what: str, value: Any) -> TimeColumn:
 
 _CHANNELS = ("position", "target", "velocity", "effort")
 _JOINT_KEYS = {
-    "name", "column", "index", *_CHANNELS, "unit", "target_unit", "normalised", "target_normalised", "sign",
-    "offset", "slides",
-}  # fmt: skip
+    "name",
+    "column",
+    "index",
+    *_CHANNELS,
+    "unit",
+    "target_unit",
+    "normalised",
+    "target_normalised",
+    "sign",
+    "offset",
+    "slides",
+}
 
 
 def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:

@@ -294,7 +294,7 @@ def _trajectory(
         command_age_s=age,
         sent_s=sent_s,
         sent_sequence=np.arange(C),
-        asked_position=target,
+        requested_position=target,
         position_target=target,
         stiffness=each(servo.stiffness),
         damping=each(servo.damping),

@@ -28,8 +28,12 @@ from deal_hw.types import Trajectory
 
 Say = Callable[[str], None]
 _READERS: dict[str, Callable[[Path], Channels]] = {
-    ".csv": read_csv, ".tsv": read_csv, ".txt": read_csv, ".npz": read_npz, ".mcap": read_mcap,
-}  # fmt: skip
+    ".csv": read_csv,
+    ".tsv": read_csv,
+    ".txt": read_csv,
+    ".npz": read_npz,
+    ".mcap": read_mcap,
+}
 _HEAD_BYTES = 1 << 20
 
 

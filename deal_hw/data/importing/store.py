@@ -86,11 +86,17 @@ def write_episode(path: Path, trajectory: Trajectory, description: Mapping[str, 
             clock.sleep_until_ns(max(stamp_ns, clock.now_ns()))
             recorder.write(
                 CycleRecord(
-                    cycle=index, deadline_ns=stamp_ns, start_ns=stamp_ns, states=states, asked=command,
-                    sent=command, sent_sequence=sequence, sent_ns=-1 if last else stamp_ns,
+                    cycle=index,
+                    deadline_ns=stamp_ns,
+                    start_ns=stamp_ns,
+                    states=states,
+                    requested=command,
+                    sent=command,
+                    sent_sequence=sequence,
+                    sent_ns=-1 if last else stamp_ns,
                     safety_state="IMPORTED",
                 )
-            )  # fmt: skip
+            )
 
 
 def minimal_description(
@@ -136,15 +142,23 @@ def minimal_description(
         "device_rate_hz": rate_hz * rates_per_sample,
         "state_rate_hz": rate_hz,
         "limits": {
-            "target": [[-math.inf, math.inf]] * A, "target_step": list(free), "target_distance": list(free),
-            "trip_position": [[-math.inf, math.inf]] * J, "trip_velocity": [math.inf] * J,
-            "stiffness": list(free), "damping": list(free), "effort": list(free), "speed": list(free),
-            "state_age_s": math.inf, "action_age_s": math.inf, "ease_in_s": 0.0,
+            "target": [[-math.inf, math.inf]] * A,
+            "target_step": list(free),
+            "target_distance": list(free),
+            "trip_position": [[-math.inf, math.inf]] * J,
+            "trip_velocity": [math.inf] * J,
+            "stiffness": list(free),
+            "damping": list(free),
+            "effort": list(free),
+            "speed": list(free),
+            "state_age_s": math.inf,
+            "action_age_s": math.inf,
+            "ease_in_s": 0.0,
         },
         "sensor": {"noise": [0.0] * J, "resolution": [0.0] * J, "velocity_window_s": 0.0},
         "mjcf": "" if mjcf is None else digest_of_file(mjcf),
         "sources": {"joint_names": "the column map", "state_rate_hz": "the recordings' own stamps"},
-    }  # fmt: skip
+    }
 
 
 def _numbers(trajectory: Trajectory) -> np.ndarray[Any, np.dtype[np.int64]]:

@@ -100,9 +100,7 @@ def synchronize(trajectory: Trajectory) -> ClockSync:
     most = _extreme(upper, drift, reference_s, np.min)
     least = _extreme(lower, drift, reference_s, np.max)
     half_range = 0.5 * (high - low) * 1e6
-    return ClockSync(
-        reference_s, 0.5 * (most + least), 0.5 * (most - least), drift * 1e6, half_range, jumps
-    )  # fmt: skip
+    return ClockSync(reference_s, 0.5 * (most + least), 0.5 * (most - least), drift * 1e6, half_range, jumps)
 
 
 def command_bounds(trajectory: Trajectory, start: int = 0, stop: int | None = None) -> Bounds:

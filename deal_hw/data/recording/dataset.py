@@ -230,7 +230,7 @@ class Dataset:
 
         Args:
             path: As :meth:`next_episode_path` gave it.
-            facts: Plain JSON values to keep with it: outcome, cadence, task, ...
+            facts: Plain JSON values to keep with it: outcome, loop_timing, task, ...
 
         Raises:
             DatasetError: It is not in this dataset's folder or cannot be read.

@@ -38,7 +38,7 @@ class EpisodeInfo:
         clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20
             jumps at most; None where it cannot be told.
         note: What the operator should know, such as a repair.
-        facts: What the collector adds: outcome, cadence, task, ...
+        facts: What the collector adds: outcome, loop_timing, task, ...
 
     Raises:
         ConfigurationError: The file is elsewhere, a verdict is none, or the clock's numbers are missing.
@@ -95,10 +95,20 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
         episode = read_episode(path)
     except EmptyRecordingError as error:
         return EpisodeInfo(
-            file=file, purpose="", policy_digest="", wall_utc="", duration_s=0.0, states=0, commands=0,
-            cycles=0, verdicts=(Verdict("length", Severity.FAIL, str(error)).to_json(),), excitation=None,
-            clock=None, note=note or "empty", facts=facts or {},
-        )  # fmt: skip
+            file=file,
+            purpose="",
+            policy_digest="",
+            wall_utc="",
+            duration_s=0.0,
+            states=0,
+            commands=0,
+            cycles=0,
+            verdicts=(Verdict("length", Severity.FAIL, str(error)).to_json(),),
+            excitation=None,
+            clock=None,
+            note=note or "empty",
+            facts=facts or {},
+        )
     trajectory = episode.trajectory
     return EpisodeInfo(
         file=file,

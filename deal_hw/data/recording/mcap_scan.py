@@ -40,8 +40,14 @@ _CHUNK_MARK_OFFSET = _PREFIX.size + 8 + 8 + 8 + 4
 """From a chunk record's first byte to its compression name: prefix, start, end, uncompressed size, CRC."""
 # A flipped bit in a compressed frame's head can announce any size, hence the last two.
 _PARSE_ERRORS = (
-    McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, MemoryError, OverflowError,
-)  # fmt: skip
+    McapError,
+    CRCValidationError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    MemoryError,
+    OverflowError,
+)
 _SUMMARY_ONLY = {
     Opcode.STATISTICS,
     Opcode.CHUNK_INDEX,
@@ -256,9 +262,13 @@ def _read_chunk(body: memoryview, offset: int) -> Found | str:
         if len(plain) != size:
             return "a chunk whose sizes contradict each other"
         record = Chunk(
-            compression="zstd", data=bytes(packed), message_start_time=start_ns, message_end_time=end_ns,
-            uncompressed_crc=crc, uncompressed_size=size,
-        )  # fmt: skip
+            compression="zstd",
+            data=bytes(packed),
+            message_start_time=start_ns,
+            message_end_time=end_ns,
+            uncompressed_crc=crc,
+            uncompressed_size=size,
+        )
         unpacked = dataclasses.replace(record, compression="", data=plain)
         return Found(offset, record, tuple(breakup_chunk(unpacked, validate_crc=True)))
     except _PARSE_ERRORS as error:

@@ -42,7 +42,7 @@ class CycleTable:
         lost: Hand-overs to the recorder refused so far, (N,).
         safety_state: Name of the safety filter's state, N entries.
         action: What the policy returned, (N, K); NaN where nothing.
-        asked_position: Position targets asked for, (N, A); NaN where none. Filled in dry runs too.
+        requested_position: Position targets asked for, (N, A); NaN where none. Filled in dry runs too.
     """
 
     cycle: IntArray
@@ -53,7 +53,7 @@ class CycleTable:
     lost: IntArray
     safety_state: tuple[str, ...]
     action: FloatArray
-    asked_position: FloatArray
+    requested_position: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,10 +237,17 @@ def _episode(path: Path, preamble: Mapping[str, str], rows: Mapping[str, list[tu
         **_commands(rows, start_ns, A),
     )
     return Episode(
-        path=path, description=description, metadata=metadata, wall_utc=preamble["wall_utc"],
-        anchor_ns=int(preamble["host_ns"]), start_ns=start_ns, device_start_ns=device_start_ns,
-        sequence=numbers, trajectory=trajectory, cycles=cycles,
-    )  # fmt: skip
+        path=path,
+        description=description,
+        metadata=metadata,
+        wall_utc=preamble["wall_utc"],
+        anchor_ns=int(preamble["host_ns"]),
+        start_ns=start_ns,
+        device_start_ns=device_start_ns,
+        sequence=numbers,
+        trajectory=trajectory,
+        cycles=cycles,
+    )
 
 
 def _body(
@@ -263,12 +270,12 @@ def _body(
 def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> dict[str, Any]:
     """Return the command fields of a Trajectory."""
     sent = rows["/command"]
-    asked = {row[1]: row[3] for row in rows["/command/asked"]}
+    asked = {row[1]: row[3] for row in rows["/command/requested"]}
     nothing = np.full(actuated, np.nan)
     return {
         "sent_s": _since([row[0] for row in sent], start_ns),
         "sent_sequence": np.array([row[2] for row in sent], dtype=np.int64),
-        "asked_position": _table([asked.get(row[1], nothing) for row in sent], actuated),
+        "requested_position": _table([asked.get(row[1], nothing) for row in sent], actuated),
         "position_target": _table([row[3] for row in sent], actuated),
         "stiffness": _table([row[5] for row in sent], actuated),
         "damping": _table([row[6] for row in sent], actuated),
@@ -279,7 +286,7 @@ def _commands(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated
 
 def _cycles(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: int) -> CycleTable:
     table = rows["/cycle"]
-    asked = {row[1]: row[3] for row in rows["/command/asked"]}
+    asked = {row[1]: row[3] for row in rows["/command/requested"]}
     width = max((row[7].size for row in table), default=0)
     nothing = np.full(actuated, np.nan)
     return CycleTable(
@@ -291,7 +298,7 @@ def _cycles(rows: Mapping[str, list[tuple[Any, ...]]], start_ns: int, actuated: 
         lost=np.array([row[4] for row in table], dtype=np.int64),
         safety_state=tuple(row[8] for row in table),
         action=_table([row[7] if row[6] else np.full(width, np.nan) for row in table], width),
-        asked_position=_table([asked.get(row[0], nothing) for row in table], actuated),
+        requested_position=_table([asked.get(row[0], nothing) for row in table], actuated),
     )
 
 

@@ -44,7 +44,7 @@ forces and temperatures as float64, behind it the J counters of lost commands as
 _EVENT = struct.Struct("<qHII")
 _WIRE = struct.Struct("<qHI")
 _CRC = struct.Struct("<I")
-_HAS_ASKED, _HAS_SENT = 1, 2
+_HAS_REQUESTED, _HAS_SENT = 1, 2
 _COMMAND_FIELDS = tuple(field.name for field in fields(JointCommand))
 
 
@@ -76,7 +76,7 @@ class CycleRecord:
         start_ns: When it started [ns].
         states: The samples received since the last cycle, in order of arrival.
         action: What the policy returned, (K,); None without a policy or an action.
-        asked: The command asked of the safety filter; None where none was.
+        requested: The command requested of the safety filter; None where none was.
         sent: The command really sent; None where none was (disarmed, dry run).
         sent_sequence: Number of the command sent; -1 where none was.
         sent_ns: When it was sent [ns]; -1 where none was.
@@ -93,7 +93,7 @@ class CycleRecord:
     start_ns: int
     states: tuple[RobotState, ...] = ()
     action: FloatArray | None = None
-    asked: JointCommand | None = None
+    requested: JointCommand | None = None
     sent: JointCommand | None = None
     sent_sequence: int = -1
     sent_ns: int = -1
@@ -133,18 +133,34 @@ def _encode_body(record: CycleRecord) -> bytes:
     if bodies and len(bodies) != len(record.states):
         raise ConfigurationError(f"cycle {record.cycle}: some states have a body, others none")
     feet = bodies[0].foot_force.size if bodies else -1
-    commands = [command for command in (record.asked, record.sent) if command is not None]
+    commands = [command for command in (record.requested, record.sent) if command is not None]
     actuated = commands[0].position_target.size if commands else 0
-    present = _HAS_ASKED * (record.asked is not None) | _HAS_SENT * (record.sent is not None)
+    present = _HAS_REQUESTED * (record.requested is not None) | _HAS_SENT * (record.sent is not None)
     safety_state = _text(record.safety_state)
     action_size = -1 if record.action is None else record.action.size
     parts = [
         _HEAD.pack(
-            MAGIC, VERSION, joints, len(record.states), actuated, len(record.events), len(record.wire),
-            action_size, present, len(safety_state), record.flags, record.cycle, record.deadline_ns,
-            record.start_ns, record.sent_sequence, record.sent_ns, record.state_age_ns, record.lost, feet,
+            MAGIC,
+            VERSION,
+            joints,
+            len(record.states),
+            actuated,
+            len(record.events),
+            len(record.wire),
+            action_size,
+            present,
+            len(safety_state),
+            record.flags,
+            record.cycle,
+            record.deadline_ns,
+            record.start_ns,
+            record.sent_sequence,
+            record.sent_ns,
+            record.state_age_ns,
+            record.lost,
+            feet,
         )
-    ]  # fmt: skip
+    ]
     parts.extend(_encode_state(state, joints, feet) for state in record.states)
     if record.action is not None:
         parts.append(_floats(record.action, action_size, "action"))
@@ -183,23 +199,52 @@ def decode(datagram: bytes) -> CycleRecord:
 
 def _decode_body(body: bytes) -> CycleRecord:
     (
-        _, _, joints, state_count, actuated, event_count, wire_count, action_size, present, text_size, flags,
-        cycle, deadline_ns, start_ns, sent_sequence, sent_ns, state_age_ns, lost, feet,
-    ) = _HEAD.unpack_from(body)  # fmt: skip
+        _,
+        _,
+        joints,
+        state_count,
+        actuated,
+        event_count,
+        wire_count,
+        action_size,
+        present,
+        text_size,
+        flags,
+        cycle,
+        deadline_ns,
+        start_ns,
+        sent_sequence,
+        sent_ns,
+        state_age_ns,
+        lost,
+        feet,
+    ) = _HEAD.unpack_from(body)
     cursor = _Cursor(body, _HEAD.size)
     states = tuple(_decode_state(cursor, joints, feet) for _ in range(state_count))
     action = cursor.floats(action_size) if action_size >= 0 else None
-    asked = _decode_command(cursor, actuated) if present & _HAS_ASKED else None
+    asked = _decode_command(cursor, actuated) if present & _HAS_REQUESTED else None
     sent = _decode_command(cursor, actuated) if present & _HAS_SENT else None
     safety_state = cursor.text(text_size)
     events = tuple(_decode_event(cursor) for _ in range(event_count))
     wire = tuple(_decode_message(cursor) for _ in range(wire_count))
     cursor.finish()
     return CycleRecord(
-        cycle=cycle, deadline_ns=deadline_ns, start_ns=start_ns, states=states, action=action, asked=asked,
-        sent=sent, sent_sequence=sent_sequence, sent_ns=sent_ns, state_age_ns=state_age_ns,
-        safety_state=safety_state, flags=flags, events=events, wire=wire, lost=lost,
-    )  # fmt: skip
+        cycle=cycle,
+        deadline_ns=deadline_ns,
+        start_ns=start_ns,
+        states=states,
+        action=action,
+        requested=asked,
+        sent=sent,
+        sent_sequence=sent_sequence,
+        sent_ns=sent_ns,
+        state_age_ns=state_age_ns,
+        safety_state=safety_state,
+        flags=flags,
+        events=events,
+        wire=wire,
+        lost=lost,
+    )
 
 
 class _Cursor:
@@ -249,22 +294,30 @@ def _encode_state(state: RobotState, joints: int, feet: int) -> bytes:
     return b"".join(
         (
             _STATE.pack(
-                state.receive_ns, state.device_ns, state.sequence, state.command_sequence,
-                state.command_age_ns, state.status,
+                state.receive_ns,
+                state.device_ns,
+                state.sequence,
+                state.command_sequence,
+                state.command_age_ns,
+                state.status,
             ),
             _floats(state.position, joints, "position"),
             _floats(state.velocity, joints, "velocity"),
             _floats(state.effort, joints, "effort"),
             body,
         )
-    )  # fmt: skip
+    )
 
 
 def _body_sizes(joints: int, feet: int) -> dict[str, int]:
     return {
-        "orientation": 4, "angular_velocity": 3, "acceleration": 3, "sticks": 4, "foot_force": feet,
+        "orientation": 4,
+        "angular_velocity": 3,
+        "acceleration": 3,
+        "sticks": 4,
+        "foot_force": feet,
         "temperature": joints,
-    }  # fmt: skip
+    }
 
 
 def _encode_body_state(body: BodyState, joints: int, feet: int) -> bytes:
@@ -280,19 +333,30 @@ def _decode_body_state(cursor: _Cursor, joints: int, feet: int) -> BodyState:
     arrays = {name: cursor.floats(size) for name, size in _body_sizes(joints, feet).items()}
     battery, voltage, current, buttons = cursor.unpack(_BODY)
     return BodyState(
-        **arrays, lost=cursor.integers(joints), battery=battery, voltage=voltage, current=current,
+        **arrays,
+        lost=cursor.integers(joints),
+        battery=battery,
+        voltage=voltage,
+        current=current,
         buttons=buttons,
-    )  # fmt: skip
+    )
 
 
 def _decode_state(cursor: _Cursor, joints: int, feet: int) -> RobotState:
     receive_ns, device_ns, sequence, command_sequence, command_age_ns, status = cursor.unpack(_STATE)
     position, velocity, effort = (cursor.floats(joints) for _ in range(3))
     return RobotState(
-        position=position, velocity=velocity, effort=effort, receive_ns=receive_ns, device_ns=device_ns,
-        sequence=sequence, command_sequence=command_sequence, command_age_ns=command_age_ns,
-        status=Status(status), body=_decode_body_state(cursor, joints, feet) if feet >= 0 else None,
-    )  # fmt: skip
+        position=position,
+        velocity=velocity,
+        effort=effort,
+        receive_ns=receive_ns,
+        device_ns=device_ns,
+        sequence=sequence,
+        command_sequence=command_sequence,
+        command_age_ns=command_age_ns,
+        status=Status(status),
+        body=_decode_body_state(cursor, joints, feet) if feet >= 0 else None,
+    )
 
 
 def _decode_command(cursor: _Cursor, actuated: int) -> JointCommand:

@@ -113,21 +113,35 @@ class EpisodeRecorder:
             )
         for state in record.states:
             data = STATE.encode(
-                state.receive_ns, state.device_ns, state.sequence, state.command_sequence,
-                state.command_age_ns, int(state.status), state.position, state.velocity, state.effort,
-            )  # fmt: skip
+                state.receive_ns,
+                state.device_ns,
+                state.sequence,
+                state.command_sequence,
+                state.command_age_ns,
+                int(state.status),
+                state.position,
+                state.velocity,
+                state.effort,
+            )
             self._add("/state", state.receive_ns, data, state.sequence)
             self._add_body(state)
-        self._add_command("/command/asked", record, record.asked)
+        self._add_command("/command/requested", record, record.requested)
         self._add_command("/command", record, record.sent)
         for event in record.events:
             data = EVENT.encode(event.stamp_ns, event.kind, event.message, json.dumps(dict(event.data)))
             self._add("/events", event.stamp_ns, data)
         action = () if record.action is None else record.action
         data = CYCLE.encode(
-            record.cycle, record.deadline_ns, record.start_ns, record.state_age_ns, record.lost, record.flags,
-            record.action is not None, action, record.safety_state,
-        )  # fmt: skip
+            record.cycle,
+            record.deadline_ns,
+            record.start_ns,
+            record.state_age_ns,
+            record.lost,
+            record.flags,
+            record.action is not None,
+            action,
+            record.safety_state,
+        )
         self._add("/cycle", record.start_ns, data, record.cycle)
         self.cycles += 1
         self.states += len(record.states)
@@ -217,10 +231,20 @@ class EpisodeRecorder:
         if body is None:
             return
         data = BODY.encode(
-            state.receive_ns, state.sequence, body.orientation, body.angular_velocity, body.acceleration,
-            body.foot_force, body.temperature, body.lost, body.battery, body.voltage, body.current,
-            body.sticks, body.buttons,
-        )  # fmt: skip
+            state.receive_ns,
+            state.sequence,
+            body.orientation,
+            body.angular_velocity,
+            body.acceleration,
+            body.foot_force,
+            body.temperature,
+            body.lost,
+            body.battery,
+            body.voltage,
+            body.current,
+            body.sticks,
+            body.buttons,
+        )
         self._add("/body", state.receive_ns, data, state.sequence)
 
     def _add_command(self, topic: str, record: CycleRecord, command: JointCommand | None) -> None:
@@ -228,9 +252,17 @@ class EpisodeRecorder:
             return
         stamp_ns = record.sent_ns if record.sent_ns >= 0 else record.start_ns
         data = COMMAND.encode(
-            stamp_ns, record.cycle, record.sent_sequence, command.position_target, command.velocity_target,
-            command.stiffness, command.damping, command.effort, command.effort_limit, command.speed_limit,
-        )  # fmt: skip
+            stamp_ns,
+            record.cycle,
+            record.sent_sequence,
+            command.position_target,
+            command.velocity_target,
+            command.stiffness,
+            command.damping,
+            command.effort,
+            command.effort_limit,
+            command.speed_limit,
+        )
         self._add(topic, stamp_ns, data, record.cycle)
 
     def _add(self, topic: str, stamp_ns: int, data: bytes, sequence: int = 0) -> None:

@@ -200,11 +200,18 @@ def _inspect(path: Path, data: bytes) -> _Findings:
     if nameless := sum(count for channel, count in counts.items() if channel not in channels):
         damaged.append(f"{nameless} messages are on channels that the file does not name")
     report = RepairReport(
-        path=path, repaired=False, torn=any(loss.torn for loss in losses),
-        messages=counts.total() - nameless, chunks=chunks, damaged=tuple(damaged[:_KEPT]),
-        places=len(damaged), lost_bytes=sum(loss.size for loss in losses), lost_spans_s=tuple(spans[:_KEPT]),
-        holes=len(spans), missing_s=sum(stop - start for start, stop in spans),
-    )  # fmt: skip
+        path=path,
+        repaired=False,
+        torn=any(loss.torn for loss in losses),
+        messages=counts.total() - nameless,
+        chunks=chunks,
+        damaged=tuple(damaged[:_KEPT]),
+        places=len(damaged),
+        lost_bytes=sum(loss.size for loss in losses),
+        lost_spans_s=tuple(spans[:_KEPT]),
+        holes=len(spans),
+        missing_s=sum(stop - start for start, stop in spans),
+    )
     return _Findings(report, header, schemas, channels)
 
 

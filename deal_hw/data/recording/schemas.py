@@ -19,9 +19,11 @@ from deal_hw.errors import ProtocolError, UnknownNameError
 _HEADER = b"\x00\x01\x00\x00"
 """CDR encapsulation, little-endian; alignment counts from its end."""
 _SCALARS = {
-    "int64": struct.Struct("<q"), "uint32": struct.Struct("<I"), "bool": struct.Struct("<?"),
+    "int64": struct.Struct("<q"),
+    "uint32": struct.Struct("<I"),
+    "bool": struct.Struct("<?"),
     "float64": struct.Struct("<d"),
-}  # fmt: skip
+}
 _LENGTH = _SCALARS["uint32"]
 
 
@@ -144,27 +146,46 @@ ROBOT = MessageType(
 STATE = MessageType(
     "deal_hw_msgs/msg/State",
     (
-        ("int64", "receive_ns"), ("int64", "device_ns"), ("int64", "sequence"),
-        ("int64", "command_sequence"), ("int64", "command_age_ns"), ("uint32", "status"),
-        ("float64[]", "position"), ("float64[]", "velocity"), ("float64[]", "effort"),
+        ("int64", "receive_ns"),
+        ("int64", "device_ns"),
+        ("int64", "sequence"),
+        ("int64", "command_sequence"),
+        ("int64", "command_age_ns"),
+        ("uint32", "status"),
+        ("float64[]", "position"),
+        ("float64[]", "velocity"),
+        ("float64[]", "effort"),
     ),
-)  # fmt: skip
+)
 COMMAND = MessageType(
     "deal_hw_msgs/msg/Command",
     (
-        ("int64", "stamp_ns"), ("int64", "cycle"), ("int64", "sequence"), ("float64[]", "position_target"),
-        ("float64[]", "velocity_target"), ("float64[]", "stiffness"), ("float64[]", "damping"),
-        ("float64[]", "effort"), ("float64[]", "effort_limit"), ("float64[]", "speed_limit"),
+        ("int64", "stamp_ns"),
+        ("int64", "cycle"),
+        ("int64", "sequence"),
+        ("float64[]", "position_target"),
+        ("float64[]", "velocity_target"),
+        ("float64[]", "stiffness"),
+        ("float64[]", "damping"),
+        ("float64[]", "effort"),
+        ("float64[]", "effort_limit"),
+        ("float64[]", "speed_limit"),
     ),
-)  # fmt: skip
+)
 CYCLE = MessageType(
     "deal_hw_msgs/msg/Cycle",
     (
-        ("int64", "cycle"), ("int64", "deadline_ns"), ("int64", "start_ns"), ("int64", "state_age_ns"),
-        ("int64", "lost"), ("uint32", "flags"), ("bool", "has_action"), ("float64[]", "action"),
+        ("int64", "cycle"),
+        ("int64", "deadline_ns"),
+        ("int64", "start_ns"),
+        ("int64", "state_age_ns"),
+        ("int64", "lost"),
+        ("uint32", "flags"),
+        ("bool", "has_action"),
+        ("float64[]", "action"),
         ("string", "safety_state"),
     ),
-)  # fmt: skip
+)
 EVENT = MessageType(
     "deal_hw_msgs/msg/Event",
     (("int64", "stamp_ns"), ("string", "kind"), ("string", "message"), ("string", "data_json")),
@@ -172,19 +193,28 @@ EVENT = MessageType(
 BODY = MessageType(
     "deal_hw_msgs/msg/Body",
     (
-        ("int64", "receive_ns"), ("int64", "sequence"), ("float64[]", "orientation"),
-        ("float64[]", "angular_velocity"), ("float64[]", "acceleration"), ("float64[]", "foot_force"),
-        ("float64[]", "temperature"), ("float64[]", "lost"), ("float64", "battery"), ("float64", "voltage"),
-        ("float64", "current"), ("float64[]", "sticks"), ("int64", "buttons"),
+        ("int64", "receive_ns"),
+        ("int64", "sequence"),
+        ("float64[]", "orientation"),
+        ("float64[]", "angular_velocity"),
+        ("float64[]", "acceleration"),
+        ("float64[]", "foot_force"),
+        ("float64[]", "temperature"),
+        ("float64[]", "lost"),
+        ("float64", "battery"),
+        ("float64", "voltage"),
+        ("float64", "current"),
+        ("float64[]", "sticks"),
+        ("int64", "buttons"),
     ),
-)  # fmt: skip
+)
 WIRE = MessageType("deal_hw_msgs/msg/Wire", (("int64", "stamp_ns"), ("uint8[]", "payload")))
 
 CHANNELS: Mapping[str, MessageType] = {
     "/robot": ROBOT,
     "/state": STATE,
     "/command": COMMAND,
-    "/command/asked": COMMAND,
+    "/command/requested": COMMAND,
     "/cycle": CYCLE,
     "/events": EVENT,
     "/wire/rx": WIRE,

@@ -179,9 +179,15 @@ def without_spikes(trajectory: Trajectory, settings: SpikeSettings = DEFAULT_SPI
         return trajectory
     kept = sound(spikes, trajectory.device_s.size)
     sampled = (
-        "receive_s", "device_s", "position", "velocity", "effort", "status", "command_sequence",
+        "receive_s",
+        "device_s",
+        "position",
+        "velocity",
+        "effort",
+        "status",
+        "command_sequence",
         "command_age_s",
-    )  # fmt: skip
+    )
     body = trajectory.body
     if body is not None:
         body = dataclasses.replace(

@@ -254,7 +254,7 @@ def _clamped_by_device(trajectory: Trajectory) -> Verdict:
 
 
 def _clamped_by_us(trajectory: Trajectory) -> Verdict:
-    asked, sent = trajectory.asked_position, trajectory.position_target
+    asked, sent = trajectory.requested_position, trajectory.position_target
     clipped = np.any(np.abs(asked - sent) > CLIP_TOLERANCE, axis=1)
     count = int(np.sum(clipped))
     text = f"our safety filter changed {count} of {clipped.size} commands"

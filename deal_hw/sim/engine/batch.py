@@ -210,7 +210,7 @@ class ServoBatch:
         return np.asarray(self._qvel[:, self._dof])
 
     def _chart(self, qpos: FloatArray, reference: FloatArray | None) -> FloatArray:
-        """Return qpos, (N, ..., nq), as reported chart coordinates, (N, ..., C)."""
+        """Return qpos, (N, ..., nq), as reported tangent coordinates, (N, ..., C)."""
         joints = qpos[..., list(self.robot.qpos)]
         if self._biased:
             joints = joints + self._bias.reshape(self.count, *(1,) * (qpos.ndim - 2), -1)

@@ -72,9 +72,13 @@ def _try(path: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="deal-hw-") as folder:
         try:
             done = subprocess.run(
-                words, stdin=subprocess.DEVNULL, capture_output=True, timeout=4 * SECONDS, check=False,
+                words,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=4 * SECONDS,
+                check=False,
                 cwd=folder,
-            )  # fmt: skip
+            )
         except subprocess.TimeoutExpired as err:
             raise ConfigurationError(f"model {path} takes longer than {4 * SECONDS:g} s to compile") from err
     answer = done.stdout.rpartition(b"\n")[2]

@@ -49,12 +49,12 @@ class RobotModel:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the C chart coordinates of a state: base position and rotation, then the joints."""
+        """Names of the C tangent coordinates of a state: base position and rotation, then the joints."""
         return (BASE_COORDINATES if self.base is not None else ()) + self.description.joint_names
 
     @property
     def coordinate_units(self) -> tuple[str, ...]:
-        """Units of the chart coordinates, (C,)."""
+        """Units of the tangent coordinates, (C,)."""
         base = ("m", "m", "m", "rad", "rad", "rad") if self.base is not None else ()
         return base + self.description.position_units
 

@@ -219,8 +219,16 @@ def _effort_limit(model: Any, actuator: int, servo: bool) -> float:
 def _no_limits(joints: int, actuated: int) -> SafetyLimits:
     free = (math.inf,) * actuated
     return SafetyLimits(
-        target=((-math.inf, math.inf),) * actuated, target_step=free, target_distance=free,
-        trip_position=((-math.inf, math.inf),) * joints, trip_velocity=(math.inf,) * joints,
-        stiffness=free, damping=free, effort=free, speed=free,
-        state_age_s=math.inf, action_age_s=math.inf, ease_in_s=0.0,
-    )  # fmt: skip
+        target=((-math.inf, math.inf),) * actuated,
+        target_step=free,
+        target_distance=free,
+        trip_position=((-math.inf, math.inf),) * joints,
+        trip_velocity=(math.inf,) * joints,
+        stiffness=free,
+        damping=free,
+        effort=free,
+        speed=free,
+        state_age_s=math.inf,
+        action_age_s=math.inf,
+        ease_in_s=0.0,
+    )

@@ -127,10 +127,27 @@ OPTION_WORDS: Mapping[str, tuple[str, ...]] = {
     "solver": ("PGS", "CG", "Newton"),
 }
 OPTIONS = (
-    "timestep", "gravity", "wind", "magnetic", "density", "viscosity", "impratio", "tolerance",
-    "ls_tolerance", "noslip_tolerance", "ccd_tolerance", "iterations", "ls_iterations",
-    "noslip_iterations", "ccd_iterations", "o_margin", "o_solref", "o_solimp", "o_friction", *OPTION_WORDS,
-)  # fmt: skip
+    "timestep",
+    "gravity",
+    "wind",
+    "magnetic",
+    "density",
+    "viscosity",
+    "impratio",
+    "tolerance",
+    "ls_tolerance",
+    "noslip_tolerance",
+    "ccd_tolerance",
+    "iterations",
+    "ls_iterations",
+    "noslip_iterations",
+    "ccd_iterations",
+    "o_margin",
+    "o_solref",
+    "o_solimp",
+    "o_friction",
+    *OPTION_WORDS,
+)
 """Options that can be written, named alike in MJCF and in ``MjModel.opt``."""
 
 ACTUATOR_WORDS: Mapping[str, tuple[str, ...]] = {
@@ -139,17 +156,41 @@ ACTUATOR_WORDS: Mapping[str, tuple[str, ...]] = {
     "dyntype": ("none", "integrator", "filter", "filterexact", "muscle"),
 }
 
-FOLLOWS = frozenset({
-    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0", "tendon_length0",
-    "actuator_acc0", "actuator_length0", "dof_length",
-})  # fmt: skip
+FOLLOWS = frozenset(
+    {
+        "body_subtreemass",
+        "body_invweight0",
+        "dof_invweight0",
+        "dof_M0",
+        "tendon_invweight0",
+        "tendon_length0",
+        "actuator_acc0",
+        "actuator_length0",
+        "dof_length",
+    }
+)
 """Computed by ``mj_setConst`` from other fields: not written, but compared afterwards."""
 
-COMPILED = frozenset({
-    "actuator_lengthrange", "geom_aabb", "geom_rbound", "geom_fluid", "body_margin", "body_simple",
-    "body_sameframe", "geom_sameframe", "site_sameframe", "dof_simplenum",
-    "cam_pos0", "cam_poscom0", "cam_mat0", "light_pos0", "light_poscom0", "light_dir0",
-})  # fmt: skip
+COMPILED = frozenset(
+    {
+        "actuator_lengthrange",
+        "geom_aabb",
+        "geom_rbound",
+        "geom_fluid",
+        "body_margin",
+        "body_simple",
+        "body_sameframe",
+        "geom_sameframe",
+        "site_sameframe",
+        "dof_simplenum",
+        "cam_pos0",
+        "cam_poscom0",
+        "cam_mat0",
+        "light_pos0",
+        "light_poscom0",
+        "light_dir0",
+    }
+)
 """Computed by the compiler alone: a model that was changed after compiling may hold the older value."""
 
 COMPILED_PREFIXES = ("bvh_", "body_bvh", "oct_", "efm0_", "efmC_", "flexedge_", "B_", "D_", "M_", "map")

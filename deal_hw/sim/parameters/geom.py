@@ -121,14 +121,26 @@ def _standard_solref(model: Any, geom: int, name: str) -> None:
 
 GEOM_KINDS = (
     Kind(
-        name="geom_friction", element="geom", quantity="friction", unit="-", writes=("geom_friction",),
-        along="nothing; torsional and rolling friction stay", apply=geom_friction,
-        baseline=lambda m, i: float(m.geom_friction[i, 0]), usable=touching_geom,
+        name="geom_friction",
+        element="geom",
+        quantity="friction",
+        unit="-",
+        writes=("geom_friction",),
+        along="nothing; torsional and rolling friction stay",
+        apply=geom_friction,
+        baseline=lambda m, i: float(m.geom_friction[i, 0]),
+        usable=touching_geom,
     ),
     Kind(
-        name="geom_restitution", element="geom", quantity="restitution", unit="-", writes=("geom_solref",),
-        along="time constant: the contact's frequency stays", apply=geom_restitution,
-        baseline=lambda m, i: restitution_of(float(m.geom_solref[i, 1])), usable=_standard_solref,
+        name="geom_restitution",
+        element="geom",
+        quantity="restitution",
+        unit="-",
+        writes=("geom_solref",),
+        along="time constant: the contact's frequency stays",
+        apply=geom_restitution,
+        baseline=lambda m, i: restitution_of(float(m.geom_solref[i, 1])),
+        usable=_standard_solref,
         most=MOST_RESTITUTION,
     ),
-)  # fmt: skip
+)

@@ -10,13 +10,30 @@ from deal_hw.sim.parameters.kind import Kind, one_dof_joint
 
 SENSOR_KINDS = (
     Kind(
-        name="encoder_bias", element="joint", quantity="encoder_bias", unit="rad", unit_slide="m", writes=(),
-        along="reported minus true joint position; a servo closes its loop on the reported one", apply=None,
-        baseline=lambda m, i: 0.0, usable=one_dof_joint, scale="linear", spread=0.1, least=float("-inf"),
+        name="encoder_bias",
+        element="joint",
+        quantity="encoder_bias",
+        unit="rad",
+        unit_slide="m",
+        writes=(),
+        along="reported minus true joint position; a servo closes its loop on the reported one",
+        apply=None,
+        baseline=lambda m, i: 0.0,
+        usable=one_dof_joint,
+        scale="linear",
+        spread=0.1,
+        least=float("-inf"),
     ),
     Kind(
-        name="sensor_noise", element="joint", quantity="sensor_noise", unit="rad", unit_slide="m", writes=(),
-        along="standard deviation of white noise on the reported joint position; `known` only", apply=None,
-        baseline=None, usable=one_dof_joint,
+        name="sensor_noise",
+        element="joint",
+        quantity="sensor_noise",
+        unit="rad",
+        unit_slide="m",
+        writes=(),
+        along="standard deviation of white noise on the reported joint position; `known` only",
+        apply=None,
+        baseline=None,
+        usable=one_dof_joint,
     ),
-)  # fmt: skip
+)

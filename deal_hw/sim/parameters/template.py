@@ -20,8 +20,13 @@ _HEAD = """\
 parameters:
 """
 _ON = (
-    "dof_frictionloss", "dof_damping", "dof_armature", "servo_stiffness", "servo_damping", "motor_gain",
-)  # fmt: skip
+    "dof_frictionloss",
+    "dof_damping",
+    "dof_armature",
+    "servo_stiffness",
+    "servo_damping",
+    "motor_gain",
+)
 _OFF = ("servo_effort_limit", "encoder_bias", "body_mass")
 
 

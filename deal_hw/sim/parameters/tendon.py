@@ -33,13 +33,24 @@ def tendon_damping(fields: Fields, elements: Sequence[str], values: Array) -> No
 
 TENDON_KINDS = (
     Kind(
-        name="tendon_frictionloss", element="tendon", quantity="frictionloss", unit="N",
-        writes=("tendon_frictionloss",), along="nothing", apply=tendon_frictionloss,
-        baseline=lambda m, i: float(m.tendon_frictionloss[i]), ratio=FRICTION_RATIO,
+        name="tendon_frictionloss",
+        element="tendon",
+        quantity="frictionloss",
+        unit="N",
+        writes=("tendon_frictionloss",),
+        along="nothing",
+        apply=tendon_frictionloss,
+        baseline=lambda m, i: float(m.tendon_frictionloss[i]),
+        ratio=FRICTION_RATIO,
     ),
     Kind(
-        name="tendon_damping", element="tendon", quantity="damping", unit="N·s/m",
-        writes=("tendon_damping",), along="nothing", apply=tendon_damping,
+        name="tendon_damping",
+        element="tendon",
+        quantity="damping",
+        unit="N·s/m",
+        writes=("tendon_damping",),
+        along="nothing",
+        apply=tendon_damping,
         baseline=lambda m, i: float(np.ravel(m.tendon_damping[i])[0]),
     ),
-)  # fmt: skip
+)

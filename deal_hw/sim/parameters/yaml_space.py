@@ -23,8 +23,18 @@ from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import Kind
 
 _KEYS: Final = (
-    "kind", "elements", "group", "name", "nominal", "range", "ratio", "scale", "known", "weighed", "prior",
-)  # fmt: skip
+    "kind",
+    "elements",
+    "group",
+    "name",
+    "nominal",
+    "range",
+    "ratio",
+    "scale",
+    "known",
+    "weighed",
+    "prior",
+)
 _GROUPS: Final = ("each", "together")
 _SCALES: Final[Mapping[str, Scale]] = {"log": "log", "linear": "linear"}
 
@@ -88,9 +98,14 @@ def write_space(space: ParameterSpace) -> str:
 
 def _entry(p: Parameter) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "kind": p.kind, "elements": list(p.elements), "group": "together", "name": p.name,
-        "nominal": float(p.nominal), "range": [float(p.low), float(p.high)], "scale": p.scale,
-    }  # fmt: skip
+        "kind": p.kind,
+        "elements": list(p.elements),
+        "group": "together",
+        "name": p.name,
+        "nominal": float(p.nominal),
+        "range": [float(p.low), float(p.high)],
+        "scale": p.scale,
+    }
     if p.known:
         entry["known"] = True
     if p.prior_mean is not None and p.prior_std is not None:
@@ -171,9 +186,18 @@ def _parameter(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], 
     if len(units) > 1:
         raise ConfigurationError(f"parameter {name!r} groups hinges with slides: their units differ, {units}")
     return Parameter(
-        name=name, kind=kind.name, elements=elements, unit=units.pop(), nominal=nominal, low=low, high=high,
-        scale=scale, known=known, prior_mean=mean, prior_std=std,
-    )  # fmt: skip
+        name=name,
+        kind=kind.name,
+        elements=elements,
+        unit=units.pop(),
+        nominal=nominal,
+        low=low,
+        high=high,
+        scale=scale,
+        known=known,
+        prior_mean=mean,
+        prior_std=std,
+    )
 
 
 def _nominal(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], model: Any, name: str) -> float:

@@ -25,8 +25,8 @@ class Episode:
     Attributes:
         step_s: Device period [s].
         sample: Grid index of each sample, (T,).
-        position: Reported positions, chart coordinates (T, C): the joints, for a floating base after its six.
-            Coordinates that nobody measured hold an estimate.
+        position: Reported positions, tangent coordinates (T, C): the joints, for a floating base after its
+            six. Coordinates that nobody measured hold an estimate.
         velocity: Reported velocities, (T, C), likewise.
         target: Position target in force at each period, before any latency, (S, A).
         stiffness: Sent stiffness in force, (S, A).

@@ -18,7 +18,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import Episode, align
-from deal_hw.sim.recordings.standing import chart_base, with_sensed_base
+from deal_hw.sim.recordings.standing import tangent_base, with_sensed_base
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
 
@@ -188,7 +188,7 @@ def _base(episode: Episode, windows: Windows, start: FloatArray, x: FloatArray) 
     if episode.reference is None:
         return None
     points = np.concatenate([windows.start[:, None], windows.samples()], axis=1)
-    return chart_base(np.concatenate([start[:, None], x], axis=1), episode.reference[points])
+    return tangent_base(np.concatenate([start[:, None], x], axis=1), episode.reference[points])
 
 
 def reported_velocity_window(trajectory: Trajectory, description: RobotDescription) -> float:

@@ -17,8 +17,14 @@ LEAD_S = LONGEST_LATENCY_S
 
 
 SAMPLED = {
-    "sample": 1, "position": 2, "velocity": 2, "usable": 1, "reported": 1, "reference": 2, "estimate_std": 2,
-}  # fmt: skip
+    "sample": 1,
+    "position": 2,
+    "velocity": 2,
+    "usable": 1,
+    "reported": 1,
+    "reference": 2,
+    "estimate_std": 2,
+}
 """Axes of what an episode has for each sample; what is the same for all samples has fewer."""
 
 

@@ -56,7 +56,7 @@ def with_sensed_base(episode: Episode, robot: RobotModel, trajectory: Trajectory
     return with_base(episode, robot, feet, body.orientation, body.angular_velocity, felt if whole else None)
 
 
-def chart_base(position: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return base poses, (..., 7), of chart coordinates, (..., >= 6), around references, (..., 4)."""
+def tangent_base(position: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return base poses, (..., 7), of tangent coordinates, (..., >= 6), around references, (..., 4)."""
     quaternion = to_quaternion(position[..., 3:6], reference)
     return np.concatenate([position[..., :3], quaternion], axis=-1)

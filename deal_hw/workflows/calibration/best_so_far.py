@@ -123,7 +123,7 @@ class BestSoFar:
                     "Calibrate again; --resume goes on where it stopped.",
                 ),
             ),
-        )  # fmt: skip
+        )
         self._say(f"{time.monotonic() - self._began:.0f} s, {progress.stage}: {self.sentence}")
 
     @property

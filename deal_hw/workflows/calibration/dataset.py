@@ -162,7 +162,7 @@ def choose_episodes(
 
 
 def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
-    """Say whether a recording is the livelier repetition of the one before, by their metadata."""
+    """Say whether a recording is the stronger repetition of the one before, by their metadata."""
     same = all(one.get(key) == former.get(key) for key in ("profile", "seed", "seconds"))
     return same and one.get("attempt", 0) == former.get("attempt", 0) + 1
 

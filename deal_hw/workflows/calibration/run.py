@@ -95,13 +95,14 @@ class SpaceOverrides:
         free: Search exactly these; empty: as the space has it.
         known: Values measured by other means, by name (SI).
         ranges: Other ranges: name, low, high (SI).
-        xi: Log ranges reach a factor xi to either side of the nominal value; None: as the space has them.
+        range_ratio: Log ranges reach this factor to either side of the nominal value; None: as the space has
+            them.
     """
 
     free: Sequence[str]
     known: Mapping[str, float]
     ranges: Sequence[tuple[str, float, float]]
-    xi: float | None
+    range_ratio: float | None
 
     def apply(self, space: ParameterSpace) -> ParameterSpace:
         """Return the changed space.
@@ -112,8 +113,8 @@ class SpaceOverrides:
         """
         if self.free:
             space = space.with_free(self.free)
-        if self.xi is not None:
-            space = space.with_ratio(self.xi)
+        if self.range_ratio is not None:
+            space = space.with_ratio(self.range_ratio)
         space = space.with_known(self.known)
         for parameter, low, high in self.ranges:
             space = space.with_range(parameter, low, high)

@@ -69,50 +69,65 @@ def examine_servos(port: str, clock: Clock, sysfs: Path = _SYSFS) -> Iterator[Fi
                     yield _old(servo, rate)
     if not found:
         yield Finding(
-            AREA, Level.FAIL, f"no servo answers on {path} at any of {len(BAUD_RATES)} baud rates",
+            AREA,
+            Level.FAIL,
+            f"no servo answers on {path} at any of {len(BAUD_RATES)} baud rates",
             "switch their supply on (USB does not power them), check the 3-pin cables, and that this is the "
             "adapter's port",
-        )  # fmt: skip
+        )
 
 
 def _servo(bus: Bus, servo: int, answer: Answer, rate: int, settings: DynamixelSettings) -> Iterator[Finding]:
     values = {}
     for register in (
-        OPERATING_MODE, RETURN_DELAY_TIME, HARDWARE_ERROR, PRESENT_POSITION, PRESENT_INPUT_VOLTAGE,
+        OPERATING_MODE,
+        RETURN_DELAY_TIME,
+        HARDWARE_ERROR,
+        PRESENT_POSITION,
+        PRESENT_INPUT_VOLTAGE,
         PRESENT_TEMPERATURE,
-    ):  # fmt: skip
+    ):
         try:
             values[register] = _read(bus, servo, register)
         except (TransportTimeoutError, FrameError):
             yield Finding(
-                AREA, Level.FAIL, f"id {servo} at {rate} baud answers pings, its other answers are corrupt",
+                AREA,
+                Level.FAIL,
+                f"id {servo} at {rate} baud answers pings, its other answers are corrupt",
                 "two servos with the same id? Connect one alone and give it another",
-            )  # fmt: skip
+            )
             return
     role = {settings.cart_id: "belt", settings.pole_id: "pole"}.get(servo, "not used")
     yield Finding(
-        AREA, Level.OK,
+        AREA,
+        Level.OK,
         f"id {servo} ({role}): {model_name(answer.model)}, firmware {answer.firmware}, {rate} baud, "
         f"operating mode {values[OPERATING_MODE]}, position {values[PRESENT_POSITION] % 4096} of 4096, "
         f"{values[PRESENT_INPUT_VOLTAGE] / 10:.1f} V, {values[PRESENT_TEMPERATURE]} °C",
-    )  # fmt: skip
+    )
     if rate != settings.baud_rate:
         yield Finding(
-            AREA, Level.FAIL, f"id {servo} is set to {rate} baud, deal-hw expects {settings.baud_rate}",
+            AREA,
+            Level.FAIL,
+            f"id {servo} is set to {rate} baud, deal-hw expects {settings.baud_rate}",
             "set its register Baud Rate (8) with Dynamixel Wizard"
             + (f", or give --port 'PORT?baud_rate={rate}' if both have it" if rate >= _FAST_BAUD else ""),
-        )  # fmt: skip
+        )
     delay_us = round(values[RETURN_DELAY_TIME] * RETURN_DELAY_UNIT_S * 1e6)
     if delay_us > _LONG_DELAY_US:
         yield Finding(
-            AREA, Level.WARN, f"id {servo} waits {delay_us} us before each answer",
+            AREA,
+            Level.WARN,
+            f"id {servo} waits {delay_us} us before each answer",
             "set its register Return Delay Time (9) to 0",
-        )  # fmt: skip
+        )
     if values[HARDWARE_ERROR]:
         yield Finding(
-            AREA, Level.FAIL, f"id {servo} reports: {explain_hardware_error(values[HARDWARE_ERROR])}",
+            AREA,
+            Level.FAIL,
+            f"id {servo} reports: {explain_hardware_error(values[HARDWARE_ERROR])}",
             "then switch it off and on",
-        )  # fmt: skip
+        )
 
 
 def _read(bus: Bus, servo: int, register: Register) -> int:
@@ -124,9 +139,11 @@ def _read(bus: Bus, servo: int, register: Register) -> int:
 
 def _old(servo: int, rate: int) -> Finding:
     return Finding(
-        AREA, Level.FAIL, f"id {servo} at {rate} baud speaks Dynamixel protocol 1.0",
+        AREA,
+        Level.FAIL,
+        f"id {servo} at {rate} baud speaks Dynamixel protocol 1.0",
         "set its register Protocol Type (13) to 2 with Dynamixel Wizard, or update its firmware",
-    )  # fmt: skip
+    )
 
 
 def _latency_timer(path: str, sysfs: Path) -> Iterator[Finding]:
@@ -138,8 +155,11 @@ def _latency_timer(path: str, sysfs: Path) -> Iterator[Finding]:
     slow = timer_ms > 1
     # The driver asks for 1 ms when it opens the port; where that is not permitted the answers are late.
     yield Finding(
-        AREA, Level.NOTE if slow else Level.OK, f"the adapter's latency timer is {timer_ms} ms",
+        AREA,
+        Level.NOTE if slow else Level.OK,
+        f"the adapter's latency timer is {timer_ms} ms",
         f"deal-hw sets it to 1 ms while it runs; for other programs: echo 1 > /sys/class/tty/"
         f"{Path(path).resolve().name}/device/latency_timer, or the udev rule in docs/dynamixel.md"
-        if slow else "",
-    )  # fmt: skip
+        if slow
+        else "",
+    )

@@ -124,10 +124,14 @@ class Homing:
     def _goal(self, position: int) -> Goal:
         d, s = self._description, self._settings
         command = JointCommand(
-            position_target=np.zeros(1), velocity_target=np.zeros(1), stiffness=np.array(d.stiffness),
-            damping=np.array(d.damping), effort=np.zeros(1), effort_limit=np.array([s.homing_effort_n]),
+            position_target=np.zeros(1),
+            velocity_target=np.zeros(1),
+            stiffness=np.array(d.stiffness),
+            damping=np.array(d.damping),
+            effort=np.zeros(1),
+            effort_limit=np.array([s.homing_effort_n]),
             speed_limit=np.array([s.homing_speed_m_s]),
-        )  # fmt: skip
+        )
         return s.to_goal(command, position, self._servos.most_effort)
 
     def _await_hand(self) -> None:

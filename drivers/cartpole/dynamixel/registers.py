@@ -70,9 +70,17 @@ PRESENT_INPUT_VOLTAGE = Register(144, 2, "Present Input Voltage")
 PRESENT_TEMPERATURE = Register(146, 1, "Present Temperature")
 
 NEEDED: Final = (
-    OPERATING_MODE, TORQUE_ENABLE, HARDWARE_ERROR, POSITION_P_GAIN, BUS_WATCHDOG, PROFILE_VELOCITY,
-    GOAL_POSITION, REALTIME_TICK, PRESENT_VELOCITY, PRESENT_POSITION,
-)  # fmt: skip
+    OPERATING_MODE,
+    TORQUE_ENABLE,
+    HARDWARE_ERROR,
+    POSITION_P_GAIN,
+    BUS_WATCHDOG,
+    PROFILE_VELOCITY,
+    GOAL_POSITION,
+    REALTIME_TICK,
+    PRESENT_VELOCITY,
+    PRESENT_POSITION,
+)
 """A model without one of these, at these addresses, is none that the driver can use."""
 
 

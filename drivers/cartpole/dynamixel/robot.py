@@ -226,7 +226,8 @@ class DynamixelCartpole(Robot):
                 self._clock.sleep_until_ns(deadline_ns)
             if not self._states and self._clock.now_ns() >= deadline_ns:
                 why = (
-                    self._fault or f"are both servos powered, is the cable good ({self.link_errors} errors)?"
+                    self._fault
+                    or f"are both servos powered, is the cable good ({self.transport_errors} errors)?"
                 )
                 raise TransportTimeoutError(f"cartpole: no state within {timeout_s:g} s; {why}")
         return self._states.popleft()
@@ -417,7 +418,7 @@ class DynamixelCartpole(Robot):
         return self._sequence
 
     @property
-    def link_errors(self) -> int:
+    def transport_errors(self) -> int:
         """Answers that were corrupt or stayed away, and commands that the servo did not show, so far."""
         return self._bus.errors - self._errors_before + self._lost_commands
 

@@ -101,10 +101,20 @@ class DynamixelSettings:
                 f"baud_rate {self.baud_rate}: X-series servos have {', '.join(map(str, BAUD_RATES))}"
             )
         for name in (
-            "metres_per_revolution", "rail_m", "rail_tolerance_m", "homing_speed_m_s", "homing_effort_n",
-            "stall_s", "upright_rad", "still_s", "stiffness_per_gain", "damping_per_gain",
-            "effort_per_current", "effort_per_pwm", "answer_s",
-        ):  # fmt: skip
+            "metres_per_revolution",
+            "rail_m",
+            "rail_tolerance_m",
+            "homing_speed_m_s",
+            "homing_effort_n",
+            "stall_s",
+            "upright_rad",
+            "still_s",
+            "stiffness_per_gain",
+            "damping_per_gain",
+            "effort_per_current",
+            "effort_per_pwm",
+            "answer_s",
+        ):
             if not 0 < (value := getattr(self, name)) < math.inf:
                 raise ConfigurationError(f"{name} is {value!r}; it must be a number above 0")
         if not 0 <= self.pole_zero < PULSES:
@@ -147,11 +157,15 @@ class DynamixelSettings:
             _integer(command.stiffness, self.stiffness_per_gain, 0, _MOST_GAIN, "stiffness"),
             _integer(command.effort_limit, self.effort_per_unit, 0, most_effort, "effort_limit"),
             _integer(command.speed_limit, self.metres_s_per_count, 1, _MOST_VELOCITY, "speed_limit"),
-            zero + _integer(
-                command.position_target, self.metres_per_pulse, -_MOST_POSITION // 2, _MOST_POSITION // 2,
+            zero
+            + _integer(
+                command.position_target,
+                self.metres_per_pulse,
+                -_MOST_POSITION // 2,
+                _MOST_POSITION // 2,
                 "position_target",
             ),
-        )  # fmt: skip
+        )
 
     def from_goal(self, goal: Goal, zero: int) -> JointCommand:
         """Return the command that the registers stand for; what they do not carry is 0."""

@@ -154,10 +154,13 @@ class Admission:
     def status(self) -> dict[str, Any]:
         """Return who has the robot and why, as plain values."""
         return {
-            "control": self.control.value, "reason": self.reason,
-            "stream": "" if self._holder is None else f"{self._holder:016x}", "admitted": self.admitted,
-            "refused": dict(self.refused), "last_refusal": self.last_refusal,
-        }  # fmt: skip
+            "control": self.control.value,
+            "reason": self.reason,
+            "stream": "" if self._holder is None else f"{self._holder:016x}",
+            "admitted": self.admitted,
+            "refused": dict(self.refused),
+            "last_refusal": self.last_refusal,
+        }
 
     def _become(self, control: Control, reason: str) -> None:
         self.control, self.reason = control, reason

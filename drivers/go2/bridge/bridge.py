@@ -31,9 +31,15 @@ RESPONSES: Final = tuple(topics.response(name) for name in topics.SERVICES)
 COMMANDS: Final = (topics.LOW_COMMAND, *REQUESTS, topics.CLAIM)
 """Topics that a controller may write."""
 TO_NETWORK: Final = (
-    topics.LOW_STATE, topics.LOW_STATE_SLOW, topics.SPORT_STATE, topics.SPORT_STATE_SLOW, topics.WIRELESS,
-    topics.LOW_COMMAND, topics.CLAIM, *RESPONSES,
-)  # fmt: skip
+    topics.LOW_STATE,
+    topics.LOW_STATE_SLOW,
+    topics.SPORT_STATE,
+    topics.SPORT_STATE_SLOW,
+    topics.WIRELESS,
+    topics.LOW_COMMAND,
+    topics.CLAIM,
+    *RESPONSES,
+)
 """Topics that pass from the robot's side; motor commands are those of others, such as sport mode."""
 READABLE: Final = (*TO_NETWORK, topics.BRIDGE)
 _ASK_S: Final = 2.0

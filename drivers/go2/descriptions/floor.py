@@ -1,4 +1,4 @@
-"""Facts about the Unitree Go2 on the floor: 12 joints under P-D control, a free base.
+"""Facts about the Unitree Go2 on the floor: 12 joints under PD control, a free base.
 
 Joint order here, in the model and in every array: FL, FR, RL, RR, each hip, thigh, calf. The robot's own wire
 order is FR, FL, RR, RL.
@@ -143,12 +143,15 @@ def walk_space() -> ParameterSpace:
         Parameter.around("floor.friction", "geom_friction", ("floor",), "-", FLOOR_FRICTION, ratio=2.0),
         *(
             Parameter.around(
-                f"{part}s.frictionloss", "dof_frictionloss", tuple(f"{leg}_{part}_joint" for leg in LEGS),
-                "N·m", FRICTIONLOSS_NM,
+                f"{part}s.frictionloss",
+                "dof_frictionloss",
+                tuple(f"{leg}_{part}_joint" for leg in LEGS),
+                "N·m",
+                FRICTIONLOSS_NM,
             )
             for part in PARTS
         ),
-    ]  # fmt: skip
+    ]
     return ParameterSpace([*parameter_space().parameters, *more])
 
 

@@ -36,7 +36,7 @@ def _reach() -> tuple[tuple[float, float], ...]:
 
 DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
     DRIVER,
-    name="go2_hung",
+    name="go2_on_stand",
     stiffness=on_stand_recording.DESCRIPTION.stiffness,
     damping=on_stand_recording.DESCRIPTION.damping,
     device_rate_hz=MOTOR_HZ,

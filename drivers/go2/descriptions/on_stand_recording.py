@@ -61,11 +61,17 @@ def _space(groups: Sequence[tuple[str, tuple[str, ...]]], *, bias: bool) -> Para
     if bias:
         parameters += [
             Parameter(
-                name=f"{joint}.encoder_bias", kind="encoder_bias", elements=(joint,), unit="rad", nominal=0.0,
-                low=-ENCODER_BIAS_RAD, high=ENCODER_BIAS_RAD, scale="linear",
+                name=f"{joint}.encoder_bias",
+                kind="encoder_bias",
+                elements=(joint,),
+                unit="rad",
+                nominal=0.0,
+                low=-ENCODER_BIAS_RAD,
+                high=ENCODER_BIAS_RAD,
+                scale="linear",
             )
             for joint in floor.JOINTS
-        ]  # fmt: skip
+        ]
     return ParameterSpace(parameters)
 
 
@@ -106,12 +112,16 @@ def linkage_space() -> ParameterSpace:
     ]
     parameters += [
         Parameter.around(
-            f"{leg}_calf_{line}.frictionloss", "tendon_frictionloss", (f"{leg}_calf_{line}",), "N",
-            LINE_FRICTIONLOSS_N, ratio=10.0,
+            f"{leg}_calf_{line}.frictionloss",
+            "tendon_frictionloss",
+            (f"{leg}_calf_{line}",),
+            "N",
+            LINE_FRICTIONLOSS_N,
+            ratio=10.0,
         )
         for line in ("rod", "strap")
         for leg in floor.LEGS
-    ]  # fmt: skip
+    ]
     return ParameterSpace(parameters)
 
 

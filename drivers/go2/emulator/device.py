@@ -387,22 +387,39 @@ class Go2Device:
         position = self._sim.base_position()
         return encode_sport_state(
             SportState(
-                stamp_ns=now * TICK_NS, error_code=0, orientation=low.orientation,
-                angular_velocity=low.angular_velocity, specific_force=low.specific_force, rpy=low.rpy,
-                imu_temperature=low.imu_temperature, mode=controller.posture.value,
-                progress=controller.progress(now), gait=0, foot_raise_height=0.0, position=position,
-                body_height=float(position[2]), velocity=self._sim.base_velocity(),
-                yaw_speed=float(low.angular_velocity[2]), range_obstacle=np.zeros(4),
-                foot_force=low.foot_force, foot_position=feet, foot_velocity=foot_velocity,
+                stamp_ns=now * TICK_NS,
+                error_code=0,
+                orientation=low.orientation,
+                angular_velocity=low.angular_velocity,
+                specific_force=low.specific_force,
+                rpy=low.rpy,
+                imu_temperature=low.imu_temperature,
+                mode=controller.posture.value,
+                progress=controller.progress(now),
+                gait=0,
+                foot_raise_height=0.0,
+                position=position,
+                body_height=float(position[2]),
+                velocity=self._sim.base_velocity(),
+                yaw_speed=float(low.angular_velocity[2]),
+                range_obstacle=np.zeros(4),
+                foot_force=low.foot_force,
+                foot_position=feet,
+                foot_velocity=foot_velocity,
                 path=np.zeros((POINTS, 7)),
             )
-        )  # fmt: skip
+        )
 
 
 PUBLISHED: Final = (
-    topics.LOW_STATE, topics.LOW_STATE_SLOW, topics.SPORT_STATE, topics.SPORT_STATE_SLOW, topics.WIRELESS,
-    *(topics.response(name) for name in topics.SERVICES), topics.LOW_COMMAND,
-)  # fmt: skip
+    topics.LOW_STATE,
+    topics.LOW_STATE_SLOW,
+    topics.SPORT_STATE,
+    topics.SPORT_STATE_SLOW,
+    topics.WIRELESS,
+    *(topics.response(name) for name in topics.SERVICES),
+    topics.LOW_COMMAND,
+)
 """Topics that the robot writes; the last one is sport mode's."""
 SUBSCRIBED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES))
 """Topics that the robot reads."""

@@ -12,8 +12,18 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 
 SHARES: Final = ("drop", "duplicate", "reorder", "corrupt")
 MOMENTS: Final = (
-    "wire", "freeze", "cut", "stale", "lost", "sport", "battery", "nan", "hot", "stop", "push",
-)  # fmt: skip
+    "wire",
+    "freeze",
+    "cut",
+    "stale",
+    "lost",
+    "sport",
+    "battery",
+    "nan",
+    "hot",
+    "stop",
+    "push",
+)
 """Faults that begin at a moment, as in ``<name>_after_s``; ``wire`` is that of the four shares."""
 
 

@@ -1,4 +1,4 @@
-"""The emulated Go2's twelve motors: a P-D loop at 1 kHz on the last command, which they hold for ever."""
+"""The emulated Go2's twelve motors: a PD loop at 1 kHz on the last command, which they hold for ever."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands between an emulated Go2's mechanics and the wire, in three steps of honesty."""
+"""What stands between an emulated Go2's mechanics and the wire, in three steps of realism."""
 
 from __future__ import annotations
 

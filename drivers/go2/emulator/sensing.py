@@ -81,10 +81,17 @@ class Sensing:
         self._resolution = profile.position_resolution
         p = profile
         self._noise = np.repeat(
-            (p.position_noise, p.velocity_noise, p.acceleration_noise, p.effort_noise,
-             p.orientation_noise, p.gyro_noise, p.specific_force_noise),
+            (
+                p.position_noise,
+                p.velocity_noise,
+                p.acceleration_noise,
+                p.effort_noise,
+                p.orientation_noise,
+                p.gyro_noise,
+                p.specific_force_noise,
+            ),
             (12, 12, 12, 12, 3, 3, 3),
-        )  # fmt: skip
+        )
         self._cells = np.zeros(15, np.int64)
 
     def empty_battery(self) -> None:
@@ -113,15 +120,30 @@ class Sensing:
         force = np.rint(np.minimum(sim.foot_force(), 32767.0)).astype(np.int64)
         self._cells[:CELLS] = battery.cell_mv
         return LowState(
-            position=position, velocity=velocity, acceleration=sim.acceleration() + noise[24:36],
-            effort=motors.effort + noise[36:48], temperature=temperature, lost=motors.lost, mode=motors.mode,
-            orientation=orientation, angular_velocity=sim.angular_velocity() + noise[51:54],
-            specific_force=sim.specific_force() + noise[54:57], rpy=_roll_pitch_yaw(w, x, y, z),
-            imu_temperature=IMU_TEMPERATURE_C, foot_force=force, foot_force_estimate=force,
-            tick_ms=tick_ms, remote=remote, battery_percent=round(100 * battery.charge),
-            battery_current_ma=-round(1e3 * battery.current), battery_status=8, battery_cycles=42,
-            cell_voltage_mv=self._cells, voltage=battery.voltage, current=battery.current,
-        )  # fmt: skip
+            position=position,
+            velocity=velocity,
+            acceleration=sim.acceleration() + noise[24:36],
+            effort=motors.effort + noise[36:48],
+            temperature=temperature,
+            lost=motors.lost,
+            mode=motors.mode,
+            orientation=orientation,
+            angular_velocity=sim.angular_velocity() + noise[51:54],
+            specific_force=sim.specific_force() + noise[54:57],
+            rpy=_roll_pitch_yaw(w, x, y, z),
+            imu_temperature=IMU_TEMPERATURE_C,
+            foot_force=force,
+            foot_force_estimate=force,
+            tick_ms=tick_ms,
+            remote=remote,
+            battery_percent=round(100 * battery.charge),
+            battery_current_ma=-round(1e3 * battery.current),
+            battery_status=8,
+            battery_cycles=42,
+            cell_voltage_mv=self._cells,
+            voltage=battery.voltage,
+            current=battery.current,
+        )
 
 
 def _turned(orientation: FloatArray, angles: FloatArray) -> FloatArray:

@@ -87,12 +87,16 @@ class Services:
         self._apis: Mapping[str, Mapping[int, Callable[[Any, FloatArray, int], tuple[int, Any]]]] = {
             "motion_switcher": {1001: self._check, 1002: self._select, 1003: self._release},
             "sport": {
-                1001: self._go(Posture.DAMPING), 1002: self._go(Posture.BALANCING), 1003: self._stop_move,
-                1004: self._go(Posture.STANDING), 1005: self._go(Posture.DOWN),
-                1006: self._go(Posture.RECOVERING), 1008: self._move,
+                1001: self._go(Posture.DAMPING),
+                1002: self._go(Posture.BALANCING),
+                1003: self._stop_move,
+                1004: self._go(Posture.STANDING),
+                1005: self._go(Posture.DOWN),
+                1006: self._go(Posture.RECOVERING),
+                1008: self._move,
             },
             "robot_state": {1001: self._switch, 1003: self._list},
-        }  # fmt: skip
+        }
 
     def answer(self, service: str, payload: bytes, position: FloatArray, now_ms: int) -> bytes | None:
         """Act on a request and return the response; None where none was asked for, or nobody is there.
@@ -188,7 +192,10 @@ class Services:
         active = SERVICE_OF.get(self._sport.name)
         # As the vendor's stand example reads it: 0 is active.
         return 0, [
-            {"name": service, "status": 0 if service in (active, *_OTHER_SERVICES) else 1,
-             "protect": int(service in _OTHER_SERVICES)}
+            {
+                "name": service,
+                "status": 0 if service in (active, *_OTHER_SERVICES) else 1,
+                "protect": int(service in _OTHER_SERVICES),
+            }
             for service in (*SERVICE_OF.values(), *_OTHER_SERVICES)
-        ]  # fmt: skip
+        ]

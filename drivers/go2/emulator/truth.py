@@ -24,7 +24,7 @@ from deal_hw.reading import number, reading
 
 JOINT_DAMPING_NMS_RAD: Final = 0.6
 ARMATURE_KGM2: Final = 0.01
-DEFAULT_XI: Final = 2.0
+DEFAULT_RANGE_RATIO: Final = 2.0
 """Hidden quantities lie within this ratio of the nominal ones, unless told otherwise."""
 
 
@@ -144,28 +144,28 @@ def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Trut
     return Truth(profile=find_profile(profile).name, seed=seed, **changes)
 
 
-def draw_truth(profile: str, seed: int, *, xi: float = DEFAULT_XI) -> Truth:
-    """Draw a hidden truth: each quantity log-uniformly in the middle 80 % of [nominal/xi, nominal*xi].
+def draw_truth(profile: str, seed: int, *, range_ratio: float = DEFAULT_RANGE_RATIO) -> Truth:
+    """Draw a hidden truth: each quantity log-uniformly in the middle 80 % of its range.
 
     Args:
         profile: Name of the profile.
         seed: Seed of the draw.
-        xi: Ratio of the range around the nominal values.
+        range_ratio: Ratio of the range around the nominal values.
 
     Raises:
         UnknownNameError: There is no such profile.
-        ConfigurationError: ``xi`` is not above 1, or the seed is negative.
+        ConfigurationError: ``range_ratio`` is not above 1, or the seed is negative.
     """
     found = find_profile(profile)
     if seed < 0:
         raise ConfigurationError(f"a seed is 0 or more, got {seed}")
-    if not 1.0 < xi < math.inf:
-        raise ConfigurationError(f"xi is a ratio above 1, got {xi}")
+    if not 1.0 < range_ratio < math.inf:
+        raise ConfigurationError(f"the range ratio must be above 1, got {range_ratio}")
     rng = np.random.default_rng([seed, 0x602])
 
     def around(nominal: float) -> tuple[float, ...]:
         exponent = rng.uniform(-0.8, 0.8, len(JOINTS))
-        return tuple(float(v) for v in nominal * xi**exponent)
+        return tuple(float(v) for v in nominal * range_ratio**exponent)
 
     low, high = found.latency_ms
     bias = found.encoder_bias_rad

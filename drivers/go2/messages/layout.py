@@ -42,9 +42,15 @@ _FRAME: Final = {
 }
 _MOTOR_COMMAND: Final = packed(
     36,
-    {"q": ("<f4", 0), "dq": ("<f4", 4), "tau": ("<f4", 8), "kp": ("<f4", 12), "kd": ("<f4", 16),
-     "reserve": (("<u4", 3), 20)},
-)  # fmt: skip
+    {
+        "q": ("<f4", 0),
+        "dq": ("<f4", 4),
+        "tau": ("<f4", 8),
+        "kp": ("<f4", 12),
+        "kd": ("<f4", 16),
+        "reserve": (("<u4", 3), 20),
+    },
+)
 LOW_COMMAND: Final = packed(
     LOW_COMMAND_BYTES,
     {
@@ -66,10 +72,19 @@ COMMAND_MODE_AT: Final = np.array([26, *range(60, 60 + 36 * (SLOTS - 1), 36)])
 
 _MOTOR_STATE: Final = packed(
     48,
-    {"q": ("<f4", 0), "dq": ("<f4", 4), "ddq": ("<f4", 8), "tau_est": ("<f4", 12), "q_raw": ("<f4", 16),
-     "dq_raw": ("<f4", 20), "ddq_raw": ("<f4", 24), "temperature": ("u1", 28), "lost": ("<u4", 32),
-     "reserve": (("<u4", 2), 36)},
-)  # fmt: skip
+    {
+        "q": ("<f4", 0),
+        "dq": ("<f4", 4),
+        "ddq": ("<f4", 8),
+        "tau_est": ("<f4", 12),
+        "q_raw": ("<f4", 16),
+        "dq_raw": ("<f4", 20),
+        "ddq_raw": ("<f4", 24),
+        "temperature": ("u1", 28),
+        "lost": ("<u4", 32),
+        "reserve": (("<u4", 2), 36),
+    },
+)
 LOW_STATE: Final = packed(
     LOW_STATE_BYTES,
     {

@@ -1,4 +1,4 @@
-"""LowCmd: P-D targets for the motors. Import its names from ``messages.protocol``."""
+"""LowCmd: PD targets for the motors. Import its names from ``messages.protocol``."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LARGEST: Final = 1e30
 
 @dataclass(frozen=True, slots=True)
 class LowCommand:
-    """P-D targets for the 12 motors, arrays (12,) in model order.
+    """PD targets for the 12 motors, arrays (12,) in model order.
 
     Attributes:
         position: Targets q [rad].
@@ -124,9 +124,7 @@ def decode_low_command(payload: bytes) -> LowCommand:
         raise FrameError(
             f"LowCmd: level_flag is 0x{payload[6]:02X}; commands to the motors have 0x{LEVEL_LOW:02X}"
         )
-    if (
-        payload[7] or record["reserve"] or record["bms_reserve"].any() or record["motor"]["reserve"].any()
-    ):  # fmt: skip
+    if payload[7] or record["reserve"] or record["bms_reserve"].any() or record["motor"]["reserve"].any():
         raise FrameError(
             "LowCmd: reserved fields are set; the sender uses another version, or another layout"
         )

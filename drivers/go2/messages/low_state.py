@@ -196,20 +196,33 @@ class LowStateFrame:
         record = np.frombuffer(self.payload, layout.LOW_STATE)[0]
         modes = np.frombuffer(self.payload, "u1")[layout.STATE_MODE_AT[SLOT]]
         return LowState(
-            position=self.position.copy(), velocity=self.velocity.copy(),
-            acceleration=self.acceleration.copy(), effort=self.effort.copy(),
-            temperature=self.temperature, lost=self.lost, mode=modes.astype(np.int64),
-            orientation=self.orientation.copy(), angular_velocity=self.angular_velocity.copy(),
-            specific_force=self.specific_force.copy(), rpy=self.rpy.copy(),
-            imu_temperature=self.payload[80], foot_force=self.foot_force,
+            position=self.position.copy(),
+            velocity=self.velocity.copy(),
+            acceleration=self.acceleration.copy(),
+            effort=self.effort.copy(),
+            temperature=self.temperature,
+            lost=self.lost,
+            mode=modes.astype(np.int64),
+            orientation=self.orientation.copy(),
+            angular_velocity=self.angular_velocity.copy(),
+            specific_force=self.specific_force.copy(),
+            rpy=self.rpy.copy(),
+            imu_temperature=self.payload[80],
+            foot_force=self.foot_force,
             foot_force_estimate=record["foot_force_est"][FOOT].astype(np.int64),
-            tick_ms=self.tick_ms, remote=self.remote, battery_percent=self.battery_percent,
-            battery_current_ma=int(record["bms_current"]), battery_status=int(record["bms_status"]),
-            battery_cycles=int(record["bms_cycle"]), cell_voltage_mv=record["cell_vol"].astype(np.int64),
-            voltage=self.voltage, current=self.current, level=self.payload[6],
+            tick_ms=self.tick_ms,
+            remote=self.remote,
+            battery_percent=self.battery_percent,
+            battery_current_ma=int(record["bms_current"]),
+            battery_status=int(record["bms_status"]),
+            battery_cycles=int(record["bms_cycle"]),
+            cell_voltage_mv=record["cell_vol"].astype(np.int64),
+            voltage=self.voltage,
+            current=self.current,
+            level=self.payload[6],
             serial=(int(record["sn"][0]), int(record["sn"][1])),
             version=(int(record["version"][0]), int(record["version"][1])),
-        )  # fmt: skip
+        )
 
 
 def decode_low_state(payload: bytes, strict: bool = True) -> LowStateFrame:
@@ -245,23 +258,37 @@ def encode_low_state(state: LowState) -> bytes:
     buffer[:6], buffer[6] = BEGIN, state.level
     motors = record["motor"]
     for name, value in (
-        ("q", state.position), ("dq", state.velocity), ("ddq", state.acceleration), ("tau_est", state.effort),
-        ("q_raw", state.position), ("dq_raw", state.velocity), ("ddq_raw", state.acceleration),
-        ("temperature", state.temperature), ("lost", state.lost),
-    ):  # fmt: skip
+        ("q", state.position),
+        ("dq", state.velocity),
+        ("ddq", state.acceleration),
+        ("tau_est", state.effort),
+        ("q_raw", state.position),
+        ("dq_raw", state.velocity),
+        ("ddq_raw", state.acceleration),
+        ("temperature", state.temperature),
+        ("lost", state.lost),
+    ):
         motors[name][SLOT] = value
     np.frombuffer(buffer, "u1")[layout.STATE_MODE_AT[SLOT]] = state.mode
     record["foot_force"][FOOT], record["foot_force_est"][FOOT] = state.foot_force, state.foot_force_estimate
     buffer[1104:1144] = state.remote
     for name, number in (
-        ("quaternion", state.orientation), ("gyroscope", state.angular_velocity),
-        ("accelerometer", state.specific_force), ("rpy", state.rpy),
+        ("quaternion", state.orientation),
+        ("gyroscope", state.angular_velocity),
+        ("accelerometer", state.specific_force),
+        ("rpy", state.rpy),
         ("imu_temperature", state.imu_temperature),
-        ("tick", state.tick_ms), ("soc", state.battery_percent), ("bms_current", state.battery_current_ma),
-        ("bms_status", state.battery_status), ("bms_cycle", state.battery_cycles),
-        ("cell_vol", state.cell_voltage_mv), ("power_v", state.voltage), ("power_a", state.current),
-        ("sn", state.serial), ("version", state.version),
-    ):  # fmt: skip
+        ("tick", state.tick_ms),
+        ("soc", state.battery_percent),
+        ("bms_current", state.battery_current_ma),
+        ("bms_status", state.battery_status),
+        ("bms_cycle", state.battery_cycles),
+        ("cell_vol", state.cell_voltage_mv),
+        ("power_v", state.voltage),
+        ("power_a", state.current),
+        ("sn", state.serial),
+        ("version", state.version),
+    ):
         record[name] = number
     buffer[1176:] = words_crc(low_state_image(bytes(buffer))).to_bytes(4, "little")
     return bytes(buffer)

@@ -15,8 +15,23 @@ from deal_hw.drivers.go2.messages.wire import CDR_HEADER
 from deal_hw.errors import ConfigurationError, FrameError, UnknownNameError
 
 BUTTONS: Final = (
-    "R1", "L1", "start", "select", "R2", "L2", "F1", "F2", "A", "B", "X", "Y", "up", "right", "down", "left",
-)  # fmt: skip
+    "R1",
+    "L1",
+    "start",
+    "select",
+    "R2",
+    "L2",
+    "F1",
+    "F2",
+    "A",
+    "B",
+    "X",
+    "Y",
+    "up",
+    "right",
+    "down",
+    "left",
+)
 """Bit 0 first."""
 REMOTE_BYTES: Final = 40
 _REMOTE: Final = struct.Struct("<2sH5f16x")

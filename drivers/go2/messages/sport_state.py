@@ -99,12 +99,22 @@ class SportState:
 
 
 _NAMES: Final = {
-    "error_code": "error_code", "quaternion": "orientation", "gyroscope": "angular_velocity",
-    "accelerometer": "specific_force", "rpy": "rpy", "imu_temperature": "imu_temperature", "mode": "mode",
-    "progress": "progress", "gait_type": "gait", "foot_raise_height": "foot_raise_height",
-    "position": "position", "body_height": "body_height", "velocity": "velocity", "yaw_speed": "yaw_speed",
+    "error_code": "error_code",
+    "quaternion": "orientation",
+    "gyroscope": "angular_velocity",
+    "accelerometer": "specific_force",
+    "rpy": "rpy",
+    "imu_temperature": "imu_temperature",
+    "mode": "mode",
+    "progress": "progress",
+    "gait_type": "gait",
+    "foot_raise_height": "foot_raise_height",
+    "position": "position",
+    "body_height": "body_height",
+    "velocity": "velocity",
+    "yaw_speed": "yaw_speed",
     "range_obstacle": "range_obstacle",
-}  # fmt: skip
+}
 _FEET: Final = {
     "foot_force": "foot_force",
     "foot_position_body": "foot_position",

@@ -23,8 +23,15 @@ _MOST_REFUSED = 50
 """So many refusals in a row (one second at 50 Hz) mean that nobody records: the run ends."""
 _MOST_WORD = 256
 STARTING, LOADING, CONNECTING, HOMING, ARMING, RUNNING, MAKING_PASSIVE, HANDING_BACK = (
-    "starting", "loading", "connecting", "homing", "arming", "running", "making passive", "handing back",
-)  # fmt: skip
+    "starting",
+    "loading",
+    "connecting",
+    "homing",
+    "arming",
+    "running",
+    "making passive",
+    "handing back",
+)
 """Phases of a run, in order; cycles run in RUNNING. A phase is told before what it names happens."""
 HEARTBEAT = "\0"
 """The word by which the supervisor says that it lives."""

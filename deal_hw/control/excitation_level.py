@@ -1,4 +1,4 @@
-"""How lively a demonstration is: judged by what it recorded, and repeated livelier or gentler where needed.
+"""How strong a demonstration is: judged by what it recorded, and repeated stronger or gentler where needed.
 
 Robots differ by factors: a set-point that throws one cart against its trips does not get another one out of
 its friction. As a person at the robot would, the search looks at the recording, never at anything hidden.
@@ -27,9 +27,9 @@ LEAST_NOISE_RATIO = 20.0
 LEAST_FREE_RATIO = 100.0
 """The same for a joint without a motor: it swings once it has left its friction, or it has not."""
 
-GENTLEST, LIVELIEST = -3.0, 3.0
+LOWEST_LEVEL, HIGHEST_LEVEL = -3.0, 3.0
 LOWEST_EFFORT = 0.1
-"""Effort limits sent below this share are halved where a demonstration becomes livelier."""
+"""Effort limits sent below this share are halved where a demonstration becomes stronger."""
 
 HELD_FACTOR = 8.0
 """Factor on effort limits that are sent low, from more than one step up on."""
@@ -55,9 +55,12 @@ def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, .
     words = []
     commanded = dict(zip(description.actuated, found.target_range, strict=True))
     for name, unit, span, noise in zip(
-        description.joint_names, description.position_units, found.position_range, joint_noise(description),
+        description.joint_names,
+        description.position_units,
+        found.position_range,
+        joint_noise(description),
         strict=True,
-    ):  # fmt: skip
+    ):
         asked = commanded.get(name)
         if asked is None:
             least, why = LEAST_FREE_RATIO * noise, f"{LEAST_FREE_RATIO:g} times the sensor's noise"
@@ -70,8 +73,8 @@ def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, .
     return tuple(words)
 
 
-def with_vigor(config: RichConfig, vigor: float, description: RobotDescription) -> RichConfig:
-    """Return the profile, livelier or gentler by some steps, inside the safety limits.
+def with_excitation_level(config: RichConfig, level: float, description: RobotDescription) -> RichConfig:
+    """Return the profile, stronger or gentler by some steps, inside the safety limits.
 
     A step up: set-points half again as far and held half again as long, gains stiffer and less damped, higher
     limits (those sent low to be felt apart), half the balancing. A step down: nearer set-points, softer and
@@ -79,17 +82,19 @@ def with_vigor(config: RichConfig, vigor: float, description: RobotDescription) 
 
     Args:
         config: The profile as it is at 0.
-        vigor: Steps up, or down where negative; half steps, too.
+        level: Steps up, or down where negative; half steps, too.
         description: The robot.
 
     Raises:
         ConfigurationError: There are no such steps.
     """
-    if not GENTLEST <= vigor <= LIVELIEST:
-        raise ConfigurationError(f"vigor {vigor:g}: {GENTLEST:g} to {LIVELIEST:g}, 0 is the profile itself")
-    if vigor == 0:
+    if not LOWEST_LEVEL <= level <= HIGHEST_LEVEL:
+        raise ConfigurationError(
+            f"excitation level {level:g}: {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}, 0 is the profile itself"
+        )
+    if level == 0:
         return config
-    up, down = max(vigor, 0.0), max(-vigor, 0.0)
+    up, down = max(level, 0.0), max(-level, 0.0)
     amplitude = config.amplitude * 1.5**up * 0.6**down
     most = room(description)
     balance_s = config.balance_s * 0.5**up
@@ -98,8 +103,8 @@ def with_vigor(config: RichConfig, vigor: float, description: RobotDescription) 
         # A user's own amplitude may be beyond the room already; the safety filter clips that.
         amplitude=min(amplitude, max(float(np.min(most[most > 0])), config.amplitude)),
         hold_s=(config.hold_s[0] * 1.5**up, config.hold_s[1] * 1.5**up),
-        balance_s=balance_s if vigor > GENTLEST and up < 2 else 0.0,
-        segments=tuple(_scaled(part, vigor, description) for part in _whole(config.segments)),
+        balance_s=balance_s if level > LOWEST_LEVEL and up < 2 else 0.0,
+        segments=tuple(_scaled(part, level, description) for part in _whole(config.segments)),
     )
 
 
@@ -108,8 +113,8 @@ def _whole(segments: tuple[Segment, ...]) -> tuple[Segment, ...]:
     return (*segments, Segment(start=0.0, stop=1.0))
 
 
-def _scaled(part: Segment, vigor: float, description: RobotDescription) -> Segment:
-    limits, up, down = description.limits, max(vigor, 0.0), max(-vigor, 0.0)
+def _scaled(part: Segment, level: float, description: RobotDescription) -> Segment:
+    limits, up, down = description.limits, max(level, 0.0), max(-level, 0.0)
 
     def within(factor: float, now: float, default: tuple[float, ...], most: tuple[float, ...]) -> float:
         return min(now * factor, max(largest_factor(default, most), now))
@@ -144,12 +149,12 @@ class Attempt:
     """One recording and what it was worth.
 
     Attributes:
-        vigor: How lively it was.
+        level: How strong it was.
         shortfalls: What hardly moved, in words.
         tripped: Why the safety module ended it; "" where it did not.
     """
 
-    vigor: float
+    level: float
     shortfalls: tuple[str, ...]
     tripped: str
 
@@ -159,11 +164,11 @@ class Attempt:
         return not self.shortfalls and not self.tripped
 
 
-class VigorSearch:
-    """Chooses how lively to record next until a recording is whole and moves; ask (`vigor`) and tell.
+class ExcitationLevelSearch:
+    """Chooses how strong to record next until a recording is whole and moves: ask (`level`) and tell.
 
     Args:
-        vigor: Where to start.
+        level: Where to start.
         attempts: Most recordings.
         rearm: Whether a recording that the safety module ended may be followed by another. On a robot a
             person has to look first.
@@ -172,18 +177,20 @@ class VigorSearch:
         ConfigurationError: It is to start outside what there is, or never.
     """
 
-    def __init__(self, vigor: float = 0.0, attempts: int = ATTEMPTS, *, rearm: bool = True) -> None:
-        if not GENTLEST <= vigor <= LIVELIEST:
-            raise ConfigurationError(f"vigor {vigor:g}: {GENTLEST:g} (gentlest) to {LIVELIEST:g} (liveliest)")
+    def __init__(self, level: float = 0.0, attempts: int = ATTEMPTS, *, rearm: bool = True) -> None:
+        if not LOWEST_LEVEL <= level <= HIGHEST_LEVEL:
+            raise ConfigurationError(
+                f"excitation level {level:g}: {LOWEST_LEVEL:g} (gentlest) to {HIGHEST_LEVEL:g} (strongest)"
+            )
         if attempts < 1:
             raise ConfigurationError(f"{attempts} attempts at a recording: at least 1")
         self._most, self._rearm = attempts, rearm
-        self.vigor = vigor
+        self.level = level
         self.attempts: list[Attempt] = []
         self.words = ""
 
     def tell(self, found: tuple[str, ...], tripped: str = "") -> bool:
-        """Take what came of the recording at `vigor`; return whether to record again, at the new `vigor`.
+        """Take what came of the recording at `level`; return whether to record again, at the new one.
 
         `words` then says what was wrong and what is done next.
 
@@ -191,44 +198,44 @@ class VigorSearch:
             found: What hardly moved, from :func:`shortfalls`.
             tripped: Why the safety module ended it; "" where it did not.
         """
-        attempt = Attempt(self.vigor, found, tripped)
+        attempt = Attempt(self.level, found, tripped)
         self.attempts.append(attempt)
         self.words = ""
         if attempt.enough:
             return False
-        how = "gentler" if tripped else "livelier"
+        how = "gentler" if tripped else "stronger"
         following = self._following(-1.0 if tripped else 1.0)
         why = f"it was cut short ({tripped})" if tripped else f"it hardly moves: {'; '.join(found)}"
         end = self._end(following, how, bool(tripped))
         if not end:
-            self.vigor = following
-        self.words = f"{why}; {end or f'recording again, {how} (vigor {following:g})'}"
+            self.level = following
+        self.words = f"{why}; {end or f'recording again, {how} (excitation level {following:g})'}"
         return not end
 
     def _following(self, step: float) -> float:
-        """Return the vigor a step away, or half way to one that was tried on the way there."""
-        tried = [(a.vigor - self.vigor) * step for a in self.attempts]
+        """Return the level a step away, or half way to one that was tried on the way there."""
+        tried = [(a.level - self.level) * step for a in self.attempts]
         nearest = min((t for t in tried if 0 < t <= 1), default=2.0)
-        return self.vigor + step * min(1.0, nearest / 2)
+        return self.level + step * min(1.0, nearest / 2)
 
     def _end(self, following: float, how: str, tripped: bool) -> str:
         """Return why there is no further attempt, in words; "" where there is one."""
-        if not GENTLEST <= following <= LIVELIEST:
-            return "there is nothing gentler" if tripped else "the limits allow nothing livelier"
-        if abs(following - self.vigor) < FINEST:
+        if not LOWEST_LEVEL <= following <= HIGHEST_LEVEL:
+            return "there is nothing gentler" if tripped else "the limits allow nothing stronger"
+        if abs(following - self.level) < FINEST:
             return f"half a step {how} was tried before"
         if tripped and not self._rearm:
-            return f"look at the robot, then record again with --vigor {following:g}"
+            return f"look at the robot, then record again with --excitation-level {following:g}"
         if len(self.attempts) >= self._most:
-            return f"no more recordings are allowed here; go on with --vigor {following:g}"
+            return f"no more recordings are allowed here; go on with --excitation-level {following:g}"
         return ""
 
     @property
     def best(self) -> int:
-        """Index of the recording to use: whole and moving, else moving, else whole; then the liveliest."""
+        """Index of the recording to use: whole and moving, else moving, else whole; then the strongest."""
 
         def worth(index: int) -> tuple[bool, bool, float]:
             attempt = self.attempts[index]
-            return not attempt.shortfalls, not attempt.tripped, attempt.vigor
+            return not attempt.shortfalls, not attempt.tripped, attempt.level
 
         return max(range(len(self.attempts)), key=worth)

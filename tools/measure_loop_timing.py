@@ -1,6 +1,6 @@
-"""Measure the control cadence: one run of N minutes against an emulated cart-pole, the report as JSON.
+"""Measure the control loop_timing: one run of N minutes against an emulated cart-pole, the report as JSON.
 
-    python tools/measure_cadence.py --minutes 10 > cadence.json
+    python tools/measure_loop_timing.py --minutes 10 > loop_timing.json
 
 The whole path is measured: supervisor, control process, recorder, serial line (a pty). With --port the robot
 or emulator on that port is used instead of one of our own.
@@ -35,8 +35,8 @@ RATE_HZ = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasureCadence:
-    """Measure the control cadence and print it as JSON."""
+class MeasureLoopTiming:
+    """Measure the control loop_timing and print it as JSON."""
 
     minutes: float = 10.0
     """Length of the run [min]."""
@@ -77,16 +77,20 @@ def _judge(overruns: list[tuple[int, int]], seen: Account) -> list[dict[str, Any
     ]
 
 
-def measure(config: MeasureCadence) -> dict[str, Any]:
+def measure(config: MeasureLoopTiming) -> dict[str, Any]:
     """Run and return the report with the machine it was measured on."""
     load_before = os.getloadavg()
     with tempfile.TemporaryDirectory() as folder, watch_stalls(_PAUSE_NS) as seen, _port(config.port) as port:
         report = collect(
             Collect(
-                robot="cartpole", port=port, dataset=Path(folder), profile=config.profile,
-                seconds=config.minutes * 60.0, quiet=True,
+                robot="cartpole",
+                port=port,
+                dataset=Path(folder),
+                profile=config.profile,
+                seconds=config.minutes * 60.0,
+                quiet=True,
             )
-        )  # fmt: skip
+        )
         dataset = Dataset.open(Path(folder), notify=lambda text: None)
         info, recording = dataset.episodes[0], dataset.read(0)
     episode = report.episodes[0]
@@ -94,7 +98,7 @@ def measure(config: MeasureCadence) -> dict[str, Any]:
         "minutes": config.minutes,
         "outcome": episode.outcome.value,
         "reason": episode.reason,
-        "cadence": episode.cadence.to_json() if episode.cadence is not None else None,
+        "loop_timing": episode.loop_timing.to_json() if episode.loop_timing is not None else None,
         "beyond_period": _judge(_late_cycles(recording), seen),
         "machine_pauses": len(seen.pauses),
         "machine_longest_pause_ms": seen.longest_ns * 1e-6,
@@ -132,7 +136,7 @@ def _port(given: str | None) -> Iterator[str]:
 
 def main() -> None:
     """Measure and print."""
-    print(json.dumps(measure(tyro.cli(MeasureCadence)), indent=1))
+    print(json.dumps(measure(tyro.cli(MeasureLoopTiming)), indent=1))
 
 
 if __name__ == "__main__":

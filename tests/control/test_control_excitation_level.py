@@ -1,4 +1,4 @@
-"""How lively to record next: what counts as motion, what a step changes, when the search ends."""
+"""How strong to record next: what counts as motion, what a step changes, when the search ends."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
+from deal_hw.control.excitation_level import (
+    HIGHEST_LEVEL,
+    LOWEST_LEVEL,
+    ExcitationLevelSearch,
+    shortfalls,
+    with_excitation_level,
+)
 from deal_hw.control.safety_filter import SafetyFilter
-from deal_hw.control.vigor import GENTLEST, LIVELIEST, VigorSearch, shortfalls, with_vigor
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import ConfigurationError
@@ -45,7 +51,7 @@ def test_what_hardly_moves_is_named(cart: float, pole: float, asked: float, word
 
 def test_a_step_up_by_hand() -> None:
     """0.12 m becomes 0.18; 80 N/m 128, 8 N s/m 4, 4 N 8, 1 m/s 1.5; a limit sent low stays low."""
-    up = with_vigor(RichConfig(), 1, DESCRIPTION)
+    up = with_excitation_level(RichConfig(), 1, DESCRIPTION)
     assert [up.amplitude, up.balance_s] == pytest.approx([0.18, 0.3])
     assert list(up.hold_s) == pytest.approx([0.15, 0.45])
     assert up.segments[-1] == Segment(
@@ -57,23 +63,25 @@ def test_a_step_up_by_hand() -> None:
     # What creeps asks for little effort: the lowest limit is halved.
     assert up.segments[1].effort_limit == 0.025
     # What still does not move is held by friction: 8 times 0.15 and 8 times half of 0.05.
-    held = with_vigor(RichConfig(), 2, DESCRIPTION).segments
+    held = with_excitation_level(RichConfig(), 2, DESCRIPTION).segments
     assert [part.effort_limit for part in held] == pytest.approx([1.2, 0.2, 2.0])
 
 
 def test_steps_down_are_slower_and_nearer() -> None:
     """0.12 m becomes 0.6 * 0.12, the speed half, the damping half again as much."""
-    down = with_vigor(RichConfig(), -1, DESCRIPTION)
+    down = with_excitation_level(RichConfig(), -1, DESCRIPTION)
     assert down.amplitude == pytest.approx(0.072)
     last = down.segments[-1]
     assert (last.stiffness, last.damping, last.effort_limit, last.speed_limit) == (0.8, 1.5, 0.7, 0.5)
-    assert with_vigor(RichConfig(), 0, DESCRIPTION) == RichConfig()
+    assert with_excitation_level(RichConfig(), 0, DESCRIPTION) == RichConfig()
 
 
-@given(vigor=st.floats(GENTLEST, LIVELIEST), seed=st.integers(0, 99))
-def test_no_step_leaves_the_safety_limits(vigor: float, seed: int) -> None:
-    """Whatever the vigor, the safety filter finds nothing to clip but the way to a target."""
-    config = dataclasses.replace(with_vigor(RichConfig(), vigor, DESCRIPTION), balance_s=0.0)
+@given(excitation_level=st.floats(LOWEST_LEVEL, HIGHEST_LEVEL), seed=st.integers(0, 99))
+def test_no_step_leaves_the_safety_limits(excitation_level: float, seed: int) -> None:
+    """Whatever the excitation level, the safety filter finds nothing to clip but the way to a target."""
+    config = dataclasses.replace(
+        with_excitation_level(RichConfig(), excitation_level, DESCRIPTION), balance_s=0.0
+    )
     behaviour = RichBehaviour(DESCRIPTION, None, config, seed)
     for k in range(0, 200, 7):
         command = behaviour.command(AT_REST, k / 50)
@@ -85,49 +93,51 @@ def test_no_step_leaves_the_safety_limits(vigor: float, seed: int) -> None:
 
 def test_a_still_robot_is_asked_for_more_until_the_limits() -> None:
     """0, 1, 2, 3, and then the words say that there is nothing more."""
-    search = VigorSearch()
+    search = ExcitationLevelSearch()
     told = [search.tell(STILL) for _ in range(4)]
     assert told == [True, True, True, False]
-    assert [a.vigor for a in search.attempts] == [0, 1, 2, 3]
-    assert search.words == "it hardly moves: pole moved 0.01 rad; the limits allow nothing livelier"
+    assert [a.level for a in search.attempts] == [0, 1, 2, 3]
+    assert search.words == "it hardly moves: pole moved 0.01 rad; the limits allow nothing stronger"
     assert search.best == 3
 
 
 def test_a_trip_is_followed_by_less_and_the_two_are_bisected() -> None:
     """Still at 0, a trip at 1: half a step, and where that hardly moves no finer one."""
-    search = VigorSearch()
+    search = ExcitationLevelSearch()
     assert search.tell(STILL)
     assert search.tell((), "cart is at 0.4 m")
-    assert search.words == "it was cut short (cart is at 0.4 m); recording again, gentler (vigor 0.5)"
+    assert (
+        search.words == "it was cut short (cart is at 0.4 m); recording again, gentler (excitation level 0.5)"
+    )
     assert not search.tell(STILL)
-    assert search.words.endswith("half a step livelier was tried before")
+    assert search.words.endswith("half a step stronger was tried before")
     # The one that tripped moved, at least.
-    assert search.attempts[search.best].vigor == 1
-    again = VigorSearch()
+    assert search.attempts[search.best].level == 1
+    again = ExcitationLevelSearch()
     assert again.tell((), "cart is at 0.4 m") and not again.tell(())
     assert (again.best, again.words) == (1, "")
 
 
 def test_on_a_robot_nothing_follows_a_trip_by_itself() -> None:
     """A person looks first; the words say with what to go on."""
-    search = VigorSearch(rearm=False)
+    search = ExcitationLevelSearch(rearm=False)
     assert not search.tell((), "cart is at 0.4 m")
-    assert search.words.endswith("look at the robot, then record again with --vigor -1")
+    assert search.words.endswith("look at the robot, then record again with --excitation-level -1")
 
 
 def test_the_number_of_recordings_is_kept() -> None:
     """Two allowed, two made."""
-    search = VigorSearch(vigor=1, attempts=2)
+    search = ExcitationLevelSearch(level=1, attempts=2)
     assert search.tell(STILL) and not search.tell(STILL)
-    assert search.words.endswith("no more recordings are allowed here; go on with --vigor 3")
+    assert search.words.endswith("no more recordings are allowed here; go on with --excitation-level 3")
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda: VigorSearch(vigor=4),
-        lambda: VigorSearch(attempts=0),
-        lambda: with_vigor(RichConfig(), -3.5, DESCRIPTION),
+        lambda: ExcitationLevelSearch(level=4),
+        lambda: ExcitationLevelSearch(attempts=0),
+        lambda: with_excitation_level(RichConfig(), -3.5, DESCRIPTION),
     ],
 )
 def test_steps_that_there_are_not_are_refused(wrong: object) -> None:

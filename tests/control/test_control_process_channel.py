@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.control.handover import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
+from deal_hw.control.process_channel import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
 from deal_hw.control.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, hurry
 from deal_hw.data.recording.record import CycleRecord, decode
 from deal_hw.errors import DatasetError

@@ -1,4 +1,4 @@
-"""The verb `excite` and `collect --excite`: what is written, what is played, and on what it runs."""
+"""The verb `design-excitation` and `collect --excite`: what is written, what is played and on what."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.collect import Collect, _excitation
-from deal_hw.cli.excite import Excite, excite
+from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation_plan import ExcitationBehaviour, read_plan
@@ -24,19 +24,26 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.workflows.shipped import shipped_policy
 
 POLICY = str(shipped_policy("cartpole") or "")
-TRUTHS = [nominal_truth("sensor", 3, actuation_ticks=9), draw_truth("sensor", 3, xi=5.0)]
+TRUTHS = [nominal_truth("sensor", 3, actuation_ticks=9), draw_truth("sensor", 3, range_ratio=5.0)]
 
 
 @pytest.fixture(scope="module")
 def optimal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An excitation that was searched for, in no time."""
     path = tmp_path_factory.mktemp("run") / "optimal.json"
-    report = excite(
-        Excite(
-            robot="cartpole", out=path, seconds=2.0, candidates=4, draws=2, confirm=2, rounds=2, threads=1,
+    report = design_excitation(
+        DesignExcitation(
+            robot="cartpole",
+            out=path,
+            seconds=2.0,
+            candidates=4,
+            draws=2,
+            confirm=2,
+            rounds=2,
+            threads=1,
             quiet=True,
         )
-    )  # fmt: skip
+    )
     assert report.optimum is not None
     assert report.optimum.tried >= 3 + 4 + 2
     assert set(report.optimum.references) == {"multisine", "chirp", "rich"}
@@ -60,11 +67,17 @@ def test_each_excitation_keeps_the_limits(kind: str, truth: Truth, optimal: Path
         name = str(optimal)
     elif kind == "steps":
         name = str(tmp_path / "steps.json")
-        settings = Excite(
-            robot="cartpole", out=Path(name), family="steps", seconds=2.0, amplitude=0.5, effort=0.15,
-            speed=2.5, quiet=True,
-        )  # fmt: skip
-        excite(settings)
+        settings = DesignExcitation(
+            robot="cartpole",
+            out=Path(name),
+            family="steps",
+            seconds=2.0,
+            amplitude=0.5,
+            effort=0.15,
+            speed=2.5,
+            quiet=True,
+        )
+        design_excitation(settings)
     plan = RunPlan(robot="cartpole", profile="excite", excite=name, policy=POLICY, seconds=2.0, seed=3)
     assert RunPlan.from_json(json.loads(json.dumps(plan.to_json()))) == plan
     run = VirtualCartpole(truth).run(make_behaviour(plan, DESCRIPTION), plan.seconds)
@@ -108,7 +121,9 @@ def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> Non
             DESCRIPTION,
         )
     with pytest.raises(UnknownNameError, match="k99"):
-        excite(Excite(robot="cartpole", out=tmp_path / "x.json", space="k99", quiet=True))
+        design_excitation(
+            DesignExcitation(robot="cartpole", out=tmp_path / "x.json", space="k99", quiet=True)
+        )
 
 
 def test_playing_needs_no_extra(optimal: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-class ScriptedDevice:
+class FakeDevice:
     """Answers each message with the same bytes, in its next tick of 1 ms; goes behind a ``VirtualTransport``.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""``deal-hw excite``: compute what to play on a robot so that a recording of it tells most."""
+"""``deal-hw design-excitation``: compute what to play on a robot so that a recording of it tells most."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 BALANCE_S = 0.6
 GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
-SEARCH = ("calibration", "space", "xi", "criterion", "draws", "confirm", "candidates", "rounds")
+SEARCH = ("calibration", "space", "range_ratio", "criterion", "draws", "confirm", "candidates", "rounds")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Excite:
+class DesignExcitation:
     """Compute what to play on a robot so that a recording of it tells most."""
 
     robot: tyro.conf.Positional[str]
@@ -45,8 +45,8 @@ class Excite:
     """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
 
     family: Literal["optimal", "multisine", "chirp", "steps", "sway"] = "optimal"
-    """optimal: the most telling of many of the others, by simulation; multisine: a sum of sines with a low
-    peak; chirp: a sweep; steps: random set-points; sway: the body moves over standing feet (go2)."""
+    """optimal: the most informative of many of the others, by simulation; multisine: a sum of sines with a
+    low peak; chirp: a sweep; steps: random set-points; sway: the body moves over standing feet (go2)."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 4.0
     """Length of the recording [s]."""
@@ -78,8 +78,8 @@ class Excite:
     space: str = ""
     """Parameters to tell, such as k9; by default the robot's first set."""
 
-    xi: Annotated[float, Ratio] = 5.0
-    """Ranges reach a factor XI to either side of nominal."""
+    range_ratio: Annotated[float, Ratio] = 5.0
+    """Ranges reach a factor RANGE-RATIO to either side of nominal."""
 
     criterion: Literal["determinant", "mean"] = "determinant"
     """determinant: most information in all; mean: least mean standard deviation."""
@@ -126,20 +126,20 @@ class ExciteReport:
     optimum: Optimum | None = None
 
 
-def excite(config: Excite) -> ExciteReport:
+def design_excitation(config: DesignExcitation) -> ExciteReport:
     """Compute an excitation, write it, return it.
 
     Raises:
         DealHwError: A setting is unusable, or no candidate keeps the limits.
     """
-    default = Excite(robot=config.robot, out=config.out)
+    default = DesignExcitation(robot=config.robot, out=config.out)
     if config.family == "optimal":
         refuse(
             given(config, default, GIVEN_DESIGN),
             "--family optimal searches it; name another",
         )
         if config.calibration is not None:
-            refuse(given(config, default, ("space", "xi")), "--calibration says what is known")
+            refuse(given(config, default, ("space", "range_ratio")), "--calibration says what is known")
     else:
         refuse(
             given(config, default, SEARCH),
@@ -170,7 +170,7 @@ def excite(config: Excite) -> ExciteReport:
     return ExciteReport(plan=plan, path=config.out, optimum=optimum)
 
 
-def _sway(config: Excite, description: RobotDescription) -> ExcitationPlan:
+def _sway(config: DesignExcitation, description: RobotDescription) -> ExcitationPlan:
     if description.name != "go2":
         raise ConfigurationError(
             f"robot {description.name!r} does not sway: that is for go2, which stands on four feet; choose "
@@ -182,12 +182,15 @@ def _sway(config: Excite, description: RobotDescription) -> ExcitationPlan:
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
     return sway_plan(
-        load_model(description), np.random.default_rng(config.seed), config.seconds,
-        (config.low_hz, config.high_hz), config.amplitude,
-    )  # fmt: skip
+        load_model(description),
+        np.random.default_rng(config.seed),
+        config.seconds,
+        (config.low_hz, config.high_hz),
+        config.amplitude,
+    )
 
 
-def _given_design(config: Excite, balances: bool) -> ExcitationDesign:
+def _given_design(config: DesignExcitation, balances: bool) -> ExcitationDesign:
     if config.family == "optimal" or config.family == "sway":
         raise RuntimeError(f"unreachable: {config.family} has no design")
     whole = config.split <= 0
@@ -210,7 +213,7 @@ def _balance_s(seconds: float) -> float:
 
 
 def _search(
-    config: Excite, description: RobotDescription, balance: Callable[[], Behaviour] | None
+    config: DesignExcitation, description: RobotDescription, balance: Callable[[], Behaviour] | None
 ) -> Optimum:
     try:
         from deal_hw.calib.design.excitation_search import SearchSettings, search_excitation
@@ -219,25 +222,33 @@ def _search(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
     settings = SearchSettings(
-        candidates=config.candidates, rounds=config.rounds,
+        candidates=config.candidates,
+        rounds=config.rounds,
         criterion=config.criterion,
-    )  # fmt: skip
+    )
     rng = np.random.default_rng(config.seed)
     quiet_plan = make_plan(
         description,
         ExcitationDesign(
-            family="steps", seconds=config.seconds, amplitude=0.01,
+            family="steps",
+            seconds=config.seconds,
+            amplitude=0.01,
             balance_s=_balance_s(config.seconds) if balance is not None else 0.0,
         ),
-    )  # fmt: skip
+    )
 
     def play(plan: ExcitationPlan) -> Behaviour:
         return ExcitationBehaviour(plan, description, balance() if balance is not None else None)
 
     experiment = Experiment(
-        load_model(description), _knowledge(config), config.seconds, config.draws, rng,
-        rest=lambda: play(quiet_plan), threads=config.threads,
-    )  # fmt: skip
+        load_model(description),
+        _knowledge(config),
+        config.seconds,
+        config.draws,
+        rng,
+        rest=lambda: play(quiet_plan),
+        threads=config.threads,
+    )
     references: dict[str, Callable[[], Behaviour]] = {
         family: _player(play, make_plan(description, design))
         for family, design in _plain_designs(config, balance is not None).items()
@@ -264,7 +275,7 @@ def _player(play: Callable[[ExcitationPlan], Behaviour], plan: ExcitationPlan) -
     return lambda: play(plan)
 
 
-def _plain_designs(config: Excite, balances: bool) -> dict[str, ExcitationDesign]:
+def _plain_designs(config: DesignExcitation, balances: bool) -> dict[str, ExcitationDesign]:
     balance_s = _balance_s(config.seconds) if balances else 0.0
     return {
         "multisine": ExcitationDesign(
@@ -274,7 +285,7 @@ def _plain_designs(config: Excite, balances: bool) -> dict[str, ExcitationDesign
     }
 
 
-def _knowledge(config: Excite) -> ParameterDistribution:
+def _knowledge(config: DesignExcitation) -> ParameterDistribution:
     from deal_hw.calib.design.experiment_design import default_knowledge
 
     if config.calibration is not None:
@@ -286,7 +297,7 @@ def _knowledge(config: Excite) -> ParameterDistribution:
     name = config.space or next(iter(table))
     if name not in table:
         raise UnknownNameError("parameter set", name, table)
-    return default_knowledge(table[name]().with_ratio(config.xi))
+    return default_knowledge(table[name]().with_ratio(config.range_ratio))
 
 
 def _note(done: int, total: int, text: str) -> None:
@@ -315,6 +326,7 @@ def print_optimum(space: ParameterSpace, optimum: Optimum, refused: int) -> None
     discarded = sum(optimum.tripped.values())
     reasons = "; ".join(f"{count} x {why}" for why, count in optimum.tripped.items())
     print(
-        f"{optimum.tried} candidates, {discarded} discarded" + (f" ({reasons})" if reasons else "")
+        f"{optimum.tried} candidates, {discarded} discarded"
+        + (f" ({reasons})" if reasons else "")
         + (f"; {refused} draws of parameters refused" if refused else "")
-    )  # fmt: skip
+    )

@@ -33,7 +33,7 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CadenceReport:
+class LoopTimingReport:
     """How regular a run was.
 
     Attributes:
@@ -49,7 +49,7 @@ class CadenceReport:
         states: State samples received.
         cycles_without_state: Cycles in which no new state had arrived.
         losses: Hand-overs that the recorder refused.
-        link_errors: Corrupt frames and gaps in the state's sequence numbers.
+        transport_errors: Corrupt frames and gaps in the state's sequence numbers.
         scheduling: What the operating system granted.
     """
 
@@ -65,7 +65,7 @@ class CadenceReport:
     states: int = 0
     cycles_without_state: int = 0
     losses: int = 0
-    link_errors: int = 0
+    transport_errors: int = 0
     scheduling: str = "default"
 
     def to_json(self) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class CadenceReport:
         return {key: plain(value) for key, value in dataclasses.asdict(self).items()}
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> CadenceReport:
+    def from_json(cls, values: dict[str, Any]) -> LoopTimingReport:
         """Return the report that :meth:`to_json` wrote."""
 
         def spread(part: dict[str, float | None]) -> Spread:
@@ -102,12 +102,12 @@ class CadenceReport:
             f"overruns    {self.overruns}, beyond one period {self.overruns_beyond_period}",
             f"state age   {ms(self.state_age)}",
             f"states      {self.states}, cycles without {self.cycles_without_state}",
-            f"link        {self.link_errors} errors",
+            f"link        {self.transport_errors} errors",
             f"losses      {self.losses} hand-overs to the recorder refused",
         ]
 
 
-class Cadence:
+class LoopTiming:
     """Paces a loop on absolute deadlines: lateness never adds up, lost periods are skipped.
 
     Call :meth:`begin` once a cycle, after :attr:`deadline_ns`; the first call sets the grid of deadlines.
@@ -180,10 +180,10 @@ class Cadence:
         finally:
             self._sections.setdefault(name, array("q")).append(self._clock.now_ns() - begun)
 
-    def report(self, **counts: Any) -> CadenceReport:
+    def report(self, **counts: Any) -> LoopTimingReport:
         """Return the report; ``counts`` are the fields that the loop counts itself."""
         lateness = np.array(self._lateness, dtype=np.int64)
-        return CadenceReport(
+        return LoopTimingReport(
             rate_hz=self._rate_hz,
             cycles=len(self._lateness),
             period=Spread.of(self._periods),
