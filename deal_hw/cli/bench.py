@@ -35,6 +35,7 @@ class Bench:
             "real",
             "verdict",
             "first-answer",
+            "speed",
             "go2-codec",
         ]
     ]
@@ -44,8 +45,9 @@ class Bench:
     simulator here does. paper: DEAL's protocol, whose target is the midpoint of the range. real: recordings
     of a real robot (--model, --data), judged on held-out motion. verdict: robots in plain MuJoCo with and
     without deliberate faults: is a right model called right, and a wrong one wrong? first-answer:
-    seconds until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. go2-codec: what
-    the Go2's messages cost to write and read."""
+    seconds until a fit is nearly as good as the last one, beside mujoco.sysid with a delay. speed: what a
+    search costs beside bare physics and DEAL's Table 3. go2-codec: what the Go2's messages cost to write
+    and read."""
 
     recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
 
@@ -131,6 +133,9 @@ class Bench:
             refuse(given(self, Bench, ("problems",)), "only `bench first-answer` and `verdict` take that")
         if self.bench != "go2-loop":
             refuse(given(self, Bench, ("steps",)), "only `bench go2-loop` takes that")
+        if self.bench == "speed":
+            options = given(self, Bench, ("demonstration", "refine_all"))
+            refuse(options, "`bench speed` times searches alone, on what a policy demonstrates")
         if self.bench != "verdict":
             refuse(given(self, Bench, ("faults",)), "only `bench verdict` takes that")
 
@@ -270,6 +275,24 @@ def _loop(config: Bench, out: Path) -> _Table:
     return _Table(cells=cells, line=tables.line, summary=tables.print_summary, draw=_draw)
 
 
+def _speed(config: Bench, out: Path) -> _Table:
+    from deal_hw.bench import speed
+
+    (range_ratio,) = parse_ratios(config.range_ratio)[:1]
+    cells = speed.cells(
+        _names(config.task),
+        _methods(config, speed.METHODS),
+        parse_seeds(config.seeds),
+        profile=config.profile,
+        range_ratio=range_ratio,
+        population=config.population,
+        generations=config.generations,
+        space=config.space,
+        threads=config.threads,
+    )
+    return _Table(cells=cells, line=speed.line, summary=lambda rows: print("\n".join(speed.summary(rows))))
+
+
 def _go2_loop(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import go2_loop
 
@@ -343,6 +366,7 @@ def _verdict(config: Bench, out: Path) -> _Table:
 _TABLES: dict[str, Callable[[Bench, Path], _Table]] = {
     "loop": _loop,
     "go2-loop": _go2_loop,
+    "speed": _speed,
     "real": _real,
     "verdict": _verdict,
     "first-answer": _first_answer,

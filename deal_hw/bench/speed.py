@@ -1,0 +1,178 @@
+"""The bench of speed: what a search costs, beside bare physics in the same run and the paper's Table 3.
+
+Bare physics is the engine alone: as many members with the same parameters advance on the same threads, with
+constant commands and one record at the end of each rollout. What a search takes beyond that is policy calls,
+records, critic and its own arithmetic.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deal_hw.bench.calibration import make_cells
+from deal_hw.bench.rows import Cells, Row
+from deal_hw.bench.tasks import Case, make_case
+from deal_hw.errors import DealHwError
+from deal_hw.workflows.calibration.run import calibrate_episodes
+
+if TYPE_CHECKING:
+    from deal_hw.calib.data.problem import Problem
+
+METHODS: Final = ("deal-paper",)
+"""Measured where no method is named."""
+
+PAPER_SECONDS: Final = {"ant": 98.0, "cartpole": 75.0, "go2": 303.0}
+"""DEAL on an i5-14600KF and an RTX 4060 Ti, 50 generations of 200 members (Table 3) [s]."""
+
+REPETITIONS: Final = 5
+"""Rollouts of bare physics, of which the median counts."""
+
+KEY: Final = ("task", "space", "method", "population", "generations", "seed")
+
+
+def cells(
+    tasks: Sequence[str],
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    *,
+    profile: str,
+    range_ratio: float,
+    population: int | None,
+    generations: int,
+    space: str,
+    threads: int | None,
+) -> Cells:
+    """Return what the bench runs; robots are moved by their policies, as the paper's are.
+
+    Raises:
+        UnknownNameError: There is no such task or method.
+    """
+    from deal_hw.calib.methods import usual_population
+
+    chosen = make_cells(
+        "fixed-range", tasks, profile, methods, [range_ratio], seeds, space=space, demonstration="policy"
+    )
+
+    def make(task: str, method: str, seed: int, members: int) -> Callable[[], Row]:
+        def run() -> Row:
+            row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
+            row |= {"population": members, "generations": generations, "seed": seed, "error": ""}
+            try:
+                case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
+                row |= measure(case, method, members, generations, threads)
+            except DealHwError as err:
+                row["error"] = f"{type(err).__name__}: {err}"
+            return row
+
+        return run
+
+    runs = []
+    for cell in chosen:
+        members = population or usual_population(cell.method)
+        key = (cell.task, space, cell.method, members, generations, cell.seed)
+        runs.append((key, make(cell.task, cell.method, cell.seed, members)))
+    return Cells(names=KEY, runs=runs)
+
+
+def measure(case: Case, method: str, population: int, generations: int, threads: int | None) -> Row:
+    """Search once without refinement, then step the engine alone.
+
+    Returns:
+        The row's figures: seconds on the clock and of the processors, physics steps, what the engine alone
+        takes for as many, and the ratio.
+    """
+    from deal_hw.calib.data.problem import Problem
+    from deal_hw.calib.methods import usual_budget
+
+    cpu_s = time.process_time()
+    result = calibrate_episodes(
+        case.robot,
+        case.space,
+        [case.fit],
+        [],
+        method=method,
+        budget=usual_budget(method, population, generations, refine=False),
+        rng=np.random.default_rng(case.seed),
+        threads=threads,
+        policy=case.policy,
+    )
+    cpu_s = time.process_time() - cpu_s
+    problem = Problem(case.robot, case.space, [case.fit], threads=threads)
+    per_step_s = bare_step_s(problem, population)
+    physics_s = result.steps * per_step_s
+    return {
+        "parameters": len(case.space),
+        "recorded_s": float(case.fit.steps * case.fit.step_s),
+        "threads": threads or len(os.sched_getaffinity(0)),
+        "steps": result.steps,
+        "seconds": result.seconds,
+        "cpu_seconds": cpu_s,
+        "bare_step_us": 1e6 * per_step_s,
+        "seconds_physics": physics_s,
+        "ratio": result.seconds / physics_s,
+        "paper_seconds": PAPER_SECONDS.get(case.task),
+        "load": os.getloadavg()[0],
+    }
+
+
+def bare_step_s(problem: Problem, population: int) -> float:
+    """Return the seconds that the engine takes for one physics step of one member, all threads together."""
+    from deal_hw.sim.engine.closed_loop import on_physics_steps
+
+    episode = problem.episodes[0]
+    first = int(np.argmax(episode.usable))
+    rng = np.random.default_rng(0)
+    batch = problem.batch(population)
+    batch.set_parameters(problem.space.sample(rng, population))
+    command = np.repeat(episode.target[None, :1], population, axis=0)
+    control = on_physics_steps(batch, np.repeat(command, min(episode.steps, 2000), axis=1), episode.step_s)
+    taken = []
+    for _ in range(REPETITIONS):
+        batch.set_state(
+            problem.starts[0].position[first],
+            problem.starts[0].velocity[first],
+            reference=None if episode.reference is None else episode.reference[first],
+        )
+        began = time.perf_counter()
+        batch.advance(control)
+        taken.append(time.perf_counter() - began)
+    return float(statistics.median(taken) / (population * control.shape[1]))
+
+
+def line(row: Row) -> str:
+    """Return one row in words."""
+    what = f"speed {row['task']} {row['method']} seed {row['seed']}"
+    if row["error"]:
+        return f"{what}: {row['error']}"
+    paper = f", the paper's {row['paper_seconds']:.0f} s" if row["paper_seconds"] else ""
+    return (
+        f"{what}: {row['seconds']:.1f} s ({row['cpu_seconds']:.1f} cpu s){paper}; "
+        f"{row['population']} members, {row['generations']} generations, {row['steps']:.3g} physics steps; "
+        f"bare physics {row['seconds_physics']:.1f} s, ratio {row['ratio']:.2f}"
+    )
+
+
+def summary(rows: Sequence[Row]) -> list[str]:
+    """Return the median over seeds of each task and method."""
+    found = []
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        if not row["error"]:
+            groups.setdefault((row["task"], row["method"], row["population"], row["generations"]), []).append(
+                row
+            )
+    for (task, method, population, generations), group in groups.items():
+        seconds, ratio = (statistics.median(row[name] for row in group) for name in ("seconds", "ratio"))
+        paper = PAPER_SECONDS.get(task)
+        beside = f"; the paper: {paper:.0f} s on a GPU" if paper else ""
+        found.append(
+            f"{task} {method}, {population} x {generations}: {seconds:.1f} s, {ratio:.2f} times bare physics"
+            f"{beside}"
+        )
+    return found

@@ -1,0 +1,96 @@
+"""The bench of speed: what it runs, what its rows hold, what it says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deal_hw.bench import speed
+from deal_hw.bench.rows import load_rows
+from deal_hw.bench.tasks import make_case
+from deal_hw.calib.data.problem import Problem
+from deal_hw.cli.bench import Bench, bench
+from deal_hw.errors import ConfigurationError
+
+
+def test_a_cell_is_a_search_and_the_same_steps_of_the_engine(tmp_path: Path) -> None:
+    """4 members for 2 generations of 200 ticks: the ratio is that of the two times, the steps are counted."""
+    out = tmp_path / "speed.json"
+    asked = Bench(
+        bench="speed",
+        profile="ideal",
+        seeds="3",
+        population=4,
+        generations=2,
+        threads=1,
+        out=out,
+        quiet=True,
+    )
+    assert bench(asked) == 0
+    (row,) = load_rows(out)
+    case = make_case("cartpole", "ideal", 3, 5.0, by_policy=True)
+    problem = Problem(case.robot, case.space, [case.fit], threads=1)
+    per_tick = round(1 / (case.robot.description.control_rate_hz * problem.robot.step_s))
+    assert row["error"] == ""
+    # Each member starts at the first of 200 transitions in each generation.
+    assert row["steps"] == pytest.approx(4 * 2 * 200 * per_tick, rel=0.1)
+    assert row["ratio"] == pytest.approx(row["seconds"] / row["seconds_physics"])
+    assert row["seconds_physics"] == pytest.approx(row["steps"] * row["bare_step_us"] * 1e-6)
+    assert (row["paper_seconds"], row["threads"], row["parameters"]) == (75.0, 1, len(case.space))
+    # What is done is not done again.
+    before = out.read_bytes()
+    assert bench(asked) == 0
+    assert out.read_bytes() == before
+
+
+def test_the_engine_alone_advances_every_member(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time of one step is that of a rollout over members times steps."""
+    case = make_case("cartpole", "ideal", 3, 5.0, by_policy=True)
+    problem = Problem(case.robot, case.space, [case.fit], threads=1)
+    ticks = iter(np.arange(0.0, 100.0, 0.5))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
+    before = problem.steps
+    found = speed.bare_step_s(problem, 5)
+    steps = problem.steps - before
+    assert steps == speed.REPETITIONS * 5 * round(0.5 / (5 * found))
+
+
+def test_rows_in_words() -> None:
+    """One line a row with both times, a summary of medians, errors left out of it."""
+    row = {
+        "task": "ant",
+        "method": "easi",
+        "seed": 0,
+        "error": "",
+        "seconds": 10.0,
+        "cpu_seconds": 20.0,
+        "population": 200,
+        "generations": 50,
+        "steps": 2_000_000,
+        "seconds_physics": 5.0,
+        "ratio": 2.0,
+        "paper_seconds": 98.0,
+    }
+    assert speed.line(row) == (
+        "speed ant easi seed 0: 10.0 s (20.0 cpu s), the paper's 98 s; 200 members, 50 generations, "
+        "2e+06 physics steps; bare physics 5.0 s, ratio 2.00"
+    )
+    assert speed.line(row | {"error": "X: y"}).endswith("seed 0: X: y")
+    rows = [
+        row,
+        row | {"seconds": 14.0, "ratio": 3.0},
+        row | {"seconds": 11.0, "ratio": 2.5},
+        row | {"error": "X: y"},
+    ]
+    assert speed.summary(rows) == [
+        "ant easi, 200 x 50: 11.0 s, 2.50 times bare physics; the paper: 98 s on a GPU"
+    ]
+
+
+def test_options_that_would_do_nothing_are_refused() -> None:
+    """It times searches alone, on what a policy demonstrates."""
+    for options in ({"refine_all": True}, {"demonstration": "policy"}):
+        with pytest.raises(ConfigurationError, match="times searches alone"):
+            Bench(bench="speed", **options)
