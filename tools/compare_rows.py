@@ -68,8 +68,17 @@ NULL = frozenset({"midpoint", "nominal", "deal-paper-flat"})
 """Methods, by their new names, that ignore the data and are never refined."""
 
 KEY = (
-    "bench", "task", "space", "profile", "demonstration", "split", "range_ratio", "method", "refined",
-)  # fmt: skip
+    "bench",
+    "task",
+    "space",
+    "profile",
+    "demonstration",
+    "demonstration_s",
+    "split",
+    "range_ratio",
+    "method",
+    "refined",
+)
 MISSPECIFIED = frozenset({"realistic", "real"})
 """Profiles of robots that do what no model here does."""
 
@@ -226,6 +235,7 @@ def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
         **{name: str(row.get(name, "")) for name in KEY},
         "bench": BENCHES.get(bench, bench),
         "demonstration": str(row.get("demonstration", "excite")),
+        "demonstration_s": f"{float(row.get('demonstration_s', 4.0)):g}" if "task" in row else "",
         "range_ratio": f"{float(row['range_ratio']):g}" if row.get("range_ratio") is not None else "",
         "method": method,
         "refined": "refined" if row.get("refined") and method not in WHOLE | NULL else "",
@@ -237,6 +247,9 @@ def cell_name(key: Key) -> str:
     """Return a cell's name for people: what is not the rule, in one line."""
     known = dict(zip(KEY, key, strict=True))
     known["demonstration"] = "" if known["demonstration"] == "excite" else known["demonstration"]
+    known["demonstration_s"] = (
+        "" if known["demonstration_s"] in ("", "4") else known["demonstration_s"] + " s"
+    )
     known["range_ratio"] = f"ratio {known['range_ratio']}" if known["range_ratio"] else ""
     return " ".join(text for text in known.values() if text)
 

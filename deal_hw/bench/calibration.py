@@ -16,12 +16,22 @@ from typing import Any, Literal
 
 from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.rows import Cells, Row
-from deal_hw.bench.tasks import TASKS, make_case
+from deal_hw.bench.tasks import DEMONSTRATION_S, TASKS, make_case
 from deal_hw.errors import DealHwError, UnknownNameError
 
 Protocol = Literal["fixed-range", "mismatch", "paper"]
 PAPER_NOTE = "centred target: a searcher that ignores the data scores 0 here"
-KEY = ("task", "space", "profile", "demonstration", "method", "refined", "range_ratio", "seed")
+KEY = (
+    "task",
+    "space",
+    "profile",
+    "demonstration",
+    "demonstration_s",
+    "method",
+    "refined",
+    "range_ratio",
+    "seed",
+)
 """What names a cell."""
 
 
@@ -35,6 +45,7 @@ class Cell:
         space: Name of the parameter set; "" for the task's default.
         profile: Profile of the robot.
         demonstration: "excite" or "policy".
+        demonstration_s: How long it is [s].
         method: Name of the method.
         refined: Whether the refinement follows.
         range_ratio: Ratio of the search range.
@@ -46,6 +57,7 @@ class Cell:
     space: str
     profile: str
     demonstration: str
+    demonstration_s: float
     method: str
     refined: bool
     range_ratio: float
@@ -68,6 +80,7 @@ def make_cells(
     space: str = "",
     refine_all: bool = False,
     demonstration: str = "excite",
+    demonstration_s: float = DEMONSTRATION_S,
 ) -> list[Cell]:
     """Return the cells of a bench, seed by seed, so that a stopped bench has whole seeds.
 
@@ -88,6 +101,7 @@ def make_cells(
             space=space,
             profile=profile,
             demonstration=demonstration,
+            demonstration_s=demonstration_s,
             method=method,
             refined=refine_all or method == "default",
             range_ratio=range_ratio,
@@ -127,6 +141,7 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
             cell.space,
             centred=cell.protocol == "paper",
             by_policy=cell.demonstration == "policy",
+            seconds=cell.demonstration_s,
         )
         part, _ = calibration_row(case, cell.method, budget, threads)
         row |= part

@@ -28,6 +28,8 @@ from deal_hw.types import FloatArray
 from deal_hw.workflows.shipped import shipped_policy
 
 DEMONSTRATION_S = 4.0
+"""Length of a demonstration where nobody says, and of every held-out motion [s]."""
+
 TRUTH_PART = (0.1, 0.9)
 """Truths are drawn from this part of the range."""
 
@@ -86,6 +88,7 @@ class _Ask:
     space: str
     centred: bool
     by_policy: bool
+    seconds: float
 
     def ranges(self, table: Mapping[str, Callable[[], ParameterSpace]]) -> ParameterSpace:
         """Return the parameter set with its search ranges."""
@@ -106,6 +109,7 @@ def make_case(
     *,
     centred: bool = False,
     by_policy: bool = False,
+    seconds: float = DEMONSTRATION_S,
 ) -> Case:
     """Draw a truth and record a demonstration and a held-out motion.
 
@@ -118,12 +122,13 @@ def make_case(
         centred: The truth is the nominal model and ranges are linear, as in DEAL's tables.
         by_policy: The robot is demonstrated by its shipped policy, as in the paper, instead of by motions
             that excite more. The cart-pole's demonstration always begins with its policy.
+        seconds: Length of the demonstration [s]; a held-out motion is always as long.
 
     Raises:
         ConfigurationError: There is no such profile or parameter set for this task.
         CalibrationError: No drawn truth could demonstrate.
     """
-    return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy))
+    return TASKS[task](_Ask(profile, seed, range_ratio, space, centred, by_policy, seconds))
 
 
 def _cartpole(ask: _Ask) -> Case:
@@ -139,7 +144,7 @@ def _cartpole(ask: _Ask) -> Case:
     plan = RunPlan(
         robot="cartpole",
         profile="balance" if ask.by_policy else "rich",
-        seconds=DEMONSTRATION_S,
+        seconds=ask.seconds,
         seed=seed,
         policy=str(shipped_policy("cartpole") or ""),
     )
@@ -204,7 +209,7 @@ def _go2(ask: _Ask) -> Case:
         fast = sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
         if ask.by_policy:
             return _policy("go2", floor.DESCRIPTION), fast
-        return sway(robot, rng, DEMONSTRATION_S), fast
+        return sway(robot, rng, ask.seconds), fast
 
     space = ask.ranges(floor.SPACES)
     return _target("go2", robot, space, ask, motions, None if ask.profile == "ideal" else sensing)
@@ -253,12 +258,12 @@ def _target(
                     space,
                     theta,
                     motion,
-                    seconds=DEMONSTRATION_S,
+                    seconds=seconds,
                     latency_s=latency_s,
                     sensing=sensing,
                     rng=rng,
                 )
-                for motion in motions(rng)
+                for motion, seconds in zip(motions(rng), (ask.seconds, DEMONSTRATION_S), strict=True)
             )
         except CalibrationError:
             continue

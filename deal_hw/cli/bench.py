@@ -97,6 +97,9 @@ class Bench:
     """How robots are demonstrated: by motions that excite, or by their shipped policies, which methods of the
     paper need."""
 
+    demonstration_seconds: Annotated[float, Range(1, 600, "s")] = 4.0
+    """fixed-range, mismatch, paper: length of the demonstration [s]."""
+
     population: Annotated[int | None, Range(2, 100_000)] = None
     """Members of a search; by default 100, for methods of the paper 200."""
 
@@ -136,6 +139,9 @@ class Bench:
         if self.bench == "speed":
             options = given(self, Bench, ("demonstration", "refine_all"))
             refuse(options, "`bench speed` times searches alone, on what a policy demonstrates")
+        if self.bench not in ("fixed-range", "mismatch", "paper"):
+            options = given(self, Bench, ("demonstration_seconds",))
+            refuse(options, "only `bench fixed-range`, `mismatch` and `paper` take that")
         if self.bench != "verdict":
             refuse(given(self, Bench, ("faults",)), "only `bench verdict` takes that")
 
@@ -323,6 +329,7 @@ def _calibration(config: Bench, out: Path) -> _Table:
         space=config.space,
         refine_all=config.refine_all,
         demonstration=config.demonstration,
+        demonstration_s=config.demonstration_seconds,
     )
     cells = calibration.cells(
         chosen, population=config.population, generations=config.generations, threads=config.threads

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deal_hw.bench import calibration
 from deal_hw.bench.rows import write_rows
 from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import Bench, bench, parse_ratios, parse_seeds
@@ -198,3 +199,18 @@ def test_an_unknown_task_is_refused(tmp_path: Path) -> None:
     """The tasks are listed."""
     with pytest.raises(UnknownNameError, match="go2"):
         bench(Bench(bench="fixed-range", task="humanoid", out=tmp_path / "honest.json"))
+
+
+@pytest.mark.parametrize("task", ["cartpole", "ant"])
+def test_a_demonstration_is_as_long_as_is_asked_and_the_held_out_motion_stays(task: str) -> None:
+    """2 s and 4 s: DEAL's Figure 5 shortens what is shown, not what judges."""
+    case = make_case(task, "ideal", 3, 5.0, seconds=2.0, by_policy=True)
+    seconds = [episode.steps * episode.step_s for episode in (case.fit, case.heldout)]
+    assert seconds == pytest.approx([2.0, 4.0], abs=0.1)
+
+
+def test_a_length_of_the_demonstration_belongs_to_the_calibration_benches() -> None:
+    """Others would ignore it; a row names it, so that a bench of another length is not taken for done."""
+    with pytest.raises(ConfigurationError, match="--demonstration-seconds"):
+        Bench(bench="loop", demonstration_seconds=2.0)
+    assert "demonstration_s" in calibration.KEY
