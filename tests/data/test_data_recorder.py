@@ -7,6 +7,7 @@ import os
 import resource
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.clock import VirtualClock
+from deal_hw.data.recording import recorder as recorder_module
 from deal_hw.data.recording.mcap_scan import Found, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_trajectory, read_wire
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.data.recording.repair import verify
+from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
 
@@ -45,6 +48,30 @@ def test_samples_come_back(write_episode: WriteEpisode) -> None:
     age = np.where(sample < 4, np.nan, 0.001 + 0.005 * (sample % 4))
     np.testing.assert_allclose(trajectory.command_age_s, age, atol=1e-12)
     assert trajectory.position.flags.c_contiguous
+
+
+def test_a_topic_by_its_former_name_is_read(
+    make_cycle: MakeCycle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the policy requests was recorded on /command/asked until November 2026."""
+    former = {new: old for old, new in OLD_TOPICS.items()}
+    channels: dict[str, Any] = {former.get(topic, topic): kind for topic, kind in CHANNELS.items()}
+    add = EpisodeRecorder._add_command
+    monkeypatch.setattr(recorder_module, "CHANNELS", channels)
+    monkeypatch.setattr(
+        EpisodeRecorder,
+        "_add_command",
+        lambda self, topic, *rest: add(self, former.get(topic, topic) or topic, *rest),
+    )
+    path = tmp_path / "former.mcap"
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {"purpose": "test"}, VirtualClock()) as recorder:
+        for number in range(5):
+            recorder.write(make_cycle(number))
+    monkeypatch.undo()
+    with open(path, "rb") as file:
+        topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    assert "/command/asked" in topics and "/command/requested" not in topics
+    np.testing.assert_array_equal(read_trajectory(path).requested_position[:, 0], 0.1 + 1e-3 * np.arange(5))
 
 
 def test_commands_asked_and_sent_come_back(write_episode: WriteEpisode) -> None:

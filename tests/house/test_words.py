@@ -46,6 +46,8 @@ KEPT = (
     ("tools/compare_rows.py", r"polish|weki|xi\b|open.loop"),
     ("tests/tools/test_tools_compare_rows.py", r"polish|weki|xi\b|open.loop"),
     ("deal_hw/bench/rows.py", r"xi|honest"),
+    ("deal_hw/data/recording/schemas.py", r"/command/asked"),
+    ("tests/data/test_data_recorder.py", r"/command/asked"),
     # xi is what DEAL calls the ratio, and a standard normal draw.
     ("calib/search/eki.py", r"xi"),
     ("calib/baselines/easi.py", r"xi"),

@@ -15,7 +15,7 @@ from mcap.records import Message as McapMessage
 from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.recording.schemas import CHANNELS, message_type
+from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS, message_type
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -190,8 +190,9 @@ def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]
         channels.update({record.id: record for record in found.contents if isinstance(record, Channel)})
         for message in messages(found):
             channel = _channel(channels, message)
-            if channel.topic in rows and not channel.topic.startswith("/wire/"):
-                rows[channel.topic].append(message_type(channel.topic).decode(message.data))
+            topic = OLD_TOPICS.get(channel.topic, channel.topic)
+            if topic in rows and not topic.startswith("/wire/"):
+                rows[topic].append(message_type(topic).decode(message.data))
     if preamble is None:
         raise DatasetError(
             f"{path} does not say what it holds (no metadata {METADATA_NAME!r}): not by deal-hw"

@@ -227,6 +227,9 @@ Repair relies on that order where the part of a file that names the channels is 
 reorder.
 """
 
+OLD_TOPICS: Mapping[str, str] = {"/command/asked": "/command/requested"}
+"""Topics by the names that recordings of November 2026 have."""
+
 
 def message_type(topic: str) -> MessageType:
     """Return the type of the messages on a topic.
