@@ -122,7 +122,7 @@ class Sensitivity:
         )
 
 
-def look(problem: Problem) -> Sensitivity:
+def compute_sensitivity(problem: Problem) -> Sensitivity:
     """Compare rollouts at both ends of each parameter's range with the nominal one.
 
     Raises:

@@ -22,9 +22,9 @@ from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
     ExcitationDesign,
     ExcitationPlan,
+    describe_design,
     largest_factor,
     make_plan,
-    words,
 )
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import DealHwError
@@ -125,7 +125,7 @@ def menu_designs(
         for amplitude in settings.amplitudes
         for effort, speed in _variants(description, settings)
     ]
-    return {words(design): design for design in designs}
+    return {describe_design(design): design for design in designs}
 
 
 def options(design: ExcitationDesign) -> str:
@@ -176,7 +176,7 @@ def advise(
     before = np.full(K, np.inf) if known.covariance is None else np.sqrt(np.diag(known.covariance))
     # An interval that was cut off at the range says less than its width.
     before = np.minimum(before, space.width / np.sqrt(12.0))
-    open_ = [k for k in range(K) if not _told(space, k, float(before[k])) or _said_weak(result, k)]
+    open_ = [k for k in range(K) if not _has_value(space, k, float(before[k])) or _said_weak(result, k)]
     if not open_:
         return ()
     designs = menu_designs(robot.description, balance is not None, settings)
@@ -228,7 +228,7 @@ def _said_weak(result: CalibrationResult, k: int) -> bool:
     return bool(result.verdicts) and result.verdicts[k] != "identifiable"
 
 
-def _told(space: ParameterSpace, k: int, std: float) -> bool:
+def _has_value(space: ParameterSpace, k: int, std: float) -> bool:
     return std <= INTERVALS.identifiable_std * (1.0 if space.log_scale[k] else float(space.width[k]))
 
 
@@ -261,7 +261,7 @@ def _advice(
             f"leaves {_amount(space, k, after)}: {how}"
         )
         return Advice(name, before, after, "", sentence)
-    rest = "" if _told(space, k, after) else ", which is still weak"
+    rest = "" if _has_value(space, k, after) else ", which is still weak"
     sentence = (
         f"record {best}: {name} goes from {_amount(space, k, before)} to {_amount(space, k, after)}{rest}"
     )

@@ -138,10 +138,10 @@ def search_excitation(
     trace = [score(best, wanted)]
     steps = [(best, design)]
     for k in range(wanted.rounds):
-        moved = designer.moved(design, k, rng)
-        found = predict(moved, score(best, wanted))
+        other = designer.neighbour(design, k, rng)
+        found = predict(other, score(best, wanted))
         if score(found, wanted) > score(best, wanted):
-            best, design = found, moved
+            best, design = found, other
             steps.append((best, design))
         trace.append(score(best, wanted))
     if confirmation is not None:
@@ -233,7 +233,7 @@ class _Designer:
             seed=int(rng.integers(2**31)),
         )
 
-    def moved(self, design: ExcitationDesign, k: int, rng: np.random.Generator) -> ExcitationDesign:
+    def neighbour(self, design: ExcitationDesign, k: int, rng: np.random.Generator) -> ExcitationDesign:
         """Return the design with one coordinate changed: the k-th, round and round."""
         factor = float(np.exp(rng.choice((-1.0, 1.0)) * rng.uniform(0.15, 0.6)))
         high = float(np.clip(design.high_hz * factor, 0.5, self._top_hz))

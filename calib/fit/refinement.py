@@ -15,7 +15,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.contacts import CONTACTS, settle, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
-from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, huber_weights, settled, solve
+from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, huber_weights, solve
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import FloatArray
 
@@ -247,7 +247,7 @@ def at_parameters(
         point = settle(shooting, point, CONTACTS.start_iterations)[0]
         normal = shooting.normal(point)
     else:
-        point, normal = settled(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
+        point, normal = converged(shooting, point, shooting.normal(point), CONTACTS.start_iterations)
     found = _refined(shooting, point, normal, 0, problem.fixed_latency_s is not None)
     return dataclasses.replace(found, theta=theta, latency_s=latency_s)
 

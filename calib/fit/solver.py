@@ -142,7 +142,7 @@ def solve(
     while True:
         fit = _Following(shooting, point, normal)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=fixed_latency)
-        point, normal = settled(shooting, fit.at(value), fit.normal_at(value), 1)
+        point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
         used += max(more, 1)
         if used >= settings.iterations or not normal.cost < before * (1 - settings.gain):
             break
@@ -151,7 +151,7 @@ def solve(
     return point, dataclasses.replace(normal, rows=()), used
 
 
-def settled(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
+def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
     """Fit start states alone where nothing kinks; parameters stay, and no window's cost grows.
 
     Args:

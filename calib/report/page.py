@@ -109,7 +109,7 @@ def render(inputs: ReportInputs) -> str:
         trace=charts.trace(result.trace),
         population=None
         if result.population is None
-        else charts.population(result.space, result.population, result.estimate, told(result)),
+        else charts.population(result.space, result.population, result.estimate, with_value(result)),
         facts=[(key, _plain(value)) for key, value in provenance.items() if key not in _HIDDEN],
         versions=_mapping(provenance.get("versions")),
         settings=[
@@ -143,7 +143,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
                 low=low,
                 high=high,
                 verdict=result.verdicts[k] if result.verdicts else "",
-                told=bool(told(result)[k]),
+                told=bool(with_value(result)[k]),
                 at_bound=bound,
                 bar_left=float(at[0][k]),
                 bar_width=max(float(at[1][k] - at[0][k]), 0.4),
@@ -191,7 +191,7 @@ def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
     return f"{100 * std:.2g} %" if parameter.scale == "log" else f"{std:.2g} {parameter.unit}"
 
 
-def told(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def with_value(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return which parameters have a value, (K,): what the data cannot tell gets none on the page."""
     K = len(result.space)
     return np.array([v != "not identifiable" for v in result.verdicts] or [True] * K, dtype=bool)

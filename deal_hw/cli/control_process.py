@@ -121,7 +121,7 @@ def _run(
 
     def progress(phase: str, silence_s: float) -> None:
         status.beat(clock.now_ns(), phase, silence_s)
-        for key in vigil.words():
+        for key in vigil.messages():
             if isinstance(source, KeyboardVelocity):
                 source.press(key)
 

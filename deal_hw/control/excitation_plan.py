@@ -231,7 +231,7 @@ def make_plan(description: RobotDescription, design: ExcitationDesign) -> Excita
         ease_s=ease_s,
         wave=wave,
         segments=design.segments(),
-        words=words(design),
+        words=describe_design(design),
     )
     times = design.balance_s + np.arange(0.0, length, 1.0 / description.control_rate_hz)
     scale = fit_to_limits(description, plan.offsets(times), smooth=design.family != "steps")
@@ -260,7 +260,7 @@ def largest_factor(default: Sequence[float], most: Sequence[float]) -> float:
     return max(min(ratios, default=1.0), 1.0)
 
 
-def words(design: ExcitationDesign) -> str:
+def describe_design(design: ExcitationDesign) -> str:
     """Return a design in words, as advice and file carry it."""
     band = f"{design.low_hz:.2g} to {design.high_hz:.2g} Hz"
     what = {

@@ -129,13 +129,13 @@ def velocity_error(
     def at(time_s: FloatArray, values: FloatArray) -> FloatArray:
         return np.interp(time_s, track.time_s, values)
 
-    def moved(values: FloatArray) -> FloatArray:
+    def change(values: FloatArray) -> FloatArray:
         return np.asarray((at(begin + settings.step_s, values) - at(begin, values)) / settings.step_s)
 
-    x, y = moved(track.place[:, 0]), moved(track.place[:, 1])
+    x, y = change(track.place[:, 0]), change(track.place[:, 1])
     middle = at(begin + 0.5 * settings.step_s, turned)
     base = np.stack(
-        (np.cos(middle) * x + np.sin(middle) * y, np.cos(middle) * y - np.sin(middle) * x, moved(turned)),
+        (np.cos(middle) * x + np.sin(middle) * y, np.cos(middle) * y - np.sin(middle) * x, change(turned)),
         axis=1,
     )
     changes = np.flatnonzero(np.any(np.diff(wanted.velocity, axis=0, prepend=np.nan), axis=1))

@@ -41,7 +41,7 @@ class SupervisorVigil:
         """Listen from now on; the thread has the priority of the one that calls."""
         self._thread.start()
 
-    def words(self) -> list[str]:
+    def messages(self) -> list[str]:
         """Return what the supervisor told since the last call, heartbeats left out."""
         return [self._words.popleft() for _ in range(len(self._words))]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.calib.data.checks import jumps, look, require_sensitive
+from deal_hw.calib.data.checks import compute_sensitivity, jumps, require_sensitive
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.errors import ConfigurationError
@@ -79,7 +79,7 @@ def test_parameters_are_told_apart_by_what_they_change(robot: RobotModel) -> Non
             ),
         ]
     )
-    found = look(Problem(robot, space, [steps_of(robot)], threads=1, known_std=STD))
+    found = compute_sensitivity(Problem(robot, space, [steps_of(robot)], threads=1, known_std=STD))
     assert found.unseen == ("limit",) and found.faint == ("friction",)
     assert found.effect[0] > 10
     with pytest.raises(ConfigurationError, match="sees limit"):

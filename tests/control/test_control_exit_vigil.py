@@ -42,7 +42,7 @@ class Rig:
     def words(self) -> list[str]:
         """Wait for words; the vigil is not silent meanwhile."""
         for _ in range(round(PATIENCE_S * 1e3)):
-            if words := self.vigil.words():
+            if words := self.vigil.messages():
                 return words
             assert not self.silent.wait(0.001)
         raise AssertionError("the words did not come")
@@ -62,8 +62,8 @@ def test_words_are_kept_and_heartbeats_left_out() -> None:
         rig.supervisor.tell(word)
     rig.vigil.start()
     rig.close()
-    assert rig.vigil.words() == ["w", "a", "s"]
-    assert rig.vigil.words() == []
+    assert rig.vigil.messages() == ["w", "a", "s"]
+    assert rig.vigil.messages() == []
     assert rig.calls == 0
 
 
@@ -169,7 +169,7 @@ def test_words_that_nobody_takes_are_forgotten() -> None:
     """The newest 256 are kept."""
     rig = Rig()
     rig.vigil._words.extend(map(str, range(300)))
-    assert rig.vigil.words() == list(map(str, range(44, 300)))
+    assert rig.vigil.messages() == list(map(str, range(44, 300)))
     rig.vigil.start()
     rig.close()
 

@@ -154,7 +154,7 @@ def require_sensitive_parameters(
     say: Callable[[str], None],
 ) -> None:
     """Check before any search that the recordings are long enough, move, and show every parameter."""
-    from deal_hw.calib.data.checks import check_excitation, jumps, look, require_sensitive
+    from deal_hw.calib.data.checks import check_excitation, compute_sensitivity, jumps, require_sensitive
     from deal_hw.calib.data.problem import Problem, samples_in
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
@@ -169,7 +169,7 @@ def require_sensitive_parameters(
         raise InsufficientDataError(
             str(err).partition("; record again with")[0] + "; record more motion"
         ) from err
-    found = look(problem)
+    found = compute_sensitivity(problem)
     require_sensitive(found)
     if found.faint:
         say(
