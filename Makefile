@@ -17,7 +17,7 @@ SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test dds-peer avr-tools firmware check coverage-safety mutation bench typing format clean
+.PHONY: help setup demo test dds-peer avr-tools firmware check docs coverage-safety mutation bench typing format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,7 +33,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  || { echo "this Python cannot make a venv; on Debian: apt-get install -y python3-venv" >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt torch
-	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[all,dev]'
+	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[all,dev,docs]'
 	@touch $@
 
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
@@ -54,11 +54,16 @@ avr-tools: ## install gcc-avr and simavr
 firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and the memory that it takes
 	@$(BIN)/python -m deal_hw.drivers.cartpole.native build/firmware
 
-check: $(STAMP) typing coverage-safety ## format, lint, types, import order and coverage of the safety module
+check: $(STAMP) typing coverage-safety docs ## format, lint, types, import order, coverage of the safety module, docs
 	$(BIN)/ruff format --check --output-format concise .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q tests/house/test_layers.py
+
+# mkdocs runs without a network; the built pages load nothing from other hosts.
+docs: $(STAMP) typing ## build the documentation into build/site and check its links
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python tools/check_site.py build/site
 
 # The repository's own coverage settings measure everything; here every line and branch of a few files counts.
 coverage-safety: $(STAMP) ## each line and branch of the safety module and of the exit path is tested

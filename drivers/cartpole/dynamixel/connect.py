@@ -38,7 +38,7 @@ def parse_port(port: str) -> tuple[str, DynamixelSettings]:
     values: dict[str, Any] = {}
     if (file := given.pop(SETTINGS_FILE, None)) is not None:
         values = read_json(
-            Path(file), dict[str, Any], "settings of the servos", "docs/dynamixel.md shows one",
+            Path(file), dict[str, Any], "settings of the servos", "docs/how-to/dynamixel.md shows one",
             error=ConfigurationError,
         )  # fmt: skip
     values |= {name: _value(text) for name, text in given.items()}
