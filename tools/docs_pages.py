@@ -2,6 +2,7 @@
 
 - ``reference/cli.md``: every verb and option, from the parser of the command line;
 - ``reference/api.md``: every public name of ``deal_hw``, then the contracts, for mkdocstrings;
+- ``reference/alarms.md``: every alarm of a calibration, from the calls that make one;
 - ``reference/errors.md``: every refusal, from tests/house/refusals.txt;
 - ``contributing.md`` and ``changelog.md``: CONTRIBUTING.md and CHANGELOG.md with links that hold in the site.
 """
@@ -9,15 +10,23 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
 import re
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+if str(Path(__file__).parent) not in sys.path:  # mkdocs loads a hook by its path.
+    sys.path.append(str(Path(__file__).parent))
+
+from refusals import words
+
 ROOT = Path(__file__).resolve().parents[1]
+ALARM_FOLDERS = ("calib", "deal_hw")
 REFUSALS = ROOT / "tests" / "house" / "refusals.txt"
 
 CONTRACTS = {
@@ -197,7 +206,7 @@ def errors_page(table: str) -> str:
         "# Error messages",
         "",
         "Every message with which a command of deal-hw ends (exit status 2), by the file that raises it. "
-        "`{...}` stands for what was given. A message says what was given, what is allowed and what to do. "
+        "`…` stands for what was given. A message says what was given, what is allowed and what to do. "
         "[Troubleshooting](../troubleshooting.md) has the frequent ones with more words. Search this page "
         "for a part of the message that does not change.",
         "",
@@ -212,7 +221,67 @@ def errors_page(table: str) -> str:
             path, rows = line.strip(), []
             continue
         if match := re.match(r"\s+.+?  (\w+) 2  (.+)$", line):
-            rows.append(f"| `{match[1]}` | {cell(match[2])} |")
+            rows.append(f"| `{match[1]}` | {cell(shortened(match[2]))} |")
+    return "\n".join(lines)
+
+
+def shortened(text: str) -> str:
+    """Return text with an ellipsis for each value that comes in at run time, whatever its expression."""
+    out, depth = [], 0
+    for sign in text:
+        depth += sign == "{"
+        if not depth:
+            out.append(sign)
+        elif sign == "}":
+            depth -= 1
+            out += ["…"] if not depth else []
+    return "".join(out)
+
+
+def alarms() -> list[tuple[str, ...]]:
+    """Return every alarm: the file that raises it, what was seen, what it means, what to do."""
+    found = []
+    for folder in ALARM_FOLDERS:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if (
+                    isinstance(node, ast.Call)
+                    and getattr(node.func, "id", "") == "Alarm"
+                    and len(node.args) == 3
+                ):
+                    if not any(isinstance(part, ast.Name) for part in node.args):
+                        seen, means, do = (shortened(words(part)) for part in node.args)
+                        found.append((path.relative_to(ROOT).as_posix(), seen, means, do))
+    return found
+
+
+def alarms_page() -> str:
+    """Return the page of alarms, causes of an unexplained residual behind them."""
+    from deal_hw.calib.validation.diagnosis import LOOKS
+
+    lines = [
+        "# Alarms",
+        "",
+        "An alarm is a reason to distrust a calibration. The terminal, the report and `result.json` show "
+        "it in three parts: what was seen, what it means, what to do. This page is made from the code. `…` "
+        "stands for a name or a number. [Calibration](../explanation/calibration.md#alarms) has the limits.",
+        "",
+        "| what was seen | what it means | what to do |",
+        "|---|---|---|",
+        *(f"| {cell(seen)} | {cell(means)} | {cell(do)} |" for _, seen, means, do in alarms()),
+        "",
+        "## Causes of a residual above the noise",
+        "",
+        "Where the model does not explain the recording, deal-hw looks for a cause. Its alarm names one "
+        "of these, the share of the residual that it explains, and the joints.",
+        "",
+        "| cause | the residual looks like | what it means | what to do |",
+        "|---|---|---|---|",
+        *(
+            f"| {cause} | {cell(looks)} | {cell(means)} | {cell(do.replace('{}', '…'))} |"
+            for cause, (looks, means, do) in LOOKS.items()
+        ),
+    ]
     return "\n".join(lines)
 
 
@@ -227,6 +296,7 @@ def pages() -> dict[str, str]:
     return {
         "reference/cli.md": cli_page(),
         "reference/api.md": api_page(),
+        "reference/alarms.md": alarms_page(),
         "reference/errors.md": errors_page(REFUSALS.read_text(encoding="utf-8")),
         "contributing.md": moved("CONTRIBUTING.md"),
         "changelog.md": moved("CHANGELOG.md"),

@@ -56,8 +56,32 @@ c.py
 """
     page = docs_pages.errors_page(table)
     assert page.endswith(
-        "## a/b.py\n\n| error | message |\n|---|---|\n| `DatasetError` | {x} \\| is &lt;odd> |\n"
+        "## a/b.py\n\n| error | message |\n|---|---|\n| `DatasetError` | … \\| is &lt;odd> |\n"
     )
+
+
+def test_each_alarm_is_on_its_page() -> None:
+    """Alarms of all folders are found with their three parts, and causes beside them."""
+    found = docs_pages.alarms()
+    assert {path for path, *_ in found} >= {
+        "calib/uncertainty/intervals.py",
+        "calib/validation/verdict.py",
+        "deal_hw/workflows/calibration/best_so_far.py",
+    }
+    assert all(part.strip("… ") for row in found for part in row)
+    page = docs_pages.alarms_page()
+    assert "| Residuals are … times the sensor's noise…. | The model does not explain the recording: " in page
+    assert "\n| backlash | play in the gear | " in page
+
+
+def test_values_of_run_time_are_shortened() -> None:
+    """Braces inside an expression do not end it."""
+    assert docs_pages.shortened("a {', '.join({x})} b {y}") == "a … b …"
+
+
+def test_readme_is_short() -> None:
+    """It has at most 100 lines; results live in docs/results."""
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100
 
 
 @pytest.fixture
