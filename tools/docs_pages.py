@@ -49,6 +49,9 @@ CONTRACTS = {
 }
 """Modules of the API page, below the functions of ``deal_hw`` itself."""
 
+PLAIN = {"", "required"}
+"""Defaults that are no values."""
+
 Sections = dict[str, list[tuple[str, str, str]]]
 """Title of a group of options -> option, text, default."""
 
@@ -63,7 +66,7 @@ def cell(text: str) -> str:
         .replace("*", "\\*")
         .replace("[", "&#91;")
     )
-    return re.sub(r"docs/([\w/-]+)\.md", r"[\1](../\1.md)", text)
+    return re.sub(r"docs/((?:[\w-]+/)?([\w-]+))\.md", r"[\2](../\1.md)", text)
 
 
 def code(text: str) -> str:
@@ -76,14 +79,15 @@ def options(parser: argparse.ArgumentParser) -> Sections:
     sections: Sections = {}
     for group in parser._action_groups:
         for action in group._group_actions:
-            if isinstance(action, (argparse._HelpAction, argparse._SubParsersAction)):
+            if type(action).__name__ in {"_HelpAction", "_SubParsersAction"}:  # tyro has its own argparse.
                 continue
             text = action.help or ""
             match = re.search(r"\s*\((required|default: .*)\)\s*$", text, flags=re.S)
             default = match[1].removeprefix("default: ") if match else ""
             # tyro shows an empty string, tuple or None as '', nothing or None.
             default = "" if default in {"None", "''"} else default
-            name = f"{max(action.option_strings, key=len, default='')} {metavar(action)}".strip()
+            name = max(action.option_strings, key=len, default=action.dest.upper())
+            name = f"{name} {metavar(action)}".strip() if action.option_strings else name
             title = "" if group.title in {"positional arguments", "options"} else str(group.title)
             sections.setdefault(title.removesuffix(" options"), []).append(
                 (name, text[: match.start()] if match else text, default)
@@ -102,7 +106,7 @@ def sub_verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
     return {
         name: sub
         for action in parser._actions
-        if isinstance(action, argparse._SubParsersAction)
+        if type(action).__name__ == "_SubParsersAction"
         for name, sub in action.choices.items()
     }
 
@@ -126,7 +130,7 @@ def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
             yield from (f"{'#' * (level + 1)} {parser.prog}: {title} {{ data-toc-label='{title}' }}", "")
         yield from ("| option | meaning | default |", "|---|---|---|")
         yield from (
-            f"| {code(name)} | {cell(text)} | {code(default) if default else ''} |"
+            f"| {code(name)} | {cell(text)} | {default if default in PLAIN else code(default)} |"
             for name, text, default in rows
         )
         yield ""
@@ -188,7 +192,14 @@ def api_page() -> str:
         "",
     ]
     for name in public_names(deal_hw):
-        lines += [f"::: {name}", ""]
+        heading = f"deal_hw.{name.rpartition('.')[2]}"
+        lines += [
+            f"::: {name}",
+            "    options:",
+            f"      heading: {heading}",
+            f"      toc_label: {heading}",
+            "",
+        ]
     for title, modules in CONTRACTS.items():
         lines += [f"## {title}", ""]
         for module in modules:

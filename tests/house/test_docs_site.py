@@ -41,7 +41,8 @@ def test_each_verb_is_in_the_reference() -> None:
     for name, verb in VERBS.items():
         assert f"\n## deal-hw {name}\n\n    deal-hw {verb.example}\n" in page
     assert "| `--latency FLOAT` | Total latency [s] if it is known" in page.replace("&#91;", "[")
-    assert "None}" not in page
+    assert "\n### deal-hw data verify\n" in page
+    assert "None}" not in page and "--help" not in page.partition("## deal-hw collect")[2]
 
 
 def test_each_refusal_is_on_the_page_of_errors() -> None:
