@@ -255,14 +255,12 @@ def alarms() -> list[tuple[str, ...]]:
     for folder in ALARM_FOLDERS:
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if (
-                    isinstance(node, ast.Call)
-                    and getattr(node.func, "id", "") == "Alarm"
-                    and len(node.args) == 3
-                ):
-                    if not any(isinstance(part, ast.Name) for part in node.args):
-                        seen, means, do = (shortened(words(part)) for part in node.args)
-                        found.append((path.relative_to(ROOT).as_posix(), seen, means, do))
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Alarm" and node.args:
+                    parts = [shortened(words(part)) for part in node.args]
+                    # Without words of its own, an alarm is copied from a file or from the table of causes.
+                    if parts[0].strip("…"):
+                        parts = [part if part.strip("…") else "(the message says it)" for part in parts]
+                        found.append((path.relative_to(ROOT).as_posix(), *parts))
     return found
 
 
