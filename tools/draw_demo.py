@@ -1,7 +1,7 @@
-"""Draw the animation and the picture of the start page, from a run folder of the cart-pole's demo.
+"""Draw the animation of the start page, from a run folder of the cart-pole's demo.
 
     deal-hw demo --out runs/demo
-    python tools/draw_demo.py runs/demo --out docs/images/demo.gif --still docs/images/demo.png
+    python tools/draw_demo.py runs/demo --out docs/images/demo.gif
 
 Left: the first recording, and what the nominal and the calibrated model predict of it; predictions restart
 from the measured state. Right: the policy on the robot before and after it was trained again, first episodes.
@@ -157,13 +157,12 @@ def frame(figure: Figure) -> Image.Image:
 
 
 def main() -> None:
-    """Write the animation and the picture."""
+    """Write the animation."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, help="run folder of `deal-hw demo`")
     parser.add_argument("--out", type=Path, required=True, help="animation to write (.gif)")
-    parser.add_argument("--still", type=Path, help="picture to write, of the last moment (.png)")
     parser.add_argument("--seconds", type=float, default=4.0, help="length [s]")
     parser.add_argument("--hz", type=float, default=12.5, help="pictures a second")
     parser.add_argument("--window", type=float, default=0.4, help="length of a prediction [s]")
@@ -182,8 +181,6 @@ def main() -> None:
     small[0].save(
         config.out, save_all=True, append_images=small[1:], duration=pause_ms, loop=0, optimize=True
     )
-    if config.still:
-        frames[-1].quantize(64).save(config.still, optimize=True)
 
 
 if __name__ == "__main__":
