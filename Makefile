@@ -18,7 +18,7 @@ SAFETY_FILES := deal_hw/control/safety*.py,deal_hw/control/leg_checks.py,deal_hw
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test dds-peer avr-tools firmware check dist coverage-safety mutation bench typing format clean
+.PHONY: help setup demo test dds-peer avr-tools firmware check dist docs coverage-safety mutation bench typing format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -34,7 +34,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  || { echo "this Python cannot make a venv; on Debian: apt-get install -y python3-venv" >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt torch
-	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[all,dev]'
+	$(BIN)/python -m pip install $(PIP_ARGS) --constraint constraints.txt --editable '.[all,dev,docs]'
 	@touch $@
 
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
@@ -55,7 +55,7 @@ avr-tools: ## install gcc-avr and simavr
 firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and the memory that it takes
 	@$(BIN)/python -m deal_hw.drivers.cartpole.native build/firmware
 
-check: $(STAMP) typing coverage-safety ## format, lint, types, declared imports, layers, coverage of the safety module, distributions
+check: $(STAMP) typing coverage-safety docs ## format, lint, types, declared imports, layers, safety coverage, docs, distributions
 	$(BIN)/ruff format --check --output-format concise .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -68,6 +68,11 @@ dist: $(STAMP) ## build/dist: the wheel, built from the source distribution, and
 	@rm -rf build/dist
 	$(BIN)/python -m build --no-isolation --outdir build/dist >build/dist.log 2>&1 || { cat build/dist.log; exit 1; }
 	$(BIN)/twine check --strict build/dist/*
+
+# mkdocs runs without a network; the built pages load nothing from other hosts.
+docs: $(STAMP) typing ## build the documentation into build/site and check its links
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python tools/check_site.py build/site
 
 # The repository's own coverage settings measure everything; here every line and branch of a few files counts.
 coverage-safety: $(STAMP) ## each line and branch of the safety module and of the exit path is tested

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
-import platform
 import subprocess
 import sys
 import time
@@ -24,6 +22,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
 from deal_hw.drivers.go2.fake import FakeGo2
@@ -182,12 +181,8 @@ def main(config: DdsPeerSoak) -> int:
     as_user = Side(LOW_COMMAND, LOW_STATE, command_bytes())
     as_robot = Side(LOW_STATE, LOW_COMMAND, state_bytes())
     result: dict[str, Any] = {
-        "machine": {
-            "processors": os.cpu_count(),
-            "kernel": platform.release(),
-            "load_at_start": os.getloadavg()[0],
-            "scheduling": became.scheduling,
-        },
+        **describe_call(f"tools/{Path(__file__).name}"),
+        "scheduling": became.scheduling,
         "cyclonedds_python": importlib.metadata.version("cyclonedds"),
         "seconds_each": config.seconds,
         "idlc_0102_gives_our_hashes": [line.split() for line in hashes.splitlines()] == ours,

@@ -20,6 +20,7 @@ from typing import Any
 
 import tyro
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.cli.emulator_process import EmulatorProcess
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -100,7 +101,8 @@ def main(config: DdsPeerStand) -> int:
         and lay["emulator"]["base_height_m"] < LYING_M
         and all(clean(result) for result in (stood, lay))
     )
-    settings = {"passed": passed, "profile": config.profile, "seed": config.seed}
+    call = describe_call(f"tools/{Path(__file__).name}")
+    settings = {**call, "passed": passed, "profile": config.profile, "seed": config.seed}
     text = json.dumps({**settings, "stood": stood, "lay_down": lay}, indent=1) + "\n"
     if config.out is None:
         print(text, end="")

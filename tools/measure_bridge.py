@@ -34,6 +34,7 @@ from bridge_client import BridgeClient
 from bridge_rig import BridgeRig, make_keys, wire
 from stall_monitor import watch_stalls
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.cli.emulator_process import VerbProcess
 from deal_hw.clock import MonotonicClock
@@ -86,7 +87,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if config.out is not None:
-        config.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        config.out.write_text(
+            json.dumps({**describe_call(f"tools/{Path(__file__).name}"), **result}, indent=1) + "\n",
+            encoding="utf-8",
+        )
     return 0
 
 

@@ -15,12 +15,12 @@ import os
 import platform
 import statistics
 import time
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import CLOSED_LOOP_METHODS, make_method, usual_population
@@ -33,22 +33,12 @@ PAPER_STEP_S = 0.005
 BARE_STEPS = 4000
 
 
-def machine() -> dict[str, Any]:
-    """Return what the numbers depend on."""
-    model = platform.processor()
+def processor() -> str:
+    """Return the processor's name, which the seconds depend on."""
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line
-        ]
-        model = names[0] if names else model
-    return {
-        "cpu": model,
-        "cpus_usable": len(os.sched_getaffinity(0)),
-        "load": os.getloadavg(),
-        "python": platform.python_version(),
-        "versions": {name: version(name) for name in ("mujoco", "torch", "numpy")},
-    }
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if "model name" in line]
+    return names[0] if names else platform.processor()
 
 
 def measure(method: str, budget: Budget, threads: int, repeats: int, seed: int) -> dict[str, Any]:
@@ -98,11 +88,11 @@ def main() -> int:
     parser.add_argument("--generations", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    report: dict[str, Any] = {"machine": machine(), "rows": []}
+    report: dict[str, Any] = {**describe_call(f"tools/{Path(__file__).name}"), "cpu": processor(), "rows": []}
     for method in options.methods.split(","):
         budget = Budget(population=usual_population(method), generations=options.generations)
         report["rows"].append(measure(method, budget, options.threads, options.repeats, options.seed))
-    report["machine"]["load_after"] = os.getloadavg()
+    report["load_after"] = os.getloadavg()
     if options.out is not None:
         options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     return 0

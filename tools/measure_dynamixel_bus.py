@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from deal_hw.bench.rows import write_rows
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
@@ -117,7 +118,7 @@ def main(config: MeasureBus) -> None:
                 rows.append(measure(bus, settings, rate_hz, config.seconds, config.absent))
                 print(json.dumps(rows[-1]), flush=True)
     if config.out is not None:
-        config.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        write_rows(config.out, rows, program=f"tools/{Path(__file__).name}")
 
 
 if __name__ == "__main__":

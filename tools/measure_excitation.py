@@ -9,13 +9,13 @@ Each robot is recorded once with each excitation, and calibrated by the default 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import write_rows
 from deal_hw.calibration import Budget
 from deal_hw.cli.calibrate import calibrate_episodes
 from deal_hw.cli.run_plan import RunPlan, make_behaviour
@@ -107,7 +107,7 @@ def main() -> None:
             text = " ".join(f"{key} {row[key]:.3g}" for key in numbers if key in row)
             print(f"seed {seed} {name}: {row['outcome']} {text or row['reason']}", flush=True)
             if given.out is not None:
-                given.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+                write_rows(given.out, rows, program=f"tools/{Path(__file__).name}")
 
 
 if __name__ == "__main__":

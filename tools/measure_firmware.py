@@ -1,4 +1,4 @@
-"""Memory and cycles of the cart-pole's firmware under simavr: the tables of docs/firmware.md.
+"""Memory and cycles of the cart-pole's firmware under simavr: the tables of docs/how-to/firmware.md.
 
 python tools/measure_firmware.py
 """

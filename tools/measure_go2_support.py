@@ -1,6 +1,6 @@
 """How clearly the emulated Go2 shows what carries it: the figures behind ``deal_hw.drivers.go2.support``.
 
-    python tools/measure_go2_support.py
+    python tools/measure_go2_support.py --out docs/measured/go2_support.json
 
 prints a table with the range over seeds and profiles of what decides, for each situation.
 """
@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import write_rows
 from deal_hw.drivers.go2.descriptions.leg_geometry import foot_loads, foot_positions
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth
@@ -28,6 +31,7 @@ SITUATIONS = {
     "on a stand, sport mode stands": {"on_stand": True, "start": "standing"},
 }
 WINDOW_MS = 300
+COLUMNS = ("reach_m", "third_foot_m", "load_n", "foot_sensors", "fastest_joint_rad_s")
 
 
 def window(device: Go2Device, after_ms: int) -> list[LowStateFrame]:
@@ -41,14 +45,17 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--out", type=Path, help="write the rows to this JSON file, too")
     options = parser.parse_args()
+    found: list[dict[str, Any]] = []
     print("| situation | answers | reach [m] | third foot [m] | load [N] | foot sensors | fastest joint |")
     print("|---|---|---|---|---|---|---|")
     for name, settings in SITUATIONS.items():
         rows, answers = [], set()
         for profile, seed in itertools.product(("sensor", "realistic"), range(options.seeds)):
             states = window(Go2Device(draw_truth(profile, seed), **settings), 500)  # type: ignore[arg-type]
-            answers.add(read_support(states).support.value)
+            answer = read_support(states).support.value
+            answers.add(answer)
             position = np.median([state.position for state in states], axis=0)
             effort = np.median([state.effort for state in states], axis=0)
             reach = -foot_positions(position)[:, 2]
@@ -57,9 +64,13 @@ def main() -> None:
             rows.append(
                 (reach.mean(), np.sort(reach)[1], foot_loads(position, effort)[:, 2].sum(), feet.max(), speed)
             )
+            values = dict(zip(COLUMNS, map(float, rows[-1]), strict=True))
+            found.append({"situation": name, "profile": profile, "seed": seed, "answer": answer, **values})
         low, high = np.min(rows, axis=0), np.max(rows, axis=0)
         cells = [f"{a:.{n}f} to {b:.{n}f}" for a, b, n in zip(low, high, (3, 3, 1, 0, 2), strict=True)]
         print(f"| {name} | {', '.join(sorted(answers))} | {' | '.join(cells)} |")
+    if options.out is not None:
+        write_rows(options.out, found, program=f"tools/{Path(__file__).name}")
 
 
 if __name__ == "__main__":

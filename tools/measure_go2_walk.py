@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.cli.demo_go2 import PROFILE, PROFILE_S
 from deal_hw.cli.virtual_go2 import walk
 from deal_hw.control.velocity_error import velocity_error
@@ -95,7 +96,7 @@ def main() -> None:
         rows.append(measure(policy, args.profile, seed, args.rounds))
         print(json.dumps(rows[-1]), flush=True)
     if args.out is not None:
-        document = {"policy": policy.digest, "rows": rows}
+        document = {**describe_call(f"tools/{Path(__file__).name}"), "policy": policy.digest, "rows": rows}
         args.out.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,7 @@ import numpy as np
 import tyro
 from stall_monitor import Account, watch_stalls
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.reader import Episode
@@ -105,13 +105,8 @@ def measure(config: MeasureLoopTiming) -> dict[str, Any]:
         "states_recorded": info.states,
         "cycles_recorded": info.cycles,
         "warnings": list(episode.warnings),
-        "machine": {
-            "processors": os.cpu_count(),
-            "kernel": platform.release(),
-            "python": platform.python_version(),
-            "load_before": load_before,
-            "load_after": os.getloadavg(),
-        },
+        **describe_call(f"tools/{Path(__file__).name}"),
+        "load_before": load_before,
     }
 
 

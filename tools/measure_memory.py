@@ -28,6 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from deal_hw.bench.rows import describe_call
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
 from deal_hw.calibration import Budget, Progress
@@ -238,7 +239,8 @@ def write(path: Path, settings: Mapping[str, Any], rows: Sequence[Mapping[str, A
     kept = before["rows"] if before.get("settings") == settings else []
     found = {row["method"]: row for row in (*kept, *rows)}
     lines = ",\n".join(json.dumps(found[m]) for m in (*SEARCHES, *WHOLES) if m in found)
-    path.write_text(f'{{"settings": {json.dumps(settings)},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
+    head = json.dumps({**describe_call(f"tools/{Path(__file__).name}"), "settings": settings})
+    path.write_text(f'{head[:-1]},\n"rows": [\n{lines}\n]}}\n', encoding="utf-8")
 
 
 def main() -> int:

@@ -1,8 +1,8 @@
 """Mutation run over the safety module and the exit path: `make mutation`.
 
 mutmut changes them in one place after another and runs their tests against each change. A change
-that no test notices survives. Survivors must stand in docs/safety-mutation.md with the reason why they may;
-any other fails the run.
+that no test notices survives. Survivors must stand in docs/results/safety-mutation.md with the reason why
+they may; any other fails the run.
 
 mutmut wants to own the directory it runs in, so the sources and the tests are copied into build/mutation; the
 rest of deal_hw (drivers) comes from the installed package.
@@ -21,7 +21,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 WORK = ROOT / "build" / "mutation"
-PAGE = ROOT / "docs" / "safety-mutation.md"
+PAGE = ROOT / "docs" / "results" / "safety-mutation.md"
 SETS = {
     "safety": (
         ("deal_hw/control/safety*.py", "deal_hw/control/leg_checks.py"),

@@ -175,18 +175,19 @@ def _last_name(node: ast.AST) -> str:
 
 def _arguments(call: ast.Call) -> Iterator[str]:
     for argument in call.args:
-        yield _words(argument)
+        yield words(argument)
     for keyword in call.keywords:
-        yield f"{keyword.arg}={_words(keyword.value)}"
+        yield f"{keyword.arg}={words(keyword.value)}"
 
 
-def _words(node: ast.AST) -> str:
+def words(node: ast.AST) -> str:
+    """Return the text of an argument, `{...}` for what comes in at run time."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return " ".join(f"x{node.value}x".split())[1:-1]
     if isinstance(node, ast.JoinedStr):
-        return "".join(_words(part) for part in node.values)
+        return "".join(words(part) for part in node.values)
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        return _words(node.left) + _words(node.right)
+        return words(node.left) + words(node.right)
     value = node.value if isinstance(node, ast.FormattedValue) else node
     return "{" + " ".join(ast.unparse(value).split()) + "}"
 

@@ -60,7 +60,7 @@ parameters:
   - {kind: dof_armature, elements: "*"}
   - {kind: servo_effort_limit, elements: gripper}
 """
-"""As in docs/example-so101.md."""
+"""As in docs/results/example-so101.md."""
 
 GO2_PARAMETERS = """\
 parameters:
@@ -72,7 +72,7 @@ parameters:
   - {kind: tendon_frictionloss, elements: ["*_rod", "*_strap"], nominal: 5, ratio: 10}
   - {kind: dof_armature, elements: "*_joint"}
 """
-"""As in docs/example-go2-suspended.md."""
+"""As in docs/results/example-go2-suspended.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ def _so101(ask: _Ask) -> Calibrate:
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
     held_out = ("step_response", "slow_precision")
-    files = ask.recorded("so101", (*fitted, *held_out), "docs/example-so101.md")
+    files = ask.recorded("so101", (*fitted, *held_out), "docs/results/example-so101.md")
     parameters = ask.folder / "so101.yaml"
     parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
     recordings = Recordings(
@@ -167,7 +167,7 @@ def _go2(ask: _Ask) -> Calibrate:
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
     name = "go2_suspended"
-    files = ask.recorded(name, ("train",), "docs/example-go2-suspended.md")
+    files = ask.recorded(name, ("train",), "docs/results/example-go2-suspended.md")
     parameters = ask.folder / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
     recordings = Recordings(

@@ -55,8 +55,8 @@ def prepare(
     """
     if recordings.model is None:
         raise ConfigurationError(
-            "bench real needs --model robot.xml --data rec.csv ... (docs/any-robot.md), and --holdout "
-            "other.csv or a part of each recording (--holdout-part)"
+            "bench real needs --model robot.xml --data rec.csv ... (docs/tutorials/your-robot.md), and "
+            "--holdout other.csv or a part of each recording (--holdout-part)"
         )
     overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=range_ratio)
     return prepare_model(

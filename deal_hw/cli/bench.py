@@ -63,7 +63,8 @@ class Bench:
 
     real: Path | None = None
     """first-answer: folder with so101/ and go2_suspended/, the recordings and columns.yaml of each as
-    docs/example-so101.md and docs/example-go2-suspended.md make them; without it these two are skipped."""
+    docs/results/example-so101.md and docs/results/example-go2-suspended.md make them; without it these two
+    are skipped."""
 
     problems: str = ""
     """first-answer, verdict: robots, comma separated; by default all. first-answer: double-pendulum,

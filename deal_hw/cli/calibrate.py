@@ -63,7 +63,7 @@ class Calibrate(Checked):
     Of a robot that deal-hw drives:  deal-hw calibrate runs/first/dataset
 
     Of any robot, from its MuJoCo model and recordings of joint positions and commands:
-    deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine    (docs/any-robot.md)
+    deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine    (docs/tutorials/your-robot.md)
     """
 
     dataset: tyro.conf.Positional[Path | None] = None
@@ -96,7 +96,8 @@ class Calibrate(Checked):
     simulator; by default the copy that the dataset keeps."""
 
     space: str = ""
-    """Which parameters of a robot of ours, such as k9 or k11 (docs/parameters.md); the first by default."""
+    """Which parameters of a robot of ours, such as k9 or k11 (docs/reference/parameters.md); the first by
+    default."""
 
     free: tuple[str, ...] = ()
     """Search exactly these parameters instead; the others keep their nominal values."""
@@ -109,7 +110,7 @@ class Calibrate(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Search each parameter within a factor RANGE-RATIO to either side of its nominal value. By default as
-    its parameter set says, mostly 5; with --model 20 for dry friction (docs/parameters.md), and with
+    its parameter set says, mostly 5; with --model 20 for dry friction (docs/reference/parameters.md), and with
     --parameters the ranges of that file."""
 
     latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
@@ -120,7 +121,8 @@ class Calibrate(Checked):
 
     spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
     """Leave out up to three samples in a row that jump away and come back, so many times farther than the
-    joint's fastest motion would take it (docs/calibration.md). A larger number leaves out less."""
+    joint's fastest motion would take it (docs/explanation/calibration.md). A larger number leaves out
+    less."""
 
     residual_std: tuple[str, ...] = ()
     """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Import(Checked):
-    """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/import.md."""
+    """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/how-to/import.md."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """CSV, NPZ or MCAP files, or folders of LeRobot datasets; of one robot."""

@@ -48,7 +48,7 @@ HELDOUT: Final = (
     (4.0, (0.3, 0.0, 0.3)),
     (6.0, (0.0, -0.2, 0.0)),
 )
-"""What only judges the calibration; gentle, or every second robot falls (docs/training.md)."""
+"""What only judges the calibration; gentle, or every second robot falls (docs/how-to/training.md)."""
 HELDOUT_S: Final = 8.0
 ATTEMPTS: Final = 3
 """Walks, until one to calibrate from is whole."""

@@ -208,7 +208,7 @@ class Emulate:
 
     firmware: Literal["python", "host", "avr"] = "python"
     """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
-    under simavr (docs/firmware.md)."""
+    under simavr (docs/how-to/firmware.md)."""
 
     link: Path | None = None
     """Make a symbolic link to the port here."""

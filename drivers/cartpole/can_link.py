@@ -1,4 +1,6 @@
-"""The cart-pole's messages as classic CAN frames: assets/cartpole.dbc and docs/protocol-cartpole-can.md.
+"""The cart-pole's messages as classic CAN frames (docs/reference/protocol-cartpole-can.md).
+
+The table of signals is assets/cartpole.dbc.
 
 A state takes five frames, a target three and an info five. The last frame of each carries a CRC over all of
 them: a sample that lost a frame, or mixes two samples, is refused as a whole.

@@ -115,7 +115,7 @@ class Doctor:
         for peer in seen.peers:
             yield Finding("dds", Level.OK, str(peer))
         for complaint in seen.complaints:
-            yield Finding("dds", Level.FAIL, complaint, "see docs/go2-dds.md")
+            yield Finding("dds", Level.FAIL, complaint, "see docs/how-to/go2-dds.md")
         typed: dict[str, set[str]] = {}
         for end in seen.endpoints:
             if end.topic in topics.TYPES:

@@ -363,7 +363,7 @@ def test_a_driver_that_fails_in_every_way_is_survived() -> None:
 
 
 def test_the_defaults_are_as_documented() -> None:
-    """docs/safety.md names them."""
+    """docs/explanation/safety.md names them."""
     assert PassiveConfig() == PassiveConfig(
         timeout_s=30.0, confirm_s=0.05, confirmations=3, reopen_s=0.5, silent_s=3.0
     )

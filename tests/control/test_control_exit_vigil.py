@@ -157,7 +157,7 @@ def test_the_vigil_keeps_nobody_alive() -> None:
 
 
 def test_the_limit_is_the_one_that_the_docs_name() -> None:
-    """docs/safety.md says 1 s."""
+    """docs/explanation/safety.md says 1 s."""
     rig = Rig()
     vigil = SupervisorVigil(rig.vigil._status, rig.clock, rig._on_silence)
     assert vigil._silence_ns == round(SUPERVISOR_SILENCE_S * 1e9) == 10**9

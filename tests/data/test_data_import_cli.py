@@ -145,7 +145,7 @@ def test_model_that_does_not_compile(recording: Path, tmp_path: Path) -> None:
 
 
 def test_command_line() -> None:
-    """The verbs parse as docs/import.md writes them."""
+    """The verbs parse as docs/how-to/import.md writes them."""
     settings, function = parse(
         "data", ["import", "a.csv", "b.csv", "--out", "x", "--columns", "m.yaml", "--dry-run"]
     )
@@ -158,8 +158,8 @@ def test_command_line() -> None:
 
 
 def test_page_shows_a_column_map_that_reads() -> None:
-    """The YAML block of docs/import.md is a column map."""
-    page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
+    """The YAML block of docs/how-to/import.md is a column map."""
+    page = (ROOT / "docs" / "how-to" / "import.md").read_text(encoding="utf-8")
     import yaml
 
     columns = parse_column_map(yaml.safe_load(page.partition("```yaml\n")[2].partition("```")[0]))

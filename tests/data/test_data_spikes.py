@@ -212,7 +212,9 @@ def test_real_recordings_have_none() -> None:
     """Two real robots, nine recordings, contacts among them: no sample is left out, with much to spare."""
     folder = os.environ.get("DEAL_HW_REAL_RECORDINGS")
     if not folder:
-        pytest.skip("DEAL_HW_REAL_RECORDINGS names no folder of real recordings (docs/example-so101.md)")
+        pytest.skip(
+            "DEAL_HW_REAL_RECORDINGS names no folder of real recordings (docs/results/example-so101.md)"
+        )
     files = sorted(Path(folder).glob("*/*.npz"))
     assert files, f"{folder} holds no */*.npz"
     for file in files:

@@ -24,7 +24,7 @@ from deal_hw.types import Status
 MS = 1_000_000
 NOMINAL = Settings(65536, 65536, 65536, 65536, 7, 0)
 CLOSED_LEFT, CLOSED_RIGHT = (True, False), (False, True)
-DOCS = (Path(__file__).parents[2] / "docs" / "firmware.md").read_text(encoding="utf-8")
+DOCS = (Path(__file__).parents[2] / "docs" / "how-to" / "firmware.md").read_text(encoding="utf-8")
 
 
 def missing() -> str:

@@ -16,7 +16,9 @@ from deal_hw.drivers.cartpole.can_link import FRAME, Angle, CanLink, CanMessage,
 from deal_hw.drivers.cartpole.protocol import MessageType, Result
 from deal_hw.errors import ConfigurationError, FrameError
 
-PAGE = (Path(__file__).parents[2] / "docs" / "protocol-cartpole-can.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "protocol-cartpole-can.md").read_text(
+    encoding="utf-8"
+)
 U8, U16, U32 = (st.integers(0, 2**n - 1) for n in (8, 16, 32))
 I16, I32 = (st.integers(-(2 ** (n - 1)), 2 ** (n - 1) - 1) for n in (16, 32))
 NAMES = st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=16)

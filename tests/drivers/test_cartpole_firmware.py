@@ -35,7 +35,7 @@ from deal_hw.errors import ConfigurationError
 needs_compiler = pytest.mark.skipif(
     shutil.which(native.compiler()) is None, reason="no C compiler: apt-get install gcc libc6-dev"
 )
-PAGE = Path(__file__).parents[2] / "docs" / "protocol-cartpole-serial.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "protocol-cartpole-serial.md"
 I32 = st.integers(-(2**31), 2**31 - 1)
 U16, U32 = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)
 NOMINAL = {p.name: p.nominal for p in parameter_space().parameters}
@@ -114,7 +114,7 @@ def cut(value: int, most: int) -> int:
 
 
 class IntegerServo(Servo):
-    """The arithmetic of servo.c, written again from docs/firmware.md."""
+    """The arithmetic of servo.c, written again from docs/how-to/firmware.md."""
 
     def __init__(self, settings: Settings) -> None:
         self._trims = settings

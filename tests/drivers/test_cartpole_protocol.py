@@ -14,7 +14,7 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.protocol import FrameDecoder, MessageType, Result
 from deal_hw.errors import FrameError, VersionMismatchError
 
-PAGE = Path(__file__).parents[2] / "docs" / "protocol-cartpole-serial.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "protocol-cartpole-serial.md"
 U8, U16, U32 = (st.integers(0, 2**n - 1) for n in (8, 16, 32))
 I16, I32 = (st.integers(-(2 ** (n - 1)), 2 ** (n - 1) - 1) for n in (16, 32))
 U64 = st.integers(0, 2**64 - 1)

@@ -1,4 +1,4 @@
-"""What travels beside a Zenoh message: the bytes of docs/protocol-go2.md, and who answers what."""
+"""What travels beside a Zenoh message: the bytes of docs/reference/protocol-go2.md, and who answers what."""
 
 from __future__ import annotations
 

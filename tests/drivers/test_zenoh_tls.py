@@ -27,7 +27,7 @@ def openssl(*arguments: object) -> None:
 
 
 def make_ca(folder: Path, name: str) -> Path:
-    """Make an authority as docs/go2-zenoh.md does, and return its certificate; its key lies beside it."""
+    """Make an authority as docs/how-to/go2-zenoh.md does; return its certificate, its key lies beside it."""
     openssl(
         "req",
         "-x509",

@@ -374,7 +374,7 @@ def commands_in_docs() -> list[str]:
     texts = [
         # A backslash at its end continues a line.
         re.sub(r"\\\n\s*", " ", path.read_text(encoding="utf-8"))
-        for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+        for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
     ]
     lines = [
         line for text in texts for line in re.findall(r"^(?: {4,}|\$ )(deal-hw [a-z].*)$", text, flags=re.M)

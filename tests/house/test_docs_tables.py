@@ -26,12 +26,12 @@ SOURCES = "\n".join(
         *(path for folder in FOLDERS for kind in ("*.py", "*.[ch]") for path in (ROOT / folder).rglob(kind)),
     ]
 )
-DATA_FORMAT = (ROOT / "docs" / "data-format.md").read_text(encoding="utf-8")
+DATA_FORMAT = (ROOT / "docs" / "reference" / "data-format.md").read_text(encoding="utf-8")
 
 
 def test_every_quantity_of_an_observation_has_its_unit() -> None:
     """The table of policies from elsewhere names exactly the known quantities."""
-    page = (ROOT / "docs" / "how-to-add.md").read_text(encoding="utf-8").partition("| quantity | of |")[2]
+    page = (ROOT / "docs" / "how-to" / "add.md").read_text(encoding="utf-8").partition("| quantity | of |")[2]
     rows = [line.split("|") for line in page.partition("\n\n")[0].splitlines()[2:]]
     assert sorted(re.findall(r"`(\w+)`", " ".join(row[1] for row in rows))) == sorted(get_args(Quantity))
     assert all(row[3].strip() for row in rows)
@@ -60,8 +60,8 @@ def test_bit_is_described(flag: enum.IntFlag) -> None:
 
 
 def test_each_safety_flag_is_described() -> None:
-    """The tables of docs/safety.md have a row for each flag, and none for others."""
-    page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
+    """The tables of docs/explanation/safety.md have a row for each flag, and none for others."""
+    page = (ROOT / "docs" / "explanation" / "safety.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \|", page[page.index("## What trips") :], flags=re.M)
     assert sorted(rows) == sorted(flag.name for flag in dataclasses.fields(SafetyFlags))
 
@@ -74,8 +74,12 @@ def test_readme_shows_each_job() -> None:
 
 
 def names_in_docs() -> list[tuple[str, str]]:
-    """Return every source file, class, method and constant that the docs name, with the document."""
-    paths = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+    """Return every source file, class, method and constant that the docs name, with the document.
+
+    What was measured names the sources of its own commit.
+    """
+    paths = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
+    paths = tuple(path for path in paths if path.parent.name != "measured")
     found = {
         (path.name, name)
         for path in paths

@@ -393,7 +393,9 @@ def test_baseline_is_what_writing_it_back_keeps(name: str, model: mujoco.MjModel
 
 def test_every_kind_has_its_row_in_the_docs() -> None:
     """Kind, element, unit, fields and what moves along are those of the table."""
-    text = (Path(__file__).resolve().parents[2] / "docs" / "parameters.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "parameters.md").read_text(
+        encoding="utf-8"
+    )
     rows = {
         cells[1].strip().strip("`"): [cell.strip() for cell in cells[2:6]]
         for cells in (line.split("|") for line in text.splitlines() if line.startswith("| `"))

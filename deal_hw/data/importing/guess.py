@@ -308,6 +308,6 @@ def _unguessed(channels: Channels, what: str) -> DatasetError:
     ]
     shown = ", ".join(names[:24]) + (", ..." if len(names) > 24 else "")
     return DatasetError(
-        f"{channels.path}: cannot tell {what}; say it in a column map (docs/import.md). Channels: "
+        f"{channels.path}: cannot tell {what}; say it in a column map (docs/how-to/import.md). Channels: "
         f"{shown or 'none'}"
     )

@@ -75,7 +75,7 @@ def load_tables(
     Raises:
         DatasetError: It cannot be read or understood.
     """
-    with reading(path, "a recording of a robot", "docs/import.md says what one holds"):
+    with reading(path, "a recording of a robot", "docs/how-to/import.md says what one holds"):
         tables = tables_of(read_channels(path), columns, joints, say)
     if not tables:
         raise DatasetError(f"{path} holds no recording")

@@ -1,6 +1,6 @@
 /* Firmware of the cart-pole, the part that every chip shares: C99, integers only, no heap, no library calls.
  *
- * docs/protocol-cartpole-serial.md is what it speaks, docs/firmware.md says how it is used. A port calls, every
+ * docs/reference/protocol-cartpole-serial.md is what it speaks, docs/how-to/firmware.md says how it is used. A port calls, every
  * millisecond: cartpole_receive() for each byte that came, cartpole_control(), and cartpole_report() where that
  * says so. Everything is in one struct, so that a host may run several.
  */

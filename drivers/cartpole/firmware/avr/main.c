@@ -1,4 +1,4 @@
-/* The cart-pole's firmware on an ATmega328P at 16 MHz (Arduino Uno, Nano). Pins: docs/firmware.md. */
+/* The cart-pole's firmware on an ATmega328P at 16 MHz (Arduino Uno, Nano). Pins: docs/how-to/firmware.md. */
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>

@@ -1,0 +1,132 @@
+"""The documentation site: pages that are made, links, nothing from other hosts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import check_site
+import docs_pages
+import pytest
+
+from deal_hw.cli.main import VERBS
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+
+
+def test_documents_link_to_files_that_exist() -> None:
+    """Relative links in the README, CONTRIBUTING and docs lead to a file, or to a page that is made."""
+    made = {(DOCS / place).resolve() for place in docs_pages.pages()}
+    broken = []
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")):
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
+            place = (path.parent / target).resolve()
+            if not place.exists() and place not in made:
+                broken.append(f"{path.relative_to(ROOT)}: {target}")
+    assert broken == []
+
+
+def test_each_page_is_in_the_navigation() -> None:
+    """Every page that is written or made has its place, and the navigation names no other."""
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    named = re.findall(r": ([\w/-]+\.md)$", text.partition("\nnav:")[2], flags=re.M)
+    pages = {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")} | set(docs_pages.pages())
+    assert sorted(named) == sorted(pages)
+
+
+def test_each_verb_is_in_the_reference() -> None:
+    """Each verb has its section with the line that runs, and its options have rows."""
+    page = docs_pages.cli_page()
+    for name, verb in VERBS.items():
+        assert f"\n## deal-hw {name}\n\n    deal-hw {verb.example}\n" in page
+    assert "| `--latency FLOAT` | Total latency [s] if it is known" in page.replace("&#91;", "[")
+    assert "\n### deal-hw data verify\n" in page
+    assert "None}" not in page and "--help" not in page.partition("## deal-hw collect")[2]
+
+
+def test_each_refusal_is_on_the_page_of_errors() -> None:
+    """Messages with exit status 2 are rows below their file; others are left out."""
+    table = """\
+# head
+a/b.py
+    f  DatasetError 2  {x} | is <odd>
+    g  ValueError -  no
+c.py
+    h  KeyError -  no
+"""
+    page = docs_pages.errors_page(table)
+    assert page.endswith(
+        "## a/b.py\n\n| error | message |\n|---|---|\n| `DatasetError` | … \\| is &lt;odd> |\n"
+    )
+
+
+def test_each_alarm_is_on_its_page() -> None:
+    """Alarms of all folders are found with their three parts, and causes beside them."""
+    found = docs_pages.alarms()
+    assert {path for path, *_ in found} >= {
+        "calib/uncertainty/intervals.py",
+        "calib/validation/verdict.py",
+        "deal_hw/workflows/calibration/best_so_far.py",
+    }
+    assert all(part.strip("… ") for row in found for part in row)
+    page = docs_pages.alarms_page()
+    assert "| Residuals are … times the sensor's noise…. | The model does not explain the recording: " in page
+    assert "\n| backlash | play in the gear | " in page
+
+
+def test_values_of_run_time_are_shortened() -> None:
+    """Braces inside an expression do not end it."""
+    assert docs_pages.shortened("a {', '.join({x})} b {y}") == "a … b …"
+
+
+def test_readme_is_short() -> None:
+    """It has at most 100 lines; results live in docs/results."""
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    """Return a site of two pages whose links hold."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "index.html").write_text('<a href="sub/a.html#x">a</a><a href="https://example.org/b">b</a>')
+    (tmp_path / "sub" / "a.html").write_text('<h1 id="x">x</h1><a href="../index.html">home</a>')
+    return tmp_path
+
+
+def test_a_site_in_order_has_no_complaint(site: Path) -> None:
+    """Links between pages, to headings and to other hosts are accepted."""
+    assert check_site.complaints(site) == []
+
+
+@pytest.mark.parametrize(
+    ("html", "complaint"),
+    [
+        ('<a href="b.html">', "b.html leads nowhere"),
+        ('<a href="sub/a.html#y">', "sub/a.html#y names no heading of that page"),
+        ('<a href="http://example.org">', "http://example.org is not https"),
+        ('<a href="https://example">', "https://example has no host name"),
+        (
+            '<script src="https://cdn.example.org/x.js">',
+            "loads https://cdn.example.org/x.js from another host",
+        ),
+        ('<link rel="stylesheet" href="//a.org/f.css">', "loads //a.org/f.css from another host"),
+        ('<p style="background: url(https://a.org/f.png)">', "loads https://a.org/f.png from another host"),
+        ('<img src="none.png">', "none.png leads nowhere"),
+    ],
+)
+def test_what_is_wrong_with_a_site_is_said(site: Path, html: str, complaint: str) -> None:
+    """Each kind of broken link or foreign load has its line."""
+    (site / "index.html").write_text(html)
+    assert check_site.complaints(site) == [f"index.html: {complaint}"]
+
+
+def test_a_style_sheet_loads_nothing_foreign(site: Path) -> None:
+    """Fonts of other hosts are found in style sheets, too."""
+    (site / "a.css").write_text("@import url('https://fonts.example.org/css'); a { background: url(a.png) }")
+    assert check_site.complaints(site) == ["a.css: loads https://fonts.example.org/css from another host"]
+
+
+def test_no_site_is_a_complaint(tmp_path: Path) -> None:
+    """An empty folder does not pass for a site."""
+    assert "make docs" in check_site.complaints(tmp_path)[0]

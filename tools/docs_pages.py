@@ -1,0 +1,327 @@
+"""Pages of the site that are made from the sources while `mkdocs build` runs (a hook of mkdocs.yml).
+
+- ``reference/cli.md``: every verb and option, from the parser of the command line;
+- ``reference/api.md``: every public name of ``deal_hw``, then the contracts, for mkdocstrings;
+- ``reference/alarms.md``: every alarm of a calibration, from the calls that make one;
+- ``reference/errors.md``: every refusal, from tests/house/refusals.txt;
+- ``contributing.md`` and ``changelog.md``: CONTRIBUTING.md and CHANGELOG.md with links that hold in the site.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import re
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+if str(Path(__file__).parent) not in sys.path:  # mkdocs loads a hook by its path.
+    sys.path.append(str(Path(__file__).parent))
+
+from refusals import words
+
+ROOT = Path(__file__).resolve().parents[1]
+ALARM_FOLDERS = ("calib", "deal_hw")
+REFUSALS = ROOT / "tests" / "house" / "refusals.txt"
+
+CONTRACTS = {
+    "Vocabulary": ("types", "errors", "clock"),
+    "Contracts": (
+        "robot",
+        "transport",
+        "description",
+        "policy",
+        "parameters",
+        "calibration",
+        "training",
+    ),
+    "Suites that a new robot, transport, method or trainer inherits": (
+        "testing.robot_suite",
+        "testing.transport_suite",
+        "testing.method_suite",
+        "testing.trainer_suite",
+    ),
+}
+"""Modules of the API page, below the functions of ``deal_hw`` itself."""
+
+PLAIN = {"", "required"}
+"""Defaults that are no values."""
+
+Sections = dict[str, list[tuple[str, str, str]]]
+"""Title of a group of options -> option, text, default."""
+
+
+def cell(text: str) -> str:
+    """Return text for a cell of a Markdown table: one line, without HTML, pages of the docs as links."""
+    text = re.sub(r"\s+", " ", text).strip()
+    text = (
+        text.replace("&", "&amp;")
+        .replace("<", "&lt;")
+        .replace("|", "\\|")
+        .replace("*", "\\*")
+        .replace("[", "&#91;")
+    )
+    return re.sub(r"docs/((?:[\w-]+/)?([\w-]+))\.md", r"[\2](../\1.md)", text)
+
+
+def code(text: str) -> str:
+    """Return text as code in a cell of a Markdown table."""
+    return "`" + re.sub(r"\s+", " ", text).replace("`", "'").replace("|", "\\|") + "`"
+
+
+def options(parser: argparse.ArgumentParser) -> Sections:
+    """Return the groups of a parser with a row for each argument and option."""
+    sections: Sections = {}
+    for group in parser._action_groups:
+        for action in group._group_actions:
+            if type(action).__name__ in {"_HelpAction", "_SubParsersAction"}:  # tyro has its own argparse.
+                continue
+            text = action.help or ""
+            match = re.search(r"\s*\((required|default: .*)\)\s*$", text, flags=re.S)
+            default = match[1].removeprefix("default: ") if match else ""
+            # tyro shows an empty string, tuple or None as '', nothing or None.
+            default = "" if default in {"None", "''"} else default
+            name = max(action.option_strings, key=len, default=action.dest.upper())
+            name = f"{name} {metavar(action)}".strip() if action.option_strings else name
+            title = "" if group.title in {"positional arguments", "options"} else str(group.title)
+            sections.setdefault(title.removesuffix(" options"), []).append(
+                (name, text[: match.start()] if match else text, default)
+            )
+    return sections
+
+
+def metavar(action: argparse.Action) -> str:
+    """Return what an option takes, without tyro's word for None."""
+    shown = str(action.metavar or "")
+    return re.sub(r"\{None\}\|", "", shown)
+
+
+def sub_verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of a verb's sub-verbs."""
+    return {
+        name: sub
+        for action in parser._actions
+        if type(action).__name__ == "_SubParsersAction"
+        for name, sub in action.choices.items()
+    }
+
+
+def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
+    """Return the parser of a dataclass of settings, as the command line builds it."""
+    import tyro
+
+    with warnings.catch_warnings():
+        # tyro warns that this function will go; constraints.txt pins the version that has it.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return tyro.extras.get_parser(settings, prog=prog, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
+    """Yield the lines of a verb: what it does, its options, then its sub-verbs."""
+    for paragraph in re.split(r"\n\s*\n", (parser.description or "").strip()):
+        yield from (cell(paragraph), "")
+    for title, rows in options(parser).items():
+        if title:
+            yield from (f"{'#' * (level + 1)} {parser.prog}: {title} {{ data-toc-label='{title}' }}", "")
+        yield from ("| option | meaning | default |", "|---|---|---|")
+        yield from (
+            f"| {code(name)} | {cell(text)} | {default if default in PLAIN else code(default)} |"
+            for name, text, default in rows
+        )
+        yield ""
+    for name, sub in sub_verbs(parser).items():
+        yield from (f"{'#' * (level + 1)} {parser.prog} {name}", "")
+        yield from describe(sub, level + 1)
+
+
+def cli_page() -> str:
+    """Return the reference of the command line."""
+    main: ModuleType = importlib.import_module("deal_hw.cli.main")
+    lines = [
+        "# Command line",
+        "",
+        "This page is made from the command line's own parser. `deal-hw VERB --help` prints the same.",
+        "",
+        "| verb | what it does | extra |",
+        "|---|---|---|",
+    ]
+    lines += [
+        f"| [`{name}`](#deal-hw-{name}) | {cell(verb.help)} | {code(verb.extra) if verb.extra else ''} |"
+        for name, verb in main.VERBS.items()
+    ]
+    lines += [
+        "",
+        "The extra is what `pip install 'deal-hw[EXTRA]'` must have installed. With each verb, `--traceback` "
+        "shows where an error came from.",
+        "",
+        f"Exit status: {main.EXIT_OK} done; {main.EXIT_ERROR} refused, and one line says why; "
+        f"{main.EXIT_INTERRUPTED} stopped by Ctrl-C; {main.EXIT_PIPE} nobody reads the output any more.",
+        "",
+    ]
+    for name, verb in main.VERBS.items():
+        settings = getattr(importlib.import_module(verb.module), verb.config)
+        lines += [f"## deal-hw {name}", "", f"    deal-hw {verb.example}", ""]
+        lines += describe(verb_parser(settings, f"deal-hw {name}"), 2)
+    return "\n".join(lines)
+
+
+def public_names(package: ModuleType) -> list[str]:
+    """Return the full names of the functions and classes that a package offers."""
+    values = [getattr(package, name) for name in dir(package) if not name.startswith("_")]
+    own = [value for value in values if getattr(value, "__module__", "").startswith("deal_hw.")]
+    functions = [value for value in own if not isinstance(value, type)]
+    classes = [value for value in own if isinstance(value, type)]
+    return [f"{value.__module__}.{value.__qualname__}" for value in (*functions, *classes)]
+
+
+def api_page() -> str:
+    """Return the reference of the Python API, for mkdocstrings."""
+    import deal_hw
+
+    lines = [
+        "# Python API",
+        "",
+        "[From Python](../how-to/python.md) shows how to use it. This page is made from the docstrings.",
+        "",
+        "## deal_hw",
+        "",
+    ]
+    for name in public_names(deal_hw):
+        heading = f"deal_hw.{name.rpartition('.')[2]}"
+        lines += [
+            f"::: {name}",
+            "    options:",
+            f"      heading: {heading}",
+            f"      toc_label: {heading}",
+            "",
+        ]
+    for title, modules in CONTRACTS.items():
+        lines += [f"## {title}", ""]
+        for module in modules:
+            lines += [f"::: deal_hw.{module}", ""]
+    return "\n".join(lines)
+
+
+def errors_page(table: str) -> str:
+    """Return the page of refusals.
+
+    Args:
+        table: The text of tests/house/refusals.txt.
+    """
+    lines = [
+        "# Error messages",
+        "",
+        "Every message with which a command of deal-hw ends (exit status 2), by the file that raises it. "
+        "`…` stands for what was given. A message says what was given, what is allowed and what to do. "
+        "[Troubleshooting](../troubleshooting.md) has the frequent ones with more words. Search this page "
+        "for a part of the message that does not change.",
+        "",
+    ]
+    path, rows = "", []
+    for line in [*table.splitlines(), ""]:
+        if line.startswith("#"):
+            continue
+        if not line.startswith(" "):
+            if rows:
+                lines += [f"## {path}", "", "| error | message |", "|---|---|", *rows, ""]
+            path, rows = line.strip(), []
+            continue
+        if match := re.match(r"\s+.+?  (\w+) 2  (.+)$", line):
+            rows.append(f"| `{match[1]}` | {cell(shortened(match[2]))} |")
+    return "\n".join(lines)
+
+
+def shortened(text: str) -> str:
+    """Return text with an ellipsis for each value that comes in at run time, whatever its expression."""
+    out, depth = [], 0
+    for sign in text:
+        depth += sign == "{"
+        if not depth:
+            out.append(sign)
+        elif sign == "}":
+            depth -= 1
+            out += ["…"] if not depth else []
+    return "".join(out)
+
+
+def alarms() -> list[tuple[str, ...]]:
+    """Return every alarm: the file that raises it, what was seen, what it means, what to do."""
+    found = []
+    for folder in ALARM_FOLDERS:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Alarm" and node.args:
+                    parts = [shortened(words(part)) for part in node.args]
+                    # Without words of its own, an alarm is copied from a file or from the table of causes.
+                    if parts[0].strip("…"):
+                        parts = [part if part.strip("…") else "(the message says it)" for part in parts]
+                        found.append((path.relative_to(ROOT).as_posix(), *parts))
+    return found
+
+
+def alarms_page() -> str:
+    """Return the page of alarms, causes of an unexplained residual behind them."""
+    from deal_hw.calib.validation.diagnosis import LOOKS
+
+    lines = [
+        "# Alarms",
+        "",
+        "An alarm is a reason to distrust a calibration. The terminal, the report and `result.json` show "
+        "it in three parts: what was seen, what it means, what to do. This page is made from the code. `…` "
+        "stands for a name or a number. [Calibration](../explanation/calibration.md#alarms) has the limits.",
+        "",
+        "| what was seen | what it means | what to do |",
+        "|---|---|---|",
+        *(f"| {cell(seen)} | {cell(means)} | {cell(do)} |" for _, seen, means, do in alarms()),
+        "",
+        "## Causes of a residual above the noise",
+        "",
+        "Where the model does not explain the recording, deal-hw looks for a cause. Its alarm names one "
+        "of these, the share of the residual that it explains, and the joints.",
+        "",
+        "| cause | the residual looks like | what it means | what to do |",
+        "|---|---|---|---|",
+        *(
+            f"| {cause} | {cell(looks)} | {cell(means)} | {cell(do.replace('{}', '…'))} |"
+            for cause, (looks, means, do) in LOOKS.items()
+        ),
+    ]
+    return "\n".join(lines)
+
+
+def moved(name: str) -> str:
+    """Return a page of the repository's root with links that hold in the site."""
+    text = (ROOT / name).read_text(encoding="utf-8")
+    return text.replace("](docs/", "](").replace("](CHANGELOG.md)", "](changelog.md)")
+
+
+def pages() -> dict[str, str]:
+    """Return every page that is made: its place in the site and its Markdown."""
+    return {
+        "reference/cli.md": cli_page(),
+        "reference/api.md": api_page(),
+        "reference/alarms.md": alarms_page(),
+        "reference/errors.md": errors_page(REFUSALS.read_text(encoding="utf-8")),
+        "contributing.md": moved("CONTRIBUTING.md"),
+        "changelog.md": moved("CHANGELOG.md"),
+    }
+
+
+def on_env(env: Any, config: Any, files: Any) -> Any:
+    """Let the search of pages on disk run by our own script: the plugin names one of another host."""
+    config.extra["polyfills"] = ["assets/search_worker.js"]
+    return env
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages; mkdocs calls this once it has listed docs/."""
+    from mkdocs.structure.files import File
+
+    for place, text in pages().items():
+        files.append(File.generated(config, place, content=text))
+    return files
