@@ -110,8 +110,8 @@ class Calibrate(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Search each parameter within a factor RANGE-RATIO to either side of its nominal value. By default as
-    its parameter set says, mostly 5; with --model 20 for dry friction (docs/reference/parameters.md), and with
-    --parameters the ranges of that file."""
+    its parameter set says, mostly 5; with --model 20 for dry friction (docs/reference/parameters.md), and
+    with --parameters the ranges of that file."""
 
     latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
