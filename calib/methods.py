@@ -30,7 +30,7 @@ METHODS: dict[str, str] = {
     "bo-critic": "deal_hw.calib.baselines.bayesian:critic_return",
     "cma": "deal_hw.calib.baselines.cma_es:Cma",
     "gauss-newton": "deal_hw.calib.baselines.gauss_newton:GaussNewton",
-    "least-squares": "deal_hw.calib.baselines.least_squares:LeastSquares",
+    "least-squares": "deal_hw.calib.baselines.least_squares:LeastSquaresBaseline",
     "least-squares-multistart": "deal_hw.calib.baselines.least_squares:MultiStartLeastSquares",
     "ekf": "deal_hw.calib.baselines.ekf:Ekf",
     "mujoco-sysid": "deal_hw.calib.baselines.sysid:MujocoSysid",
@@ -95,8 +95,8 @@ def make_method(name: str, *, refine: bool = False) -> CalibrationMethod[Problem
     search = cast("CalibrationMethod[Problem]", getattr(importlib.import_module(module), attribute)())
     if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
         return search
-    from deal_hw.calib.pipeline import Calibration
+    from deal_hw.calib.pipeline import CalibrationPipeline
     from deal_hw.calib.validation.verdict import Validation
 
     # Who names a search wants it run, also where the model's own values could be refined without one.
-    return Calibration(search, name, Validation(local_first=name == "default"))
+    return CalibrationPipeline(search, name, Validation(local_first=name == "default"))

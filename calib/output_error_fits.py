@@ -27,7 +27,7 @@ from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.output_error import SHORT, OutputErrorFit, Recipe, fit_output_error, prediction_rmse
 from deal_hw.calib.fit.refinement import SETTINGS as REFINEMENT
 from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.pipeline import Calibration, CalibrationRun, Fits, Outcome
+from deal_hw.calib.pipeline import CalibrationPipeline, CalibrationRun, FitOutcome, Fits
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.uncertainty.intervals import (
     MISMATCH,
@@ -129,7 +129,7 @@ class OutputErrorFits(Fits):
 
     settings: OutputErrorSettings = field(default_factory=OutputErrorSettings)
 
-    def best(self, run: CalibrationRun) -> Outcome:
+    def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the one that predicts best. See :meth:`Fits.best`."""
         settings, problem = self.settings, run.problem
         if run.settings.cross_validation:
@@ -194,7 +194,7 @@ class OutputErrorFits(Fits):
             alarms=(*known.alarms, *self._unexplained(chi2)),
             null_directions=tuple(dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))),
         )
-        return Outcome(
+        return FitOutcome(
             searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
         )
 
@@ -307,22 +307,22 @@ class OutputErrorFits(Fits):
         return (mismatch(chi2, f" over {seconds:g} s from {kind} start states"),)
 
 
-def output_error_method(search: CalibrationMethod[Problem] | None = None) -> Calibration:
+def output_error_method(search: CalibrationMethod[Problem] | None = None) -> CalibrationPipeline:
     """Return `output-error`: output-error fits by cross-validation, after the local fit and a search.
 
     Args:
         search: The search; `eki` by default.
     """
-    return Calibration(search or Eki(), "output-error", fits=OutputErrorFits())
+    return CalibrationPipeline(search or Eki(), "output-error", fits=OutputErrorFits())
 
 
-def local() -> Calibration:
+def local() -> CalibrationPipeline:
     """Return `local`: the fits over short and then long windows alone, from the model's own values.
 
     For a robot whose model is near (within a factor two or so) and in which motion is damped: it costs a
     twentieth of a search. What its residual does not explain it says like `output-error`.
     """
-    return Calibration(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
+    return CalibrationPipeline(Nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
 
 
 GAIT = OutputErrorSettings(
@@ -344,13 +344,13 @@ FORCES = ("servo_stiffness", "servo_damping", "dof_frictionloss")
 """Kinds of parameters that scale with all forces."""
 
 
-def gait() -> Calibration:
+def gait() -> CalibrationPipeline:
     """Return `gait`: short, robust fits of a robot that walks, from the model's own values.
 
     Smoothed start states, and none that are fitted: each landing of a foot would be explained by them.
     """
     settings = Validation(local_first=False, cross_validation=False)
-    return Calibration(Nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
+    return CalibrationPipeline(Nominal(), "gait", settings, fits=OutputErrorFits(GAIT))
 
 
 def _scaled_together(problem: Problem, known: Uncertainty, theta: FloatArray, std: float) -> Uncertainty:

@@ -1,9 +1,9 @@
 """The whole calibration: checks, a local fit, a search where that is not the answer, uncertainty, validation.
 
-Simulated or real, fixed or floating base: the same :class:`Calibration`. How it goes on where the local fit
-does not explain the recordings is a strategy, :class:`Fits`. :class:`Refinement` searches and refines down to
-the sensors' noise; :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits predictions of a robot that
-no model explains.
+Simulated or real, fixed or floating base: the same :class:`CalibrationPipeline`. How it goes on where the
+local fit does not explain the recordings is a strategy, :class:`Fits`. :class:`Refinement` searches and refines
+down to the sensors' noise; :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits predictions of a
+robot that no model explains.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class RestartSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class FitOutcome:
     """What a way of fitting ended with.
 
     Attributes:
@@ -133,7 +133,7 @@ class Fits(abc.ABC):
     """A way to go on where the local fit is not the answer: searches, candidate fits, and the choice."""
 
     @abc.abstractmethod
-    def best(self, run: CalibrationRun) -> Outcome:
+    def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit, choose, and say what is known."""
 
 
@@ -143,7 +143,7 @@ DIVERGED = (
 )
 
 
-class Calibration(CalibrationMethod[Problem]):
+class CalibrationPipeline(CalibrationMethod[Problem]):
     """A calibration in stages, ordered by what they cost.
 
     Args:
@@ -241,7 +241,7 @@ class Refinement(Fits):
 
     restarts: RestartSettings = field(default_factory=RestartSettings)
 
-    def best(self, run: CalibrationRun) -> Outcome:
+    def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, refine, let cross-validation say whether the refinement helps. See :meth:`Fits.best`."""
         settings, left, floating = self.restarts, run.budget.generations, run.problem.robot.base is not None
         best: tuple[CalibrationResult, Refined] | None = None
@@ -303,7 +303,7 @@ def to_the_noise(
     refined: Refined,
     choice: Choice | None = None,
     restarts: int = 0,
-) -> Outcome:
+) -> FitOutcome:
     """Scan the latency, say what is known, check it.
 
     Args:
@@ -347,7 +347,7 @@ def to_the_noise(
             "chi2": [p.chi2 for p in scan.refined],
             "weights": scan.weights.tolist(),
         }
-    return Outcome(
+    return FitOutcome(
         searched=searched,
         theta=refined.theta,
         latency_s=refined.latency_s,

@@ -24,7 +24,7 @@ Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
 RESULT_FILE = "result.json"
 RESULT_FORMAT = "deal_hw.calibration_result/1"
-Verdict = Literal["identifiable", "weak", "not identifiable"]
+Identifiability = Literal["identifiable", "weak", "not identifiable"]
 ProblemT = TypeVar("ProblemT", contravariant=True)
 
 
@@ -149,7 +149,7 @@ class CalibrationResult:
     interval: FloatArray
     covariance: FloatArray | None = None
     population: FloatArray | None = None
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[Identifiability, ...] = ()
     null_directions: tuple[str, ...] = ()
     latency_s: float = 0.0
     latency_interval_s: tuple[float, float] = (0.0, 0.0)
@@ -219,8 +219,8 @@ class CalibrationResult:
         rows = [object_of(values["parameters"][name], f"parameter {shown(name)}") for name in space.names]
         covariance = values["covariance"]
         verdicts = tuple(row["verdict"] for row in rows) if rows and rows[0]["verdict"] else ()
-        if unknown := [v for v in verdicts if v not in get_args(Verdict)]:
-            raise UnknownNameError("verdict", shown(unknown[0]), get_args(Verdict))
+        if unknown := [v for v in verdicts if v not in get_args(Identifiability)]:
+            raise UnknownNameError("verdict", shown(unknown[0]), get_args(Identifiability))
         low_s, high_s = numbers(values["latency_interval_s"], "latency_interval_s", (2,), finite=False)
         return cls(
             method=texts([values["method"]], "method")[0],

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 if str(Path(__file__).parent) not in sys.path:  # mkdocs loads a hook by its path.
     sys.path.append(str(Path(__file__).parent))
@@ -103,12 +103,11 @@ def metavar(action: argparse.Action) -> str:
 
 def sub_verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """Return the parsers of a verb's sub-verbs."""
-    return {
-        name: sub
-        for action in parser._actions
-        if type(action).__name__ == "_SubParsersAction"
-        for name, sub in action.choices.items()
-    }
+    found: dict[str, argparse.ArgumentParser] = {}
+    for action in parser._actions:
+        if type(action).__name__ == "_SubParsersAction":
+            found |= cast("dict[str, argparse.ArgumentParser]", action.choices)
+    return found
 
 
 def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
@@ -118,7 +117,8 @@ def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
     with warnings.catch_warnings():
         # tyro warns that this function will go; constraints.txt pins the version that has it.
         warnings.simplefilter("ignore", DeprecationWarning)
-        return tyro.extras.get_parser(settings, prog=prog, config=(tyro.conf.FlagCreatePairsOff,))
+        found: Any = tyro.extras.get_parser(settings, prog=prog, config=(tyro.conf.FlagCreatePairsOff,))
+    return cast(argparse.ArgumentParser, found)
 
 
 def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
@@ -222,7 +222,8 @@ def errors_page(table: str) -> str:
         "for a part of the message that does not change.",
         "",
     ]
-    path, rows = "", []
+    path = ""
+    rows: list[Any] = []
     for line in [*table.splitlines(), ""]:
         if line.startswith("#"):
             continue

@@ -153,7 +153,7 @@ class OneShotSearch(Search, abc.ABC):
 
 
 @dataclass(frozen=True)
-class LeastSquares(OneShotSearch):
+class LeastSquaresBaseline(OneShotSearch):
     """Single-start least squares on the one-step prediction error; nothing is drawn."""
 
     name = "least-squares"

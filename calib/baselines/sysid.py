@@ -17,7 +17,7 @@ from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.base import SearchLog
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.recordings.sysid_adapter import Recording, check_space, identify, require_sysid
+from deal_hw.sim.recordings.sysid_adapter import SysidRecording, check_space, identify, require_sysid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +89,7 @@ def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: st
     if settings.window_s is not None:
         ticks = max(round(settings.window_s * problem.robot.description.control_rate_hz), 1)
     recordings = [
-        Recording(problem.episodes[d.episode], d.windows, d.start_position, d.start_velocity)
+        SysidRecording(problem.episodes[d.episode], d.windows, d.start_position, d.start_velocity)
         for d in cut(problem, ticks)
     ]
     space = problem.space

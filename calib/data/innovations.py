@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Prediction, Problem, WindowData
+from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
@@ -59,7 +59,7 @@ def cut(problem: Problem, ticks: int) -> list[WindowData]:
 
 
 def early_setpoints(
-    batch: ServoBatch, episode: Episode, latency_s: FloatArray, advance_s: float = 0.008
+    batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray, advance_s: float = 0.008
 ) -> FloatArray:
     """Return set-points like :func:`setpoints`, but for latencies that may be slightly negative.
 
@@ -81,7 +81,7 @@ def predict(
     data: WindowData,
     position: FloatArray | None = None,
     velocity: FloatArray | None = None,
-) -> Prediction:
+) -> MemberPrediction:
     """Predict windows like :meth:`Problem.predict`, but for latencies that may be slightly negative."""
     batch = problem.batch(len(members.theta))
     batch.set_parameters(members.theta)
@@ -94,7 +94,7 @@ class Whitening:
     """What whitens the windows of one episode.
 
     Attributes:
-        reference: Prediction of the simulator around which was linearised, (W, H, M).
+        reference: MemberPrediction of the simulator around which was linearised, (W, H, M).
         factor: Inverse Cholesky factors of Sigma, (W, H M, H M).
         root: J sqrt(P0): what one standard deviation of each start coordinate does, (W, H M, 2 C).
         std: Standard deviations of a start state, (2 C,).

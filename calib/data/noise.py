@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import savgol_coeffs
 
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 MAD_TO_STD = 1.4826022185056018
@@ -193,7 +193,7 @@ class StartStates:
 
 
 def smooth_states(
-    episode: Episode, noise_std: FloatArray, rotation: slice, settings: DataSettings = SETTINGS
+    episode: SampledEpisode, noise_std: FloatArray, rotation: slice, settings: DataSettings = SETTINGS
 ) -> StartStates:
     """Estimate the state at every sample.
 

@@ -31,7 +31,7 @@ from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
-from deal_hw.sim.recordings.episode import Episode, fill_gaps
+from deal_hw.sim.recordings.episode import SampledEpisode, fill_gaps
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray
 
@@ -65,7 +65,7 @@ class WindowData:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class MemberPrediction:
     """What N members predict of W windows of H samples; NaN where a member diverged.
 
     Attributes:
@@ -131,7 +131,7 @@ class Problem:
 
     robot: RobotModel
     space: ParameterSpace
-    episodes: Sequence[Episode]
+    episodes: Sequence[SampledEpisode]
     threads: int | None = None
     latency_range_s: tuple[float, float] = LATENCY_RANGE_S
     fixed_latency_s: float | None = None
@@ -229,7 +229,7 @@ class Problem:
         ]
         return other
 
-    def on(self, episodes: Sequence[Episode], known_std: FloatArray | None) -> Problem:
+    def on(self, episodes: Sequence[SampledEpisode], known_std: FloatArray | None) -> Problem:
         """Return the problem of other recordings; noise is estimated anew, simulators are shared.
 
         Args:
@@ -364,7 +364,7 @@ class Problem:
         data: WindowData,
         position: FloatArray | None = None,
         velocity: FloatArray | None = None,
-    ) -> Prediction:
+    ) -> MemberPrediction:
         """Predict windows with N parameter vectors.
 
         Args:
@@ -387,7 +387,7 @@ class Problem:
         position: FloatArray | None = None,
         velocity: FloatArray | None = None,
         force: FloatArray | None = None,
-    ) -> Prediction:
+    ) -> MemberPrediction:
         """Predict windows with members whose parameters are set, along given set-points, (N, S, A).
 
         Forces on the coordinates, (N, W, H * stride, C), are those of device periods.
@@ -403,9 +403,9 @@ class Problem:
         )
         C, channels = x.shape[-1], self.channels
         if np.array_equal(channels, np.arange(C)):
-            return Prediction(x, x, v)
+            return MemberPrediction(x, x, v)
         positions, velocities = x[..., channels[channels < C]], v[..., channels[channels >= C] - C]
-        return Prediction(np.concatenate([positions, velocities], axis=-1), x, v)
+        return MemberPrediction(np.concatenate([positions, velocities], axis=-1), x, v)
 
 
 def samples_in(problem: Problem, seconds: float) -> int:

@@ -14,7 +14,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps
 from deal_hw.sim.engine.servo import slew
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
 
@@ -107,7 +107,7 @@ def control_ticks(problem: Problem, index: int, most: int | None = None, history
     )
 
 
-def _send(batch: ServoBatch, episode: Episode, at: int) -> None:
+def _send(batch: ServoBatch, episode: SampledEpisode, at: int) -> None:
     batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
 
 
@@ -168,7 +168,7 @@ def policy_of(problem: Problem) -> PopulationPolicy:
 
 
 def _replay(
-    batch: ServoBatch, episode: Episode, members: Members, ticks: Ticks
+    batch: ServoBatch, episode: SampledEpisode, members: Members, ticks: Ticks
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     path = early_setpoints(batch, episode, members.latency_s)
     N, T, J = batch.count, len(ticks), episode.position.shape[1]
@@ -188,7 +188,7 @@ def _replay(
 
 
 def _closed_loop(
-    batch: ServoBatch, episode: Episode, members: Members, ticks: Ticks, policy: PopulationPolicy
+    batch: ServoBatch, episode: SampledEpisode, members: Members, ticks: Ticks, policy: PopulationPolicy
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     N, T, J = batch.count, len(ticks), episode.position.shape[1]
     A, lead, first = episode.target.shape[1], ticks.lead, int(ticks.start[0])

@@ -30,7 +30,7 @@ from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 
@@ -278,7 +278,7 @@ def _amount(space: ParameterSpace, k: int, std: float) -> str:
 def next_recordings(
     robot: RobotModel,
     result: CalibrationResult,
-    episodes: Sequence[Episode],
+    episodes: Sequence[SampledEpisode],
     *,
     balance: Callable[[], Behaviour] | None = None,
     settings: AdviceSettings = SETTINGS,
@@ -322,7 +322,7 @@ def _without(names: Sequence[str], why: str) -> tuple[Advice, ...]:
 def _described(
     robot: RobotModel,
     result: CalibrationResult,
-    episodes: Sequence[Episode],
+    episodes: Sequence[SampledEpisode],
     settings: AdviceSettings,
     threads: int | None,
 ) -> RobotDescription:

@@ -21,7 +21,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
 
@@ -58,7 +58,7 @@ class Trial:
         clipped: Commands that the safety filter changed.
     """
 
-    episode: Episode
+    episode: SampledEpisode
     tripped: str
     clipped: int
 
@@ -148,7 +148,7 @@ class TrialRunner:
             return np.repeat([getattr(sent[n], name) for sent in loop.sent], self._period, axis=0)
 
         start = x[0][list(self._robot.description.actuated_index)]
-        episode = Episode(
+        episode = SampledEpisode(
             step_s=self._device_s,
             sample=np.arange(len(x)) * self._stride,
             position=x,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Prediction, Problem, WindowData
+from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.types import FloatArray
 
 
@@ -398,7 +398,9 @@ class Shooting:
         position, velocity = zip(*chosen, strict=True)
         return Point(point.value, position, velocity)
 
-    def _predict(self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray) -> Prediction:
+    def _predict(
+        self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray
+    ) -> MemberPrediction:
         theta = self.problem.space.from_scale(values[:, :-1])
         return self.problem.predict(theta, np.maximum(values[:, -1], 0.0), data, x, v)
 

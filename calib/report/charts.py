@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from deal_hw.calib.report.gather import Overlay, Residuals
+from deal_hw.calib.report.gather import OverlayPanel, Residuals
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
@@ -202,7 +202,7 @@ def envelope(time: FloatArray, values: FloatArray, buckets: int = 350) -> tuple[
     return time[order], values[order]
 
 
-def overlay(shown: Overlay, panels: int = SETTINGS.panels) -> Markup:
+def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
     """Draw real, nominal and calibrated motion, one panel a channel.
 
     Args:

@@ -13,7 +13,7 @@ from deal_hw.calib.data.problem import Problem, WindowData, longest_windows, sam
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 
@@ -37,7 +37,7 @@ SETTINGS = GatherSettings()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Overlay:
+class OverlayPanel:
     """One recording beside open-loop predictions that restart from the measured state.
 
     Attributes:
@@ -96,7 +96,7 @@ class ReportInputs:
 
     robot: str
     result: CalibrationResult
-    overlays: tuple[Overlay, ...] = ()
+    overlays: tuple[OverlayPanel, ...] = ()
     residuals: tuple[Residuals, ...] = ()
     tick_s: float | None = None
     telemetry: tuple[str, ...] = ()
@@ -106,8 +106,8 @@ class ReportInputs:
 def gather(
     robot: RobotModel,
     result: CalibrationResult,
-    episodes: Sequence[Episode],
-    holdout: Sequence[Episode] = (),
+    episodes: Sequence[SampledEpisode],
+    holdout: Sequence[SampledEpisode] = (),
     *,
     telemetry: Sequence[str] = (),
     window_s: float = SETTINGS.window_s,
@@ -124,7 +124,7 @@ def gather(
         window_s: Drawn predictions restart this often [s]; where no recording is as long, more often.
         threads: Simulation threads.
     """
-    overlays: list[Overlay] = []
+    overlays: list[OverlayPanel] = []
     residuals: list[Residuals] = []
     left_out: list[str] = []
     for group, heldout in ((episodes, False), (holdout, True)):
@@ -152,7 +152,7 @@ def gather(
 
 def _overlays(
     problem: Problem, result: CalibrationResult, titles: Sequence[str], heldout: bool, window_s: float
-) -> list[Overlay]:
+) -> list[OverlayPanel]:
     theta = np.stack([result.space.nominal, result.estimate])
     # The user's own model knows no latency: the same candidates as in the held-out error.
     latency = np.array([0.0, result.latency_s])
@@ -166,7 +166,7 @@ def _overlays(
         if episode.reported is not None:
             real = np.where(episode.reported[:, None], real, np.nan)
         found.append(
-            Overlay(
+            OverlayPanel(
                 title=titles[data.episode],
                 heldout=heldout,
                 names=problem.channel_names,

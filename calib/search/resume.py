@@ -109,7 +109,7 @@ def unpack(data: bytes) -> dict[str, Any]:
         return dict(object_of(header["state"]))
 
 
-class Checkpoint:
+class SearchCheckpoint:
     """A checkpoint file of one run; written whole or not at all. A :class:`deal_hw.calibration.StateStore`.
 
     Args:

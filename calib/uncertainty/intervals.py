@@ -16,7 +16,7 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.uncertainty.cluster_robust import Clustered, clustered
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
-from deal_hw.calibration import Z90, Alarm, Verdict, listed
+from deal_hw.calibration import Z90, Alarm, Identifiability, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -100,17 +100,17 @@ class Uncertainty:
     covariance: FloatArray
     interval: FloatArray
     latency_interval_s: tuple[float, float]
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[Identifiability, ...]
     null_directions: tuple[str, ...]
     alarms: tuple[Alarm, ...]
     inflation: float
-    shape: Shape
+    shape: PosteriorShape
     clustered: Clustered | None
     widened: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class PosteriorShape:
     """Which intervals are not symmetric around the estimate.
 
     Attributes:
@@ -201,7 +201,7 @@ def uncertainty(
     if fixed_latency:
         latency = (latency_s, latency_s)
     blind |= std[:K] > SETTINGS.blind_share * np.sqrt(flat[:K])
-    shape = Shape(blind, bound)
+    shape = PosteriorShape(blind, bound)
     return Uncertainty(
         covariance=covariance[:K, :K],
         interval=intervals(space, theta, covariance[:K, :K], shape),
@@ -271,7 +271,7 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
 
 
 def intervals(
-    space: ParameterSpace, theta: FloatArray, covariance: FloatArray, shape: Shape | None = None
+    space: ParameterSpace, theta: FloatArray, covariance: FloatArray, shape: PosteriorShape | None = None
 ) -> FloatArray:
     """Return 90 % intervals, (K, 2), inside the range.
 
@@ -298,9 +298,11 @@ def intervals(
     return np.stack([low, high], axis=1)
 
 
-def _verdicts(space: ParameterSpace, std: FloatArray, blind: npt.NDArray[np.bool_]) -> tuple[Verdict, ...]:
+def _verdicts(
+    space: ParameterSpace, std: FloatArray, blind: npt.NDArray[np.bool_]
+) -> tuple[Identifiability, ...]:
     unit, prior_std = _unit(space), space.width / np.sqrt(12.0)
-    found: list[Verdict] = []
+    found: list[Identifiability] = []
     for k in range(len(space)):
         if blind[k]:
             found.append("not identifiable")

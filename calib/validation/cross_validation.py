@@ -20,7 +20,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import refine, refine_robust
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.errors import CalibrationError, InsufficientDataError
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 
@@ -194,7 +194,7 @@ def time_masks(problem: Problem, count: int) -> list[list[npt.NDArray[np.bool_]]
     return [[part == number for part in parts] for number in range(count)]
 
 
-def motion_numbers(episodes: Sequence[Episode]) -> list[int]:
+def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:
     """Return which motion each episode is of, counted from 0: stretches of one follow each other."""
     number, found = -1, []
     last: tuple[int, int] | None = None

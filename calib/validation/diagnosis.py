@@ -22,7 +22,7 @@ from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import ended_at_bound
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
-from deal_hw.calib.validation.signatures import Answer, Cause, Signature, answers, signatures
+from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
 from deal_hw.calibration import Alarm, listed
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter
@@ -114,7 +114,7 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnosis:
     """One cause that the residual looks like.
 
     Attributes:
@@ -148,12 +148,12 @@ class Evidence:
     rows: Sequence[WindowRows]
     prior: FloatArray
     found: Sequence[Signature]
-    answers: Sequence[Answer]
+    answers: Sequence[SignatureResponse]
     period_s: float
     time_s: Sequence[FloatArray]
 
 
-def diagnose(problem: Problem, refined: Refined) -> tuple[Finding, ...]:
+def diagnose(problem: Problem, refined: Refined) -> tuple[Diagnosis, ...]:
     """Return what the residual of a fit looks like, best supported first.
 
     Args:
@@ -187,7 +187,7 @@ def evidence(problem: Problem, refined: Refined) -> Evidence:
     )
 
 
-def find_play(problem: Problem, refined: Refined) -> Finding | None:
+def find_play(problem: Problem, refined: Refined) -> Diagnosis | None:
     """Fit a model with play in every gear to a part of the recordings; return what it says of the rest.
 
     The model without has seen all of them.
@@ -248,10 +248,10 @@ def find_play(problem: Problem, refined: Refined) -> Finding | None:
     return _finding("backlash", share, deviance, joints, listed(joints), seen_words)
 
 
-def name_causes(known: Evidence) -> list[Finding]:
+def name_causes(known: Evidence) -> list[Diagnosis]:
     """Return the causes that evidence supports, the best first, each beside those before it."""
     left = _Left.of(known)
-    found: list[Finding] = []
+    found: list[Diagnosis] = []
     taken: list[Signature] = []
     groups = _groups(known.found)
     while groups and len(found) < SETTINGS.most:
@@ -283,17 +283,17 @@ def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
 
 def _finding(
     cause: Cause, share: float, deviance: float, joints: Sequence[str], where: str, seen: str = ""
-) -> Finding:
+) -> Diagnosis:
     looks, means, do = LOOKS[cause]
     if not seen:
         seen = f"{100 * share:.2g} % of the squared residual on left-out motion looks like {looks}: {cause}."
     alarm = Alarm(seen, means, do.replace("{}", where))
-    return Finding(cause, float(share), float(deviance), tuple(joints), alarm)
+    return Diagnosis(cause, float(share), float(deviance), tuple(joints), alarm)
 
 
 def _told(
     left: _Left, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
-) -> Finding:
+) -> Diagnosis:
     cause = group[0].cause
     if cause == "mass":
         return _told_mass(left, taken, share, deviance)
@@ -303,7 +303,7 @@ def _told(
     return _finding(cause, share, deviance, joints, listed(joints))
 
 
-def _told_mass(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Finding:
+def _told_mass(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
     """Name each body that explains about as much: without a known torque motion shows ratios of masses."""
     bodies = [s for s in left.known.found if s.cause == "mass"]
     gains = {k: left.gain(taken, [body]) for k, body in enumerate(bodies)}
@@ -411,7 +411,7 @@ class _Left:
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
 
-def _varying_delay(known: Evidence) -> Finding | None:
+def _varying_delay(known: Evidence) -> Diagnosis | None:
     """Return whether each command seems to act late by another time; see :mod:`.random_delay`."""
     found = random_delay(known.rows, known.answers, known.period_s)
     if found is None or not (found.gain > SETTINGS.evidence and found.share > SETTINGS.noticed):
@@ -423,7 +423,7 @@ def _varying_delay(known: Evidence) -> Finding | None:
     return _finding("delay", found.share, found.deviance, (), "", seen)
 
 
-def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Finding | None:
+def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None:
     """Return whether the residual comes in bursts, and when; None where it does not."""
     power: list[FloatArray] = []
     values: list[FloatArray] = []

@@ -14,7 +14,7 @@ from deal_hw.calibration import Z90
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_vector
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
 
@@ -79,7 +79,7 @@ class HeldOut:
         self,
         robot: RobotModel,
         space: ParameterSpace,
-        episodes: Sequence[Episode],
+        episodes: Sequence[SampledEpisode],
         window_s: float = 0.2,
         threads: int | None = None,
         truth: Sequence[FloatArray] | None = None,
@@ -145,7 +145,9 @@ class HeldOut:
         self._known.update(zip(fits, zip(rms[0], rms[1], strict=True), strict=True))
 
 
-def signal_range(episode: Episode, values: FloatArray, columns: IntArray, rotation: slice) -> FloatArray:
+def signal_range(
+    episode: SampledEpisode, values: FloatArray, columns: IntArray, rotation: slice
+) -> FloatArray:
     """Return the range that each measured coordinate covers in a recording, (n,).
 
     Args:

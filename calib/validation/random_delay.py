@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation.signatures import Answer
+from deal_hw.calib.validation.signatures import SignatureResponse
 from deal_hw.types import FloatArray, IntArray
 
 
@@ -81,7 +81,7 @@ class RandomDelay:
 
 
 def random_delay(
-    rows: Sequence[WindowRows], answers: Sequence[Answer], period_s: float
+    rows: Sequence[WindowRows], answers: Sequence[SignatureResponse], period_s: float
 ) -> RandomDelay | None:
     """Hold random delays against other processes; None where there is nothing to compare.
 
@@ -132,7 +132,7 @@ class _Window:
     change: FloatArray
 
     @classmethod
-    def of(cls, rows: WindowRows, answer: Answer, w: int) -> _Window:
+    def of(cls, rows: WindowRows, answer: SignatureResponse, w: int) -> _Window:
         R, S, M = rows.residual.shape[1], rows.start.shape[2], answer.response.shape[3]
         H = min(answer.response.shape[2], max(SETTINGS.rows // M, 4))
         # What is known of the start state comes last.

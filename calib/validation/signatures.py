@@ -61,7 +61,7 @@ class Signature:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class SignatureResponse:
     """How an episode's windows answer to commands.
 
     Attributes:
@@ -125,7 +125,7 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
     return [Signature(cause, where, tuple(columns)) for (cause, where), columns in found.items()]
 
 
-def answers(problem: Problem, fit: Refined) -> list[Answer]:
+def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
     """Return how the windows of a fit answer to commands; see :func:`signatures`."""
     responses, changes = [], []
     for e, data in enumerate(fit.shooting.data):
@@ -143,7 +143,7 @@ def answers(problem: Problem, fit: Refined) -> list[Answer]:
         changes.append(np.diff(path[0][edges], axis=1))
     mean = np.nan_to_num(np.mean(np.concatenate(responses, axis=1), axis=1))
     every = zip(fit.shooting.data, changes, strict=True)
-    return [Answer(mean[:, None] / data.std, change) for data, change in every]
+    return [SignatureResponse(mean[:, None] / data.std, change) for data, change in every]
 
 
 def held_direction(velocity: FloatArray, speed: float) -> FloatArray:

@@ -22,7 +22,7 @@ from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
-from deal_hw.sim.recordings.episode import Episode, align, fill_gaps
+from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps
 from deal_hw.sim.recordings.target import Behaviour, Sensing, TargetRecording, record_target
 from deal_hw.types import FloatArray
 from deal_hw.workflows.shipped import shipped_policy
@@ -69,8 +69,8 @@ class Case:
     space: ParameterSpace
     theta: FloatArray
     latency_s: float
-    fit: Episode
-    heldout: Episode
+    fit: SampledEpisode
+    heldout: SampledEpisode
     fit_truth: tuple[FloatArray, FloatArray]
     heldout_truth: FloatArray
     channel_std: FloatArray | None

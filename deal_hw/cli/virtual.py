@@ -26,7 +26,7 @@ from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, Trajectory
 
 _START_NS = 10**9
@@ -48,7 +48,7 @@ class VirtualEpisode:
     true: TrueTrajectory
     report: LoopReport
 
-    def true_states(self, episode: Episode) -> tuple[FloatArray, FloatArray]:
+    def true_states(self, episode: SampledEpisode) -> tuple[FloatArray, FloatArray]:
         """Return noise-free positions and velocities at an episode's samples, (T, J) each."""
         rows = np.searchsorted(self.true.tick, self.first_tick + episode.origin + episode.sample)
         rows = np.minimum(rows, len(self.true.tick) - 1)

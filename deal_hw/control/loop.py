@@ -15,7 +15,7 @@ from deal_hw.control.loop_timing import LoopTiming, LoopTimingReport
 from deal_hw.control.passive import make_passive
 from deal_hw.control.process_channel import ARMING, CONNECTING, HANDING_BACK, HOMING, MAKING_PASSIVE, RUNNING
 from deal_hw.control.repeater import Repeater
-from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
+from deal_hw.control.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.data.recording.record import CycleFlag, CycleRecord
 from deal_hw.errors import DealHwError, TransportError, TransportTimeoutError
 from deal_hw.robot import Robot
@@ -177,7 +177,7 @@ class ControlLoop:
         self._safety.stop("the run is over")
         return Outcome.FINISHED, "the run is over"
 
-    def _cycle(self, index: int, deadline_ns: int) -> Verdict:
+    def _cycle(self, index: int, deadline_ns: int) -> SafetyDecision:
         start_ns = self._clock.now_ns()
         state, flags = self._state, CycleFlag.NONE
         wanted: JointCommand | None = None
@@ -222,7 +222,7 @@ class ControlLoop:
             )
         return verdict
 
-    def _note_verdict(self, verdict: Verdict) -> CycleFlag:
+    def _note_verdict(self, verdict: SafetyDecision) -> CycleFlag:
         flags = CycleFlag.NONE
         for name in verdict.clipped:
             self._clipped[name] = self._clipped.get(name, 0) + 1

@@ -19,7 +19,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import SafetyError
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
-__all__ = ["CycleInput", "Safety", "SafetyConfig", "SafetyFlags", "SafetyState", "Verdict"]
+__all__ = ["CycleInput", "Safety", "SafetyConfig", "SafetyDecision", "SafetyFlags", "SafetyState"]
 
 _DRIFT = 5e-4
 """Largest rate difference between host and device clock that counts as drift (a bad crystal has 1e-4)."""
@@ -70,7 +70,7 @@ class CycleInput:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class SafetyDecision:
     """What the safety module decided in one cycle.
 
     Attributes:
@@ -144,7 +144,7 @@ class Safety:
         self._machine.arm(cycle.now_ns)
         self._start = self._previous = cycle.state.position[self._index]
 
-    def step(self, cycle: CycleInput, wanted: JointCommand | None) -> Verdict:
+    def step(self, cycle: CycleInput, wanted: JointCommand | None) -> SafetyDecision:
         """Judge one cycle.
 
         Args:
@@ -160,9 +160,9 @@ class Safety:
         if was_armed and not state.armed:
             self.reason = "; ".join(failures[name] for name in flags.raised)
         if state is SafetyState.PASSIVE or wanted is None or cycle.state is None or unsound:
-            return Verdict(state, None, (), flags.raised, self.reason)
+            return SafetyDecision(state, None, (), flags.raised, self.reason)
         command, clipped = self._clip(cycle.now_ns, wanted, cycle.state)
-        return Verdict(state, command, clipped, flags.raised, self.reason)
+        return SafetyDecision(state, command, clipped, flags.raised, self.reason)
 
     def stop(self, reason: str) -> None:
         """Go passive for a reason that is no failure of a check, such as the end of the run."""

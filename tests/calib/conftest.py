@@ -16,13 +16,13 @@ from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.testing.recorded_commands import RecordedCommands
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
 
-Recorded = tuple[ParameterSpace, FloatArray, Episode]
-Beginning = Callable[[Episode, float], Episode]
+Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
+Beginning = Callable[[SampledEpisode, float], SampledEpisode]
 Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 FREE = ("FL_hip_joint.stiffness", "RR_thigh_joint.stiffness", "FR_calf_joint.damping")
 TRUTH = {"cart.frictionloss": 0.4, "servo.damping": 2.5}
@@ -93,7 +93,7 @@ def small_problem() -> Callable[..., Problem]:
 def beginning() -> Beginning:
     """Return what cuts a recording after so many seconds."""
 
-    def cut(episode: Episode, seconds: float) -> Episode:
+    def cut(episode: SampledEpisode, seconds: float) -> SampledEpisode:
         count = round(seconds / episode.period_s)
         names = ("sample", "position", "velocity", "usable", "reference")
         return dataclasses.replace(episode, **{name: getattr(episode, name)[:count] for name in names})

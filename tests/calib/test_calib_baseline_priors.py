@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings
-from deal_hw.calib.baselines.least_squares import LeastSquares
+from deal_hw.calib.baselines.least_squares import LeastSquaresBaseline
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationMethod
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 FREE = ("cart.frictionloss", "servo.damping")
 METHODS = {
     "gauss-newton": GaussNewton(GaussNewtonSettings(draws=20, starts=3, survivors=2)),
-    "least-squares": LeastSquares(),
+    "least-squares": LeastSquaresBaseline(),
 }
 
 
@@ -36,7 +36,7 @@ def space(std: float | None = None, factor: float = 1.3) -> ParameterSpace:
 
 
 @pytest.fixture(scope="module")
-def episode() -> Episode:
+def episode() -> SampledEpisode:
     """Return 1.2 s of a cart-pole with nominal values, reported through its noisy sensor."""
     plain = space()
     made = simulated_episode(DESCRIPTION, plain, plain.nominal, seconds=1.2, sensor=True, seed=2)
@@ -44,7 +44,7 @@ def episode() -> Episode:
 
 
 def found(
-    method: CalibrationMethod[Problem], searched: ParameterSpace, episode: Episode
+    method: CalibrationMethod[Problem], searched: ParameterSpace, episode: SampledEpisode
 ) -> tuple[float, float]:
     """Return the friction as a ratio of its true value, and its standard deviation (log)."""
     problem = Problem(load_model(DESCRIPTION), searched, [episode], threads=1, fixed_latency_s=0.0)
@@ -55,7 +55,7 @@ def found(
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_priors_count(name: str, episode: Episode) -> None:
+def test_priors_count(name: str, episode: SampledEpisode) -> None:
     """Nothing for a vague one; a tight one wins; one as sharp as the data meets them half way."""
     method = METHODS[name]
     free, std = found(method, space(), episode)

@@ -15,15 +15,15 @@ from deal_hw.calib.baselines.bayesian import (
     critic_return,
 )
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.method_suite import MemoryStore, MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 
-Recorded = tuple[ParameterSpace, FloatArray, Episode]
+Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
 
 
 class TestBo(MethodSuite):
@@ -40,7 +40,7 @@ class TestBo(MethodSuite):
             budget=Budget(population=16, generations=10),
             short_budget=Budget(population=8, generations=3),
             tolerance=0.25,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
             grows=True,
         )
 

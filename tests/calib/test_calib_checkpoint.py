@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from deal_hw.calib.search.resume import Checkpoint, digest, pack, restore_generator, unpack
+from deal_hw.calib.search.resume import SearchCheckpoint, digest, pack, restore_generator, unpack
 from deal_hw.errors import ConfigurationError, DatasetError
 
 KEYS = st.text(max_size=8).filter(lambda key: key != "__array__")
@@ -122,11 +122,11 @@ def test_generator_goes_on_where_it_was() -> None:
 
 def test_file_is_replaced_whole_and_removed(tmp_path: Path) -> None:
     """Each save replaces the last; nothing else is left in the folder, and nothing after the end."""
-    kept = Checkpoint(tmp_path / "run" / "checkpoint.npz", "mine")
+    kept = SearchCheckpoint(tmp_path / "run" / "checkpoint.npz", "mine")
     assert kept.load() is None
     for number in range(3):
         kept.save({"number": number})
-    assert Checkpoint(kept.path, "mine").load() == {"number": 2}
+    assert SearchCheckpoint(kept.path, "mine").load() == {"number": 2}
     assert [path.name for path in kept.path.parent.iterdir()] == ["checkpoint.npz"]
     kept.remove()
     assert kept.load() is None
@@ -135,10 +135,10 @@ def test_file_is_replaced_whole_and_removed(tmp_path: Path) -> None:
 def test_fresh_run_does_not_read_the_file_that_it_replaces(tmp_path: Path) -> None:
     """Without resume an earlier state is not continued, but it is there until the first generation."""
     path = tmp_path / "checkpoint.npz"
-    Checkpoint(path, "mine").save({"number": 1})
-    fresh = Checkpoint(path, "yours", fresh=True)
+    SearchCheckpoint(path, "mine").save({"number": 1})
+    fresh = SearchCheckpoint(path, "yours", fresh=True)
     assert fresh.load() is None
-    assert Checkpoint(path, "mine").load() == {"number": 1}
+    assert SearchCheckpoint(path, "mine").load() == {"number": 1}
     fresh.save({"number": 2})
     assert fresh.load() == {"number": 2}
 
@@ -147,7 +147,7 @@ def test_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     """A folder in the way is named."""
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(DatasetError, match="cannot be written"):
-        Checkpoint(tmp_path / "file" / "checkpoint.npz", "mine").save({})
+        SearchCheckpoint(tmp_path / "file" / "checkpoint.npz", "mine").save({})
 
 
 def test_digest_tells_apart_what_differs() -> None:

@@ -9,15 +9,15 @@ import pytest
 
 from deal_hw.calib.baselines.cma_es import Cma, CmaSettings, RestartedCma
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 
-Recorded = tuple[ParameterSpace, FloatArray, Episode]
+Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
 
 
 class TestCma(MethodSuite):
@@ -34,7 +34,7 @@ class TestCma(MethodSuite):
             budget=Budget(population=20, generations=20),
             short_budget=Budget(population=10, generations=3),
             tolerance=0.01,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
             grows=True,
         )
 

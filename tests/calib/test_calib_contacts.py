@@ -18,11 +18,11 @@ from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, parameter_space
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.target import Sensing, record_target
 from deal_hw.types import FloatArray
 
-Beginning = Callable[[Episode, float], Episode]
+Beginning = Callable[[SampledEpisode, float], SampledEpisode]
 Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 
 

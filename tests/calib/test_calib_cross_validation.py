@@ -12,7 +12,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine_robust, refine_windows
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
-from deal_hw.calib.pipeline import Calibration
+from deal_hw.calib.pipeline import CalibrationPipeline
 from deal_hw.calib.validation.cross_validation import choose, fold_masks, prediction_error
 from deal_hw.calib.validation.verdict import Validation, unexplained
 from deal_hw.calibration import Budget
@@ -67,7 +67,7 @@ def test_unexplained_data_go_through_the_folds_and_are_diagnosed(noisy: Case) ->
     wrong = noisy.latency_s + 0.01
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=wrong)
     search = FixedSearch(noisy.theta, wrong)
-    result = Calibration(search, settings=Validation(split_half=False)).run(
+    result = CalibrationPipeline(search, settings=Validation(split_half=False)).run(
         problem, Budget(generations=16), np.random.default_rng(0)
     )
     assert len(search.budgets) >= 3
@@ -84,7 +84,7 @@ def test_a_residual_that_was_chosen_explains_itself_so_folds_decide(noisy: Case)
         noisy.robot, noisy.space, [noisy.fit], threads=1, fixed_latency_s=noisy.latency_s, known_std=chosen
     )
     search = FixedSearch(noisy.theta * 1.05, noisy.latency_s)
-    result = Calibration(search, settings=Validation(split_half=False, diagnosis=False)).run(
+    result = CalibrationPipeline(search, settings=Validation(split_half=False, diagnosis=False)).run(
         problem, Budget(generations=15), np.random.default_rng(0)
     )
     assert result.chi2 < 0.5

@@ -14,9 +14,9 @@ from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.uncertainty.intervals import with_rows
 from deal_hw.calib.validation import diagnosis
-from deal_hw.calib.validation.diagnosis import Evidence, Finding, evidence, find_play, name_causes
+from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, name_causes
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
-from deal_hw.calib.validation.signatures import Answer, Cause, Signature, held_direction
+from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
 from deal_hw.cli.calibrate import Calibrate, prepare
 from deal_hw.testing.plain_robots import Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
@@ -89,7 +89,7 @@ def _evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Eviden
     )
 
 
-def _named(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> list[Finding]:
+def _named(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> list[Diagnosis]:
     return name_causes(_evidence(wrong, columns))
 
 
@@ -171,7 +171,7 @@ def test_every_window_is_left_out_once_in_stretches() -> None:
 
 def _pushed(
     varies: Callable[[FloatArray, np.random.Generator], FloatArray],
-) -> tuple[list[WindowRows], list[Answer]]:
+) -> tuple[list[WindowRows], list[SignatureResponse]]:
     """Return residuals of a joint that impulses move, as ``varies`` makes them of what commands change."""
     rng = np.random.default_rng(3)
     time = np.arange(SAMPLES) * PERIOD_S
@@ -187,7 +187,7 @@ def _pushed(
         np.concatenate([np.ones((WINDOWS, SAMPLES, 1)), np.full((WINDOWS, 1, 1), 1e-3)], axis=1),
     )
     response = np.broadcast_to(answer, (1, WINDOWS, SAMPLES))[..., None]
-    return [rows], [Answer(response, change[..., None])]
+    return [rows], [SignatureResponse(response, change[..., None])]
 
 
 def test_random_delays_push_where_commands_change() -> None:

@@ -10,15 +10,15 @@ import pytest
 from deal_hw.calib.baselines.easi import Easi, EasiSettings, EliteGaussian, elite_weights, logarithmic
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.deal_paper.fitness import FITNESSES
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 
-Recorded = tuple[ParameterSpace, FloatArray, Episode]
+Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
 
 
 class TestEasi(MethodSuite):
@@ -35,7 +35,7 @@ class TestEasi(MethodSuite):
             budget=Budget(population=10, generations=3),
             short_budget=Budget(population=10, generations=3),
             tolerance=None,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
             grows=False,
         )
 
@@ -54,7 +54,7 @@ class TestEasiOfTrajectories(MethodSuite):
             budget=Budget(population=30, generations=12),
             short_budget=Budget(population=10, generations=3),
             tolerance=0.05,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
             grows=False,
         )
 

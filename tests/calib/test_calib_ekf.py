@@ -11,16 +11,16 @@ import pytest
 
 from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman
 from deal_hw.calib.data.problem import Problem, taken
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 
-Recorded = tuple[ParameterSpace, FloatArray, Episode]
+Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
 
 
 class TestEkf(MethodSuite):
@@ -37,7 +37,7 @@ class TestEkf(MethodSuite):
             budget=Budget(generations=8),
             short_budget=Budget(generations=2),
             tolerance=0.05,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
         )
 
 

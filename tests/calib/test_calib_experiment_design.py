@@ -24,7 +24,7 @@ from deal_hw.calib.design.experiment_design import (
     information,
 )
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calibration import CalibrationResult, Verdict
+from deal_hw.calibration import CalibrationResult, Identifiability
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import ExcitationBehaviour, ExcitationDesign, make_plan
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
@@ -313,7 +313,7 @@ def result(parameters: ParameterSpace, std: FloatArray) -> CalibrationResult:
     """Return a calibration that ended at the nominal values with these standard deviations."""
     value = parameters.to_scale(parameters.nominal)
     interval = np.stack([parameters.from_scale(value + s * 1.645 * std) for s in (-1.0, 1.0)], axis=1)
-    verdicts: tuple[Verdict, ...] = tuple("identifiable" if s < 0.15 else "weak" for s in std)
+    verdicts: tuple[Identifiability, ...] = tuple("identifiable" if s < 0.15 else "weak" for s in std)
     return CalibrationResult(
         method="x",
         space=parameters,

@@ -15,10 +15,10 @@ from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.validation.metrics import HeldOut, signal_range
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
-Beginning = Callable[[Episode, float], Episode]
+Beginning = Callable[[SampledEpisode, float], SampledEpisode]
 Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 
 

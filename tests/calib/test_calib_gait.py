@@ -11,7 +11,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
 from deal_hw.calib.output_error_fits import FORCES, GAIT, _holding, _scaled_together
-from deal_hw.calib.uncertainty.intervals import Shape, Uncertainty
+from deal_hw.calib.uncertainty.intervals import PosteriorShape, Uncertainty
 from deal_hw.calibration import Z90
 from deal_hw.cli.calibrate import Calibrate, usual_method
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
@@ -49,7 +49,7 @@ def known_at(theta: np.ndarray) -> Uncertainty:
         null_directions=(),
         alarms=(),
         inflation=1.0,
-        shape=Shape(np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)),
+        shape=PosteriorShape(np.zeros(K, dtype=bool), np.zeros(K, dtype=np.int64)),
         clustered=None,
         widened=np.ones(K),
     )

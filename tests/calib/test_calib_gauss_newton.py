@@ -9,12 +9,12 @@ import pytest
 
 from deal_hw.calib.baselines.gauss_newton import GaussNewton, GaussNewtonSettings, Innovations
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
@@ -27,7 +27,7 @@ SMALL = GaussNewtonSettings(draws=20, starts=3, survivors=2)
 
 
 @functools.cache
-def recorded(sensor: bool) -> tuple[ParameterSpace, FloatArray, Episode]:
+def recorded(sensor: bool) -> tuple[ParameterSpace, FloatArray, SampledEpisode]:
     """Return a space with two free parameters, their true values, and a recording."""
     space = k9_space().with_ratio(5.0).with_free(TRUTH)
     theta = np.array([p.nominal * TRUTH[p.name] for p in space])
@@ -59,7 +59,7 @@ class TestGaussNewton(MethodSuite):
             budget=Budget(population=20, generations=20),
             short_budget=Budget(population=10, generations=3),
             tolerance=1e-3,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
         )
 
 

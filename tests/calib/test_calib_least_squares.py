@@ -7,16 +7,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deal_hw.calib.baselines.least_squares import LeastSquares, OneStep, textbook_covariance
+from deal_hw.calib.baselines.least_squares import LeastSquaresBaseline, OneStep, textbook_covariance
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.types import FloatArray
 
-Recorded = tuple[ParameterSpace, FloatArray, Episode]
+Recorded = tuple[ParameterSpace, FloatArray, SampledEpisode]
 
 
 class TestLeastSquares(MethodSuite):
@@ -27,19 +27,19 @@ class TestLeastSquares(MethodSuite):
     def case(cls, recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]) -> MethodCase:
         """Return the method under test."""
         return MethodCase(
-            method=LeastSquares(),
+            method=LeastSquaresBaseline(),
             make_problem=small_problem,
             truth=recorded()[1],
             budget=Budget(generations=30),
             short_budget=Budget(generations=2),
             tolerance=1e-3,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
         )
 
 
 def test_says_when_it_has_not_converged(small_problem: Callable[..., Problem]) -> None:
     """Two iterations are not enough, and the result says so."""
-    result = LeastSquares().run(small_problem(), Budget(generations=2), np.random.default_rng(0))
+    result = LeastSquaresBaseline().run(small_problem(), Budget(generations=2), np.random.default_rng(0))
     assert ["not converged after 2 iterations" in alarm.seen for alarm in result.alarms] == [True]
     assert result.provenance["iterations"] == 2
 
@@ -50,8 +50,8 @@ def test_takes_no_latency_but_a_given_one(
     """Where the latency is to be found it assumes none, and its estimate pays for it; given, it is exact."""
     theta = recorded(latency_ticks=8)[1]
     rng = np.random.default_rng(0)
-    ignorant = LeastSquares().run(small_problem(latency_ticks=8, fixed_latency_s=None), Budget(), rng)
-    told = LeastSquares().run(small_problem(latency_ticks=8, fixed_latency_s=8e-3), Budget(), rng)
+    ignorant = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=None), Budget(), rng)
+    told = LeastSquaresBaseline().run(small_problem(latency_ticks=8, fixed_latency_s=8e-3), Budget(), rng)
     assert ignorant.latency_s == 0.0
     assert ignorant.provenance["assumed_latency_s"] == 0.0
     assert told.latency_s == 8e-3

@@ -20,10 +20,10 @@ from deal_hw.calib.methods import (
     check_method,
     make_method,
 )
-from deal_hw.calib.pipeline import Calibration
+from deal_hw.calib.pipeline import CalibrationPipeline
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.errors import InsufficientDataError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -85,7 +85,7 @@ def case_of(name: str, budget: Budget, tolerance: float | None) -> MethodCase:
         budget=budget,
         short_budget=Budget(population=10, generations=2),
         tolerance=tolerance,
-        open_store=Checkpoint,
+        open_store=SearchCheckpoint,
     )
 
 
@@ -221,7 +221,7 @@ def test_every_name_in_the_table_makes_a_method(name: str) -> None:
     method = make_method(name)
     assert method.name == name or name == "default"
     whole = make_method(name, refine=True)
-    assert isinstance(whole, Calibration) == (name not in NO_DATA_METHODS | {"mujoco-sysid"})
+    assert isinstance(whole, CalibrationPipeline) == (name not in NO_DATA_METHODS | {"mujoco-sysid"})
     assert whole.name == name
 
 

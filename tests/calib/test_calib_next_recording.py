@@ -19,7 +19,7 @@ from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
 from deal_hw.drivers.go2.descriptions.floor import parameter_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.testing.simulated_episode import simulated_episode
 
 
@@ -38,19 +38,19 @@ def result(space: ParameterSpace, verdict: str, std: float = 0.3) -> Calibration
 
 
 @pytest.fixture(scope="module")
-def episode() -> Episode:
+def episode() -> SampledEpisode:
     """Return two seconds of a balanced cart-pole."""
     space = k9_space()
     return align(simulated_episode(DESCRIPTION, space, space.nominal, seconds=2.0), DESCRIPTION)
 
 
-def test_nothing_open_needs_nothing(episode: Episode) -> None:
+def test_nothing_open_needs_nothing(episode: SampledEpisode) -> None:
     """No simulation is run where every parameter is identifiable."""
     found = result(k9_space(), "identifiable")
     assert next_recordings(load_model(DESCRIPTION), found, [episode]) == ()
 
 
-def test_what_cannot_be_computed_is_said(episode: Episode) -> None:
+def test_what_cannot_be_computed_is_said(episode: SampledEpisode) -> None:
     """A floating base gets a line a parameter that says why, and the page shows it."""
     found = result(parameter_space(), "weak")
     advice = next_recordings(load_model(GO2), found, [episode])
@@ -62,7 +62,7 @@ def test_what_cannot_be_computed_is_said(episode: Episode) -> None:
     assert "What to record next" in page and "held by its trunk" in page
 
 
-def test_advice_survives_the_file(episode: Episode) -> None:
+def test_advice_survives_the_file(episode: SampledEpisode) -> None:
     """Written and read back, the advice is the same; older files have none."""
     row = {"parameter": "p", "std": 0.5, "std_after": None, "excitation": "", "sentence": "s"}
     values = dataclasses.replace(result(k9_space(), "weak"), advice=(row,)).to_json()

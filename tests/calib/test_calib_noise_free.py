@@ -17,10 +17,10 @@ from deal_hw.calib.uncertainty.time_steps import scan_latency
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
-Beginning = Callable[[Episode, float], Episode]
+Beginning = Callable[[SampledEpisode, float], SampledEpisode]
 Known = Callable[[ParameterSpace, FloatArray], tuple[ParameterSpace, FloatArray]]
 SECONDS = 1.0
 STEP_S = 0.002
@@ -32,7 +32,7 @@ class Seen:
 
     robot: RobotModel
     space: ParameterSpace
-    episode: Episode
+    episode: SampledEpisode
     truth: FloatArray
 
 

@@ -15,14 +15,14 @@ from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiS
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import Recipe, expected_residual, fit_output_error, prediction_rmse
 from deal_hw.calib.output_error_fits import OutputErrorFits, output_error_method
-from deal_hw.calib.pipeline import Calibration
+from deal_hw.calib.pipeline import CalibrationPipeline
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calib.uncertainty.null_space import confounded
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationResult, Progress
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.model import Recordings, prepare_model
 from deal_hw.workflows.calibration.run import SpaceOverrides
@@ -125,9 +125,9 @@ def test_the_expected_residual_is_at_least_the_noise(problem: Problem) -> None:
     assert problem.noise_std[0] <= std[0] < 5e-3
 
 
-def searching(folds: bool = True) -> Calibration:
+def searching(folds: bool = True) -> CalibrationPipeline:
     """Return the method without a local fit before its search."""
-    return Calibration(
+    return CalibrationPipeline(
         Eki(), "output-error", Validation(local_first=False, cross_validation=folds), fits=OutputErrorFits()
     )
 
@@ -192,7 +192,7 @@ def test_a_stopped_run_is_resumed_to_the_same_numbers(problem: Problem, tmp_path
             raise StoppedError
 
     whole = method.run(problem, BUDGET, np.random.default_rng(0))
-    store = Checkpoint(tmp_path / "checkpoint.npz", "a")
+    store = SearchCheckpoint(tmp_path / "checkpoint.npz", "a")
     with pytest.raises(StoppedError):
         method.run(problem, BUDGET, np.random.default_rng(0), stop, store)
     resumed = method.run(problem, BUDGET, np.random.default_rng(0), None, store)
@@ -209,10 +209,10 @@ def test_least_squares_from_several_starts_finds_them_too(problem: Problem) -> N
     assert found.provenance["stopped"] == "best of 3 starts, 1 of them fitted to all recordings"
 
 
-def episode_at(row: int, samples: int = 10) -> Episode:
+def episode_at(row: int, samples: int = 10) -> SampledEpisode:
     """Return what folds look at of an episode."""
     return cast(
-        "Episode",
+        "SampledEpisode",
         SimpleNamespace(first_row=row, origin=10 * row, sample=np.arange(samples), usable=np.ones(samples)),
     )
 

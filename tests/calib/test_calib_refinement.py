@@ -16,7 +16,7 @@ from deal_hw.calib.data.noise import noise_model, white_noise_std
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
-from deal_hw.calib.pipeline import Calibration, CalibrationRun, Refinement, conclusive
+from deal_hw.calib.pipeline import CalibrationPipeline, CalibrationRun, Refinement, conclusive
 from deal_hw.calib.search.resume import Restarts
 from deal_hw.calib.uncertainty.intervals import MISMATCH, SETTINGS, correlation_time, intervals, uncertainty
 from deal_hw.calib.uncertainty.null_space import null_directions, null_space
@@ -110,7 +110,7 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None
     def watch(p: Progress) -> None:
         stages.append(p.stage)
 
-    method = Calibration(
+    method = CalibrationPipeline(
         FixedSearch(noisy.theta, noisy.latency_s + 1e-3, 0.05), settings=Validation(local_first=False)
     )
     result = method.run(problem, Budget(), np.random.default_rng(0), watch)
@@ -136,7 +136,7 @@ def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal:
     """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)
     search = FixedSearch(ideal.theta, 0.021, 0.05)
-    result = Calibration(search).run(problem, Budget(), np.random.default_rng(0))
+    result = CalibrationPipeline(search).run(problem, Budget(), np.random.default_rng(0))
     assert len(search.budgets) >= 2
     assert any("does not explain" in alarm.means for alarm in result.alarms)
 
@@ -260,7 +260,7 @@ def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) 
     problem = Problem(ideal.robot, ideal.space, [still], threads=1)
     search = FixedSearch(ideal.theta, 1e-3, 0.05)
     with pytest.raises(InsufficientDataError, match=r"hardly moves.*--profile rich"):
-        Calibration(search).run(problem, Budget(), np.random.default_rng(0))
+        CalibrationPipeline(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.budgets == []
     short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 60)
     with pytest.raises(InsufficientDataError, match=r"0\.30 s of usable samples"):

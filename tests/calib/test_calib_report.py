@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.calib.report.charts import autocorrelation, envelope
-from deal_hw.calib.report.gather import Overlay, ReportInputs, Residuals, gather
+from deal_hw.calib.report.gather import OverlayPanel, ReportInputs, Residuals, gather
 from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report, write_result
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
@@ -22,7 +22,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
-from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.sim.recordings.parts import part
 from deal_hw.testing.simulated_episode import simulated_episode
 
@@ -65,7 +65,7 @@ def inputs(found: CalibrationResult, channels: int = 2, samples: int = 200, name
     names = tuple(f"{name}{m}" for m in range(channels))
     real = rng.normal(size=(samples, channels))
     overlays = tuple(
-        Overlay(
+        OverlayPanel(
             title=f"{name} {heldout}",
             heldout=heldout,
             names=names,
@@ -269,7 +269,7 @@ def test_held_out_error_of_each_joint_stands_in_its_unit() -> None:
 
 
 @pytest.fixture(scope="module")
-def recordings() -> tuple[RobotModel, CalibrationResult, list[Episode]]:
+def recordings() -> tuple[RobotModel, CalibrationResult, list[SampledEpisode]]:
     """A cart-pole with 7 ms latency and sensor noise, twice 2.5 s, and a result with its true parameters."""
     robot, searched = load_model(DESCRIPTION), k9_space().with_ratio(3.0)
     truth = searched.unnormalize(np.linspace(0.3, 0.7, len(searched)))
@@ -296,14 +296,14 @@ def recordings() -> tuple[RobotModel, CalibrationResult, list[Episode]]:
 
 
 @pytest.fixture(scope="module")
-def gathered(recordings: tuple[RobotModel, CalibrationResult, list[Episode]]) -> ReportInputs:
+def gathered(recordings: tuple[RobotModel, CalibrationResult, list[SampledEpisode]]) -> ReportInputs:
     """Gather at the true parameters."""
     robot, found, episodes = recordings
     return gather(robot, found, episodes[:1], episodes[1:], telemetry=["fine"], threads=1)
 
 
 def test_overlays_restart_as_often_as_held_out_predictions(
-    recordings: tuple[RobotModel, CalibrationResult, list[Episode]],
+    recordings: tuple[RobotModel, CalibrationResult, list[SampledEpisode]],
 ) -> None:
     """1 s is drawn as 1 s; a recording of half a second beside one of 2.5 s gets what it holds."""
     robot, found, episodes = recordings

@@ -11,10 +11,10 @@ import pytest
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.methods import make_method
-from deal_hw.calib.pipeline import Calibration, Refinement, RestartSettings
+from deal_hw.calib.pipeline import CalibrationPipeline, Refinement, RestartSettings
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki, EkiSettings
-from deal_hw.calib.search.resume import Checkpoint, run_identity
+from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
 from deal_hw.calib.validation.verdict import Validation
 from deal_hw.calibration import Budget, CalibrationMethod, CalibrationResult, Progress
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -39,7 +39,11 @@ class StoppedError(Exception):
 
 
 def run(
-    method: CalibrationMethod[Any], problem: Problem, budget: Budget, store: Checkpoint | None, most: int
+    method: CalibrationMethod[Any],
+    problem: Problem,
+    budget: Budget,
+    store: SearchCheckpoint | None,
+    most: int,
 ) -> CalibrationResult:
     """Run until the callback has been called ``most`` times; 0 for to the end."""
     calls = 0
@@ -75,8 +79,8 @@ def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
     whole = run(method, make_problem(1e-3), budget, None, 0)
     assert whole.provenance["restarts"] >= 1
     with pytest.raises(StoppedError):
-        run(method, make_problem(1e-3), budget, Checkpoint(path, "a"), stop)
-    resumed = run(method, make_problem(1e-3), budget, Checkpoint(path, "a"), 0)
+        run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), stop)
+    resumed = run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), 0)
     check_same(resumed, whole)
     # The generation in which it was stopped is simulated twice and counted once.
     assert resumed.steps == whole.steps
@@ -90,8 +94,8 @@ def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> Non
     budget, path = Budget(population=8, generations=6), tmp_path / "checkpoint.npz"
     whole = run(method, make_problem(1e-3), budget, None, 0)
     with pytest.raises(StoppedError):
-        run(method, make_problem(1e-3), budget, Checkpoint(path, "a"), stop)
-    check_same(run(method, make_problem(1e-3), budget, Checkpoint(path, "a"), 0), whole)
+        run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), stop)
+    check_same(run(method, make_problem(1e-3), budget, SearchCheckpoint(path, "a"), 0), whole)
 
 
 def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
@@ -99,7 +103,7 @@ def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
     # Nothing is ever explained and no two searches agree: all three attempts are made.
     fits = Refinement(RestartSettings(explained=0.0, same=0.0, fewest_generations=1))
     search = Eki(EkiSettings(clean_ticks=(5,), stage_generations=3, restart_chi2=1e9))
-    method = Calibration(search, settings=Validation(local_first=False), fits=fits)
+    method = CalibrationPipeline(search, settings=Validation(local_first=False), fits=fits)
     budget, path = Budget(population=8, generations=9), tmp_path / "checkpoint.npz"
     stages: list[str] = []
 
@@ -113,14 +117,14 @@ def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
     refining = stages.index("refinement") + 1
     searching = stages[refining:].index("search") + 1
     with pytest.raises(StoppedError):
-        run(method, make_problem(), budget, Checkpoint(path, "a"), refining)
-    saved = Checkpoint(path, "a").load()
+        run(method, make_problem(), budget, SearchCheckpoint(path, "a"), refining)
+    saved = SearchCheckpoint(path, "a").load()
     assert saved is not None and len(saved["searches"]) == 1
     with pytest.raises(StoppedError):
-        run(method, make_problem(), budget, Checkpoint(path, "a"), searching + 3)
-    saved = Checkpoint(path, "a").load()
+        run(method, make_problem(), budget, SearchCheckpoint(path, "a"), searching + 3)
+    saved = SearchCheckpoint(path, "a").load()
     assert saved is not None and len(saved["searches"]) == 2
-    resumed = run(method, make_problem(), budget, Checkpoint(path, "a"), 0)
+    resumed = run(method, make_problem(), budget, SearchCheckpoint(path, "a"), 0)
     check_same(resumed, whole)
     assert resumed.provenance["restarts"] == 2
     np.testing.assert_array_equal(resumed.covariance, whole.covariance)
@@ -129,7 +133,7 @@ def test_calibration_keeps_finished_searches(tmp_path: Path) -> None:
 def test_finished_checkpoint_gives_the_result_again(tmp_path: Path) -> None:
     """A run that was stopped after its last generation has nothing left to simulate but the verdict."""
     method, budget = make_method("random"), Budget(population=10, generations=2)
-    store = Checkpoint(tmp_path / "checkpoint.npz", "a")
+    store = SearchCheckpoint(tmp_path / "checkpoint.npz", "a")
     whole = run(method, make_problem(), budget, store, 0)
     problem = make_problem()
     again = run(method, problem, budget, store, 1)
@@ -160,8 +164,8 @@ def test_identity_changes_with_all_that_decides_the_numbers() -> None:
         identity(other(space=problem.space.with_ratio(3.0))),
         identity(method=Deal()),
         identity(method=Eki(EkiSettings(widen=0.6))),
-        identity(method=Calibration(Eki())),
-        identity(method=Calibration(Eki(EkiSettings(widen=0.6)))),
+        identity(method=CalibrationPipeline(Eki())),
+        identity(method=CalibrationPipeline(Eki(EkiSettings(widen=0.6)))),
         identity(budget=Budget(population=99)),
         identity(seed=1),
         run_identity(

@@ -16,7 +16,7 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.compiling import load_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 
 SLIDER = """
 <mujoco>
@@ -42,12 +42,12 @@ def robot(tmp_path: Path) -> RobotModel:
     return load_model(describe(path, load_mjcf(path), ("rail",), ("rail",), rates), rates.step_s)
 
 
-def steps_of(robot: RobotModel, T: int = 200) -> Episode:
+def steps_of(robot: RobotModel, T: int = 200) -> SampledEpisode:
     """Return an episode at rest in which the command steps by 5 cm; the positions are all zero."""
     steps = 5 * (T - 1)
     rows = np.ones((steps, 1))
     square = 0.05 * np.sign(np.sin(2 * np.pi * np.arange(steps) / 250))[:, None]
-    return Episode(
+    return SampledEpisode(
         step_s=robot.step_s,
         sample=5 * np.arange(T),
         position=np.zeros((T, 1)),
@@ -151,7 +151,7 @@ def test_a_solver_that_stops_early_is_seen_by_what_jumps(solver: str, smooth: bo
     rows = np.ones((steps, 2))
     angle = -1.2 + 0.4 * np.sin(np.arange(steps) * 0.0025 * 3.0)[:, None] * [1.0, -1.0]
     found = np.concatenate([angle[:1], angle[3::4]])
-    episode = Episode(
+    episode = SampledEpisode(
         step_s=robot.step_s,
         sample=4 * np.arange(T),
         position=found,

@@ -13,15 +13,15 @@ import pytest
 
 from deal_hw.calib.baselines.sysid import MujocoSysid, SysidSettings, with_delay
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Checkpoint
+from deal_hw.calib.search.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.install import install_line
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align
-from deal_hw.sim.recordings.sysid_adapter import Recording, identify, require_sysid
+from deal_hw.sim.recordings.episode import SampledEpisode, align
+from deal_hw.sim.recordings.sysid_adapter import SysidRecording, identify, require_sysid
 from deal_hw.testing.method_suite import MethodCase, MethodSuite
 from deal_hw.testing.simulated_episode import simulated_episode
 from deal_hw.types import FloatArray
@@ -38,7 +38,7 @@ else:
 
 
 @functools.cache
-def recorded(latency_ticks: int = 0) -> tuple[ParameterSpace, FloatArray, Episode]:
+def recorded(latency_ticks: int = 0) -> tuple[ParameterSpace, FloatArray, SampledEpisode]:
     """Return a space with three free parameters, their true values, and 1.2 s of a noise-free recording."""
     space = k9_space().with_ratio(5.0).with_free(TRUTH)
     theta = np.array([p.nominal * TRUTH[p.name] for p in space])
@@ -67,7 +67,7 @@ class TestMujocoSysid(MethodSuite):
             budget=Budget(generations=30),
             short_budget=Budget(generations=2),
             tolerance=5e-3,
-            open_store=Checkpoint,
+            open_store=SearchCheckpoint,
         )
 
 
@@ -112,7 +112,7 @@ def test_its_residual_is_our_prediction() -> None:
     robot = load_model(DESCRIPTION)
     made = Problem(robot, space, [changed], threads=1, fixed_latency_s=2.5e-3)
     data = made.windows(40)[0]
-    recording = Recording(made.episodes[0], data.windows, data.start_position, data.start_velocity)
+    recording = SysidRecording(made.episodes[0], data.windows, data.start_position, data.start_velocity)
     found = identify(robot, space, [recording], latency_s=2.5e-3, iterations=1, threads=1)
     predicted = made.predict(found.theta[None], np.array([2.5e-3]), data).position[0]
     rows = data.windows.start[:, None] + np.arange(41)

@@ -13,7 +13,7 @@ from deal_hw.bench import loop as bench_loop
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calibration import Budget, CalibrationResult, Verdict
+from deal_hw.calibration import Budget, CalibrationResult, Identifiability
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.run_plan import RunPlan
@@ -97,7 +97,7 @@ def test_a_row_is_flagged_where_a_parameter_is_given_no_value(monkeypatch: pytes
     """No alarm, but a limit that the recording never reached: the row names it."""
 
     def told(*args: Any, **kwargs: Any) -> CalibrationResult:
-        verdicts: list[Verdict] = ["identifiable"] * 9
+        verdicts: list[Identifiability] = ["identifiable"] * 9
         verdicts[7] = "not identifiable"
         return dataclasses.replace(calibrate_episodes(*args, **kwargs), verdicts=tuple(verdicts), alarms=())
 

@@ -17,7 +17,7 @@ from deal_hw.control.loop import ControlLoop, LoopConfig, LoopReport, Outcome, _
 from deal_hw.control.passive import PassiveConfig
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
 from deal_hw.control.process_channel import RUNNING
-from deal_hw.control.safety import CycleInput, Safety, Verdict
+from deal_hw.control.safety import CycleInput, Safety, SafetyDecision
 from deal_hw.data.recording.record import CycleRecord, encode
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
@@ -83,9 +83,9 @@ class Spy(Safety):
     def __init__(self) -> None:
         super().__init__(DRIVER)
         self.told: list[CycleInput] = []
-        self.said: list[Verdict] = []
+        self.said: list[SafetyDecision] = []
 
-    def step(self, cycle: CycleInput, wanted: JointCommand | None) -> Verdict:
+    def step(self, cycle: CycleInput, wanted: JointCommand | None) -> SafetyDecision:
         """Judge as ever."""
         self.told.append(cycle)
         self.said.append(super().step(cycle, wanted))

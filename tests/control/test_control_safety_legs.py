@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.control.leg_checks import LegChecks, tilt
-from deal_hw.control.safety import CycleInput, Safety, SafetyState, Verdict
+from deal_hw.control.safety import CycleInput, Safety, SafetyDecision, SafetyState
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import SafetyError
@@ -109,7 +109,7 @@ def armed(safety: Safety) -> Safety:
     return safety
 
 
-def step(safety: Safety, at_ms: float, sample: RobotState | None = None, **changes: Any) -> Verdict:
+def step(safety: Safety, at_ms: float, sample: RobotState | None = None, **changes: Any) -> SafetyDecision:
     """Run a cycle some time after arming."""
     now = T0 + round(at_ms * MS)
     return safety.step(cycle(now, sample, **changes), command())

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from deal_hw.data.recording.excitation import excitation
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict, check, worst
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, check, worst
 from deal_hw.types import Status, Trajectory
 
 MakeTrajectory = Callable[..., Trajectory]
 
 
-def verdict(trajectory: Trajectory, name: str) -> Verdict:
+def verdict(trajectory: Trajectory, name: str) -> CheckResult:
     """Return one verdict by its name."""
     (found,) = [verdict for verdict in check(trajectory) if verdict.name == name]
     return found

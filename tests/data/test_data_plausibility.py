@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from deal_hw.data.checks.joint_match import best_assignment
 from deal_hw.data.checks.plausibility import examine, require
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict, worst
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, worst
 from deal_hw.errors import DatasetError, MissingExtraError
 from deal_hw.install import install_line
 
@@ -25,7 +25,7 @@ MakeTable = Callable[..., Table]
 LIMITS = np.array([[-1.0, 1.0]] * 3)
 
 
-def verdict(table: Table, name: str, limits: np.ndarray | None = None) -> Verdict:
+def verdict(table: Table, name: str, limits: np.ndarray | None = None) -> CheckResult:
     """Return one verdict on a recording."""
     return next(verdict for verdict in examine(table, limits) if verdict.name == name)
 

@@ -15,7 +15,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.compiling import load_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
-from deal_hw.sim.recordings.episode import SENT, Episode
+from deal_hw.sim.recordings.episode import SENT, SampledEpisode
 from deal_hw.sim.recordings.gravity_gain import gravity_gain
 from deal_hw.sim.recordings.parts import joined, part, split_last, spread, stretches
 
@@ -50,12 +50,12 @@ def robot_of(folder: Path, text: str = ARM) -> RobotModel:
     return load_model(describe(path, model, ("lift", "rail"), ("lift", "rail"), rates), rates.step_s)
 
 
-def hold(robot: RobotModel, target: tuple[float, float], position: tuple[float, float]) -> Episode:
+def hold(robot: RobotModel, target: tuple[float, float], position: tuple[float, float]) -> SampledEpisode:
     """Return an episode in which the robot stands at a position under a command."""
     T = 100
     steps = 10 * (T - 1)
     rows = np.ones((steps, 2))
-    return Episode(
+    return SampledEpisode(
         step_s=robot.step_s,
         sample=10 * np.arange(T),
         position=np.tile(position, (T, 1)),

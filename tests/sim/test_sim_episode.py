@@ -14,7 +14,7 @@ from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align, fill_gaps
+from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps
 from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import Trajectory
 
@@ -108,7 +108,7 @@ def test_short_gaps_are_filled_by_a_spline_and_long_ones_by_lines() -> None:
     kept = np.delete(np.arange(200), [104, *range(150, 160)])  # 3 Hz * 104 * 0.02 s: a quarter turn past 6.
     time_s = 0.02 * np.arange(200)
     motion = np.sin(2 * np.pi * 3.0 * time_s)
-    whole = Episode(
+    whole = SampledEpisode(
         step_s=0.02,
         sample=kept,
         position=motion[kept, None],

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.recordings.episode import Episode, thin
+from deal_hw.sim.recordings.episode import SampledEpisode, thin
 
 SAMPLES = 100
 
 
-def episode(lost: tuple[int, ...] = ()) -> Episode:
+def episode(lost: tuple[int, ...] = ()) -> SampledEpisode:
     """Return 0.2 s of one joint at 500 Hz on a grid of 1 ms; its position is its time in seconds."""
     kept = np.setdiff1d(np.arange(SAMPLES), lost)
     sample = 2 * kept
     one = np.ones((2 * SAMPLES, 1))
-    return Episode(
+    return SampledEpisode(
         step_s=1e-3,
         sample=sample,
         position=1e-3 * sample[:, None],

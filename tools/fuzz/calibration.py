@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from mcap_ros2.writer import Writer
 
-from deal_hw.calib.search.resume import Checkpoint, pack
+from deal_hw.calib.search.resume import SearchCheckpoint, pack
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.cli.emulate_common import read_truth
 from deal_hw.cli.train import read_distribution
@@ -316,7 +316,7 @@ def read_model(path: Path) -> None:
 
 
 def _checkpoint(path: Path) -> None:
-    Checkpoint(path, "id").load()
+    SearchCheckpoint(path, "id").load()
 
 
 KINDS: dict[str, Kind] = {

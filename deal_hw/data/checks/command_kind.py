@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.types import FloatArray
 
 LAG_S: Final = 0.3
@@ -42,7 +42,7 @@ STILL: Final = {"rad": 0.02, "m": 0.002}
 """A joint or a command whose standard deviation is a quarter of this or less says nothing [rad or m]."""
 
 
-def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> Verdict:
+def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None) -> CheckResult:
     """Check that commands are what the actuators of the model take.
 
     Args:
@@ -63,8 +63,10 @@ def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None)
     test = _is_effort if servo else _is_position
     found = [table.actuated[c] for c, i in joints if test(position[:, i], command[:, c], period)]
     if not joints or len(found) < MOST * len(joints):
-        return beyond or Verdict("actuation", Severity.OK, "commands are of the kind that the model takes")
-    return Verdict("actuation", Severity.FAIL, _accusation(found, servo=servo))
+        return beyond or CheckResult(
+            "actuation", Severity.OK, "commands are of the kind that the model takes"
+        )
+    return CheckResult("actuation", Severity.FAIL, _accusation(found, servo=servo))
 
 
 def _accusation(names: Sequence[str], *, servo: bool) -> str:
@@ -84,7 +86,7 @@ def _accusation(names: Sequence[str], *, servo: bool) -> str:
     )
 
 
-def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> Verdict | None:
+def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> CheckResult | None:
     """Return what to say of commands that the actuators would clip; None where there are hardly any."""
     if limits is None:
         return None
@@ -101,7 +103,7 @@ def _beyond(table: Table, limits: FloatArray | None, servo: bool) -> Verdict | N
     other = "torques for a position actuator" if servo else "positions for a motor"
     text = f"commands outside the actuators' ctrlrange: {', '.join(named)}; {other}, or another unit?"
     severe = float(np.max(share)) > BEYOND[1]
-    return Verdict("actuation", Severity.FAIL if severe else Severity.WARN, text)
+    return CheckResult("actuation", Severity.FAIL if severe else Severity.WARN, text)
 
 
 def _on_grid(table: Table) -> tuple[FloatArray, FloatArray, FloatArray]:

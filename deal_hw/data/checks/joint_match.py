@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.data.importing.table import Table
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
@@ -49,12 +49,12 @@ class _Match:
     near: FloatArray
 
 
-def match(table: Table) -> tuple[Verdict, Verdict]:
+def match(table: Table) -> tuple[CheckResult, CheckResult]:
     """Check order and sign of the joints, and that measurements follow commands."""
     found = _correlate(table)
     if found is None:
         text = "no joint's command and measurement both move enough to compare"
-        return Verdict("assignment", Severity.WARN, text), Verdict("delay", Severity.OK, text)
+        return CheckResult("assignment", Severity.WARN, text), CheckResult("delay", Severity.OK, text)
     follows = found.lags_s >= -1e-9
     own = np.abs(np.diagonal(found.correlation, axis1=1, axis2=2)).mean(axis=1)
     # Where joints are swapped, the given pairs say nothing of the lag: each takes the best partner it has.
@@ -112,7 +112,7 @@ def _correlations(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(a.T @ b / np.where(norm > 0, norm, np.inf))
 
 
-def _assignment(found: _Match, at: int) -> Verdict:
+def _assignment(found: _Match, at: int) -> CheckResult:
     C = found.correlation[at]
     M = len(found.names)
     same = np.arange(M)
@@ -151,20 +151,20 @@ def _assignment(found: _Match, at: int) -> Verdict:
                 "column map",
             )
     if best is not None:
-        return Verdict(
+        return CheckResult(
             "assignment", Severity.FAIL, f"commands and measurements do not belong together: {best[1]}"
         )
     against = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < -GOOD]
     if against:
         text = f"a joint moves against its command: {', '.join(against)}; check order and sign of the joints"
-        return Verdict("assignment", Severity.FAIL, text)
+        return CheckResult("assignment", Severity.FAIL, text)
     weak = [f"{name} {C[i, i]:.2f}" for i, name in enumerate(found.names) if C[i, i] < CLEAR]
     if weak:
         text = f"command and measurement of a joint hardly move together: {', '.join(weak)}"
-        return Verdict(
+        return CheckResult(
             "assignment", Severity.WARN, f"{text}; is it free, blocked, or another joint's channel?"
         )
-    return Verdict(
+    return CheckResult(
         "assignment", Severity.OK, f"each of {M} joints follows its own command (at least {_least(C):.2f})"
     )
 
@@ -195,7 +195,7 @@ def _pairs(found: _Match, C: FloatArray, order: IntArray, moved: IntArray) -> st
     return ", ".join(parts)
 
 
-def _delay(found: _Match, own: FloatArray) -> Verdict:
+def _delay(found: _Match, own: FloatArray) -> CheckResult:
     at = int(np.argmax(own))
     lag_s, period = float(found.lags_s[at]), float(found.lags_s[1] - found.lags_s[0])
     text = f"measurements follow commands by about {lag_s * 1e3:.0f} ms"
@@ -206,12 +206,12 @@ def _delay(found: _Match, own: FloatArray) -> Verdict:
             "have one clock, "
             "and is the target column the one that was sent?"
         )
-        return Verdict("delay", Severity.FAIL, text)
+        return CheckResult("delay", Severity.FAIL, text)
     if lag_s > MAX_LAG_S - period:
-        return Verdict(
+        return CheckResult(
             "delay", Severity.WARN, f"measurements follow commands by {lag_s:.2f} s or more; is that right?"
         )
-    return Verdict("delay", Severity.OK, text)
+    return CheckResult("delay", Severity.OK, text)
 
 
 def best_assignment(score: FloatArray) -> IntArray:

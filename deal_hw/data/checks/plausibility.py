@@ -3,7 +3,7 @@
 ``recording/telemetry_checks`` looks at what our own recorder wrote; these look for what goes wrong on the way
 from somebody else's log: a clock in the wrong unit or going backwards, degrees for radians, joints in another
 order or with another sign, a target that is a copy of the measurement, and the like. A check returns one
-:class:`~deal_hw.data.recording.telemetry_checks.Verdict`; "fail" is a refusal.
+:class:`~deal_hw.data.recording.telemetry_checks.CheckResult`; "fail" is a refusal.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from deal_hw.data.checks.joint_match import match
 from deal_hw.data.checks.slip import slip_verdict
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings, find_spikes, sound
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict, spikes_verdict
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, spikes_verdict
 from deal_hw.errors import DatasetError
 from deal_hw.types import FloatArray
 
@@ -47,7 +47,7 @@ def examine(
     limits: FloatArray | None = None,
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
-) -> tuple[Verdict, ...]:
+) -> tuple[CheckResult, ...]:
     """Run all checks on a recording; the order is fixed.
 
     Where clock or values are unusable the later checks are left out: they would only say the same again.
@@ -93,7 +93,7 @@ def despiked(table: Table, settings: SpikeSettings) -> Table:
     return table.rows(sound(found, table.time_s.size)) if found else table
 
 
-def require(verdicts: Sequence[Verdict], name: str) -> None:
+def require(verdicts: Sequence[CheckResult], name: str) -> None:
     """Refuse a recording with a failed check.
 
     Raises:
@@ -106,17 +106,17 @@ def require(verdicts: Sequence[Verdict], name: str) -> None:
         raise DatasetError(f"{name} cannot be used: {'; '.join(failed)}")
 
 
-def _verdict(name: str, severity: Severity, message: str) -> Verdict:
-    return Verdict(name, severity, message)
+def _verdict(name: str, severity: Severity, message: str) -> CheckResult:
+    return CheckResult(name, severity, message)
 
 
-def _size(table: Table) -> Verdict:
+def _size(table: Table) -> CheckResult:
     count = table.time_s.size
     text = f"{count} samples, {table.command_s.size} commands, {len(table.joint_names)} joints"
     return _verdict("size", Severity.OK if count >= 3 else Severity.FAIL, text)
 
 
-def _finite(table: Table) -> Verdict:
+def _finite(table: Table) -> CheckResult:
     counts = {
         f"{kind} of {joint}": (int(np.sum(~np.isfinite(values[:, column]))), kind)
         for kind, values, joints in (
@@ -144,7 +144,7 @@ def _finite(table: Table) -> Verdict:
     return _verdict("finite", Severity.WARN, f"{text}; samples without a position are left out")
 
 
-def _clock(table: Table) -> Verdict:
+def _clock(table: Table) -> CheckResult:
     for what, stamps in (("samples", table.time_s), ("commands", table.command_s)):
         steps = np.diff(stamps)
         back = np.flatnonzero(steps < 0)
@@ -169,7 +169,7 @@ def _steps(clock: FloatArray) -> FloatArray:
     return steps[steps > 0]
 
 
-def _rate(clock: FloatArray) -> Verdict:
+def _rate(clock: FloatArray) -> CheckResult:
     steps = _steps(clock)
     if not steps.size:
         return _verdict("rate", Severity.FAIL, "the clock stands still")
@@ -189,7 +189,7 @@ def _rate(clock: FloatArray) -> Verdict:
     return _verdict("rate", Severity.OK, text)
 
 
-def _gaps(clock: FloatArray) -> Verdict:
+def _gaps(clock: FloatArray) -> CheckResult:
     steps = _steps(clock)
     period = float(np.median(steps))
     long = steps[steps > GAP_PERIODS * period]
@@ -209,7 +209,7 @@ def _moves(table: Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
     return np.asarray(np.nanmax(table.position, axis=0) - np.nanmin(table.position, axis=0) >= least)
 
 
-def _frozen(table: Table) -> Verdict:
+def _frozen(table: Table) -> CheckResult:
     moves = _moves(table)
     commanded = np.zeros(len(table.joint_names), dtype=bool)
     if table.command_s.size:
@@ -262,7 +262,7 @@ def held_target(table: Table) -> FloatArray:
     return np.asarray(table.target[np.maximum(rows, 0)])
 
 
-def _commands(table: Table) -> Verdict:
+def _commands(table: Table) -> CheckResult:
     if not table.command_s.size:
         text = (
             "no commanded positions; name them as `target` in the column map: without them "
@@ -286,7 +286,7 @@ def _commands(table: Table) -> Verdict:
     return _verdict("commands", Severity.OK, text)
 
 
-def _copy(table: Table) -> Verdict:
+def _copy(table: Table) -> CheckResult:
     held, measured = held_target(table), table.position[:, list(table.actuated_index)]
     copied = []
     for column, name in enumerate(table.actuated):
@@ -306,7 +306,7 @@ def _copy(table: Table) -> Verdict:
     return _verdict("copy", Severity.FAIL, text)
 
 
-def _slip(table: Table) -> Verdict:
+def _slip(table: Table) -> CheckResult:
     # A stamp that stands twice is reported by the clock's check; here the first of each counts.
     new = np.concatenate([[True], np.diff(table.time_s) > 0])
     return slip_verdict(
@@ -317,7 +317,7 @@ def _slip(table: Table) -> Verdict:
 _FACTORS = {DEGREES: "degrees for radians", 1000.0: "millimetres for metres"}
 
 
-def _units(table: Table, limits: FloatArray | None) -> Verdict:
+def _units(table: Table, limits: FloatArray | None) -> CheckResult:
     """Compare the spans of command and measurement, and both with the model's limits."""
     held, found = held_target(table), []
     for column, index in enumerate(table.actuated_index):
@@ -359,7 +359,7 @@ def _units(table: Table, limits: FloatArray | None) -> Verdict:
     return _verdict("units", Severity.OK, "ranges of commands and measurements fit each other")
 
 
-def _levels(table: Table) -> Verdict:
+def _levels(table: Table) -> CheckResult:
     held, found = held_target(table), []
     for column, index in enumerate(table.actuated_index):
         off = float(np.nanmedian(table.position[:, index] - held[:, column]))
@@ -403,7 +403,7 @@ def _normal_range(values: FloatArray) -> str:
     return "another unit"
 
 
-def _inside_limits(table: Table, limits: FloatArray | None) -> Verdict:
+def _inside_limits(table: Table, limits: FloatArray | None) -> CheckResult:
     if limits is None:
         return _verdict("limits", Severity.OK, "no joint limits given to compare with")
     found, severe = [], False
@@ -434,7 +434,7 @@ def _at_extreme(values: FloatArray) -> float:
     return float(max(np.mean(values == np.max(values)), np.mean(values == np.min(values))))
 
 
-def _clipped_commands(table: Table, limits: FloatArray | None) -> Verdict:
+def _clipped_commands(table: Table, limits: FloatArray | None) -> CheckResult:
     held, found = held_target(table), []
     for column, (index, name) in enumerate(zip(table.actuated_index, table.actuated, strict=True)):
         share = _at_extreme(held[:, column])
@@ -454,7 +454,7 @@ def _clipped_commands(table: Table, limits: FloatArray | None) -> Verdict:
     return _verdict("clamped", Severity.WARN, text)
 
 
-def _saturated_effort(table: Table) -> Verdict:
+def _saturated_effort(table: Table) -> CheckResult:
     if table.effort is None:
         return _verdict("saturated", Severity.OK, "no effort recorded")
     found = [
@@ -470,7 +470,7 @@ def _saturated_effort(table: Table) -> Verdict:
     return _verdict("saturated", Severity.WARN, text)
 
 
-def _excitation(table: Table) -> Verdict:
+def _excitation(table: Table) -> CheckResult:
     spans = [_span(column) for column in table.position.T]
     weak = [
         f"{name} {span:.2g} {unit}"
@@ -489,7 +489,7 @@ def _excitation(table: Table) -> Verdict:
     return _verdict("excitation", Severity.OK, "every joint moves enough to look at")
 
 
-def _quaternion(table: Table) -> Verdict:
+def _quaternion(table: Table) -> CheckResult:
     values = np.asarray(table.orientation)
     off = float(np.max(np.abs(np.linalg.norm(values, axis=1) - 1)))
     if not off < 0.02:

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
 from deal_hw.types import FloatArray, IntArray
 
 AHEAD_S: Final = 0.1
@@ -71,17 +71,17 @@ class Slip:
 
 def slip_verdict(
     time_s: FloatArray, position: FloatArray, command_s: FloatArray, target: FloatArray, actuated: IntArray
-) -> Verdict:
+) -> CheckResult:
     """Check that one delay holds for the whole recording; arguments as of :func:`find_slip`."""
     found = find_slip(time_s, position, command_s, target, actuated)
     if found is None:
-        return Verdict(
+        return CheckResult(
             "slip", Severity.OK, "too short, or too little motion, to look for slips of the clocks"
         )
     if found.clear < CLEAR or found.agree < AGREE or abs(found.later_s) < LEAST_S:
-        return Verdict("slip", Severity.OK, "one delay holds for the whole recording")
+        return CheckResult("slip", Severity.OK, "one delay holds for the whole recording")
     side = "later" if found.later_s > 0 else "sooner"
-    return Verdict(
+    return CheckResult(
         "slip",
         Severity.FAIL if found.clear >= GLARING else Severity.WARN,
         f"from {found.begin_s:.3g} s to {found.end_s:.3g} s measurements follow commands about "

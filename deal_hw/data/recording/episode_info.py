@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from deal_hw.data.recording.clock_sync import synchronize
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import Episode, read_episode
-from deal_hw.data.recording.telemetry_checks import Severity, Verdict, check
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, check
 from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
 from deal_hw.schema import STRICT
 
@@ -33,7 +33,7 @@ class EpisodeInfo:
         states: State samples.
         commands: Commands sent.
         cycles: Control cycles.
-        verdicts: The telemetry checks, as ``telemetry_checks.Verdict.to_json`` writes them.
+        verdicts: The telemetry checks, as ``telemetry_checks.CheckResult.to_json`` writes them.
         excitation: Movement, as ``excitation.Excitation.to_json`` writes it.
         clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20
             jumps at most; None where it cannot be told.
@@ -103,7 +103,7 @@ def summarize(path: Path, file: str, note: str = "", facts: Mapping[str, Any] | 
             states=0,
             commands=0,
             cycles=0,
-            verdicts=(Verdict("length", Severity.FAIL, str(error)).to_json(),),
+            verdicts=(CheckResult("length", Severity.FAIL, str(error)).to_json(),),
             excitation=None,
             clock=None,
             note=note or "empty",

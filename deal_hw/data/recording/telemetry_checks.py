@@ -1,6 +1,6 @@
 """Telemetry checks: what in a recording would mislead a calibration.
 
-A check returns one :class:`Verdict`: "ok", "warn" (usable, but know it) or "fail" (calibrate refuses).
+A check returns one :class:`CheckResult`: "ok", "warn" (usable, but know it) or "fail" (calibrate refuses).
 Clamping by the device is data and never fails; clamping by our own safety filter is flagged, because the
 policy was not obeyed.
 """
@@ -38,7 +38,7 @@ class Severity(str, enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CheckResult:
     """The result of one check.
 
     Attributes:
@@ -56,7 +56,7 @@ class Verdict:
         return {key: str(value) for key, value in asdict(self).items()}
 
 
-def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tuple[Verdict, ...]:
+def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tuple[CheckResult, ...]:
     """Run all checks on a recording; the order is fixed.
 
     Args:
@@ -66,7 +66,9 @@ def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tup
     if trajectory.device_s.size < 2:
         count = trajectory.device_s.size
         return (
-            Verdict("length", Severity.FAIL, f"{count} state samples; record at least {MIN_DURATION_S:g} s"),
+            CheckResult(
+                "length", Severity.FAIL, f"{count} state samples; record at least {MIN_DURATION_S:g} s"
+            ),
         )
     return (
         _length(trajectory),
@@ -97,29 +99,29 @@ def spikes_verdict(
     joints: Sequence[str],
     units: Sequence[str],
     settings: SpikeSettings,
-) -> Verdict:
+) -> CheckResult:
     """Say which samples jump away and come back; arguments as of :func:`find_spikes`."""
     found = find_spikes(time_s, position, units, settings)
     if not found:
-        return Verdict("spikes", Severity.OK, "no position jumps away and comes back")
+        return CheckResult("spikes", Severity.OK, "no position jumps away and comes back")
     count = len({row for spike in found for row in spike.rows})
     text = (
         f"{count} samples jump and come back, faster than the joint ever moves otherwise: "
         f"{describe(found, time_s, joints, units)}"
     )
     if count > settings.most * time_s.size:
-        return Verdict(
+        return CheckResult(
             "spikes",
             Severity.FAIL,
             f"{text}; that is {count / time_s.size:.1%} of all samples: the sensor or its line fails. Mend "
             "it and record again",
         )
-    return Verdict(
+    return CheckResult(
         "spikes", Severity.WARN, f"{text}. Calibration leaves them out (--spike-ratio); check sensor and line"
     )
 
 
-def worst(verdicts: Sequence[Verdict]) -> Severity:
+def worst(verdicts: Sequence[CheckResult]) -> Severity:
     """Return the worst severity."""
     order = list(Severity)
     return max((verdict.severity for verdict in verdicts), key=order.index, default=Severity.OK)
@@ -131,15 +133,15 @@ def nominal_period_s(trajectory: Trajectory) -> float:
     return 1.0 / rate_hz if rate_hz else float(np.median(np.diff(trajectory.device_s)))
 
 
-def _length(trajectory: Trajectory) -> Verdict:
+def _length(trajectory: Trajectory) -> CheckResult:
     duration_s, count = trajectory.duration_s, trajectory.device_s.size
     text = f"{duration_s:.2f} s, {count} state samples, {trajectory.sent_s.size} commands"
     if duration_s >= MIN_DURATION_S:
-        return Verdict("length", Severity.OK, text)
-    return Verdict("length", Severity.FAIL, f"{text}; too short, record at least {MIN_DURATION_S:g} s")
+        return CheckResult("length", Severity.OK, text)
+    return CheckResult("length", Severity.FAIL, f"{text}; too short, record at least {MIN_DURATION_S:g} s")
 
 
-def _finite(trajectory: Trajectory) -> Verdict:
+def _finite(trajectory: Trajectory) -> CheckResult:
     bad = {
         f"{channel} of {joint}": int(np.sum(~np.isfinite(getattr(trajectory, channel)[:, index])))
         for channel in ("position", "velocity", "effort")
@@ -150,62 +152,68 @@ def _finite(trajectory: Trajectory) -> Verdict:
         bad = {name: count for name, count in bad.items() if not name.startswith("effort")}
     found = [f"{name}: {count}" for name, count in bad.items() if count]
     if not found:
-        return Verdict("finite", Severity.OK, "all values are finite")
+        return CheckResult("finite", Severity.OK, "all values are finite")
     # Effort is the device's own estimate; a robot without one reports NaN, and calibration does not read it.
     severity = Severity.WARN if all(name.startswith("effort") for name in found) else Severity.FAIL
-    return Verdict("finite", severity, f"values that are not finite ({', '.join(found)}); check the sensors")
+    return CheckResult(
+        "finite", severity, f"values that are not finite ({', '.join(found)}); check the sensors"
+    )
 
 
-def _clock(trajectory: Trajectory) -> Verdict:
+def _clock(trajectory: Trajectory) -> CheckResult:
     back = int(np.sum(np.diff(trajectory.device_s) < 0))
     if back:
         text = f"the device clock ran backwards {back} times; did the device restart? Record again"
-        return Verdict("clock", Severity.FAIL, text)
+        return CheckResult("clock", Severity.FAIL, text)
     jumps = find_jumps(trajectory.device_s, trajectory.receive_s - trajectory.device_s)
     if jumps:
         places = ", ".join(f"{jump.size_s * 1e3:+.1f} ms at {jump.device_s:.2f} s" for jump in jumps[:5])
         text = f"{len(jumps)} clock jumps ({places}); do not set clocks while recording. Record again"
-        return Verdict("clock", Severity.FAIL, text)
+        return CheckResult("clock", Severity.FAIL, text)
     repeated = int(np.sum(np.diff(trajectory.device_s) == 0))
     if repeated:
         severity = Severity.FAIL if repeated > 0.02 * trajectory.device_s.size else Severity.WARN
         text = f"{repeated} samples repeat the device time of the one before; is the device stuck?"
-        return Verdict("clock", severity, text)
-    return Verdict("clock", Severity.OK, "the clocks of device and host run evenly")
+        return CheckResult("clock", severity, text)
+    return CheckResult("clock", Severity.OK, "the clocks of device and host run evenly")
 
 
-def _gaps(trajectory: Trajectory) -> Verdict:
+def _gaps(trajectory: Trajectory) -> CheckResult:
     steps = np.diff(trajectory.device_s)
     period_s = nominal_period_s(trajectory)
     count, longest_s = int(np.sum(steps > 1.5 * period_s)), float(np.max(steps))
     text = f"{count} gaps in the state stream, the longest {longest_s * 1e3:.1f} ms"
     if longest_s > max(MAX_GAP_S, 2.5 * period_s):
-        return Verdict(
+        return CheckResult(
             "gaps", Severity.FAIL, f"{text}; more than {MAX_GAP_S * 1e3:g} ms is too long. Check the cable"
         )
-    return Verdict("gaps", Severity.WARN if count > 0.02 * steps.size else Severity.OK, text)
+    return CheckResult("gaps", Severity.WARN if count > 0.02 * steps.size else Severity.OK, text)
 
 
-def _lost_frames(trajectory: Trajectory) -> Verdict:
+def _lost_frames(trajectory: Trajectory) -> CheckResult:
     lost = int(trajectory.metadata.get("lost_frames", 0))
     share = lost / (lost + trajectory.device_s.size)
     text = f"{lost} state samples never arrived ({share:.1%})"
     if share > 0.2:
-        return Verdict("lost_frames", Severity.FAIL, f"{text}; check the cable and the load of this computer")
-    return Verdict("lost_frames", Severity.WARN if share > 0.02 else Severity.OK, text)
+        return CheckResult(
+            "lost_frames", Severity.FAIL, f"{text}; check the cable and the load of this computer"
+        )
+    return CheckResult("lost_frames", Severity.WARN if share > 0.02 else Severity.OK, text)
 
 
-def _jitter(trajectory: Trajectory) -> Verdict:
+def _jitter(trajectory: Trajectory) -> CheckResult:
     delay_s = trajectory.receive_s - trajectory.device_s
     lateness_s = delay_s - np.min(delay_s)
     p50, p99 = np.percentile(lateness_s, [50, 99])
     text = f"samples arrive {p50 * 1e3:.2f} ms (p50), {p99 * 1e3:.2f} ms (p99) after the fastest one"
     if p99 > 0.02:
-        return Verdict("jitter", Severity.WARN, f"{text}; control was late, the device's own stamps are not")
-    return Verdict("jitter", Severity.OK, text)
+        return CheckResult(
+            "jitter", Severity.WARN, f"{text}; control was late, the device's own stamps are not"
+        )
+    return CheckResult("jitter", Severity.OK, text)
 
 
-def _frozen(trajectory: Trajectory) -> Verdict:
+def _frozen(trajectory: Trajectory) -> CheckResult:
     moving = np.any(np.diff(trajectory.position, axis=0) != 0, axis=1)
     found = []
     for index, joint in enumerate(trajectory.joint_names):
@@ -213,12 +221,12 @@ def _frozen(trajectory: Trajectory) -> Verdict:
         if still_s > FROZEN_S:
             found.append(f"{joint} for {still_s:.2f} s")
     if not found:
-        return Verdict("frozen", Severity.OK, "no position stands still while others move")
+        return CheckResult("frozen", Severity.OK, "no position stands still while others move")
     text = (
         f"positions without any change while other joints move: {', '.join(found)}; is the sensor connected?"
     )
     whole = any(not np.any(np.diff(column)) for column in trajectory.position.T)
-    return Verdict("frozen", Severity.FAIL if whole else Severity.WARN, text)
+    return CheckResult("frozen", Severity.FAIL if whole else Severity.WARN, text)
 
 
 def _longest_still(trajectory: Trajectory, index: int, moving: np.ndarray[Any, np.dtype[np.bool_]]) -> float:
@@ -231,53 +239,57 @@ def _longest_still(trajectory: Trajectory, index: int, moving: np.ndarray[Any, n
     return float(np.max(spans[others], initial=0.0))
 
 
-def _commands(trajectory: Trajectory) -> Verdict:
+def _commands(trajectory: Trajectory) -> CheckResult:
     seen = np.unique(trajectory.command_sequence[trajectory.command_sequence >= 0])
     sent = trajectory.sent_sequence
     if not sent.size:
-        return Verdict("commands", Severity.WARN, "no command was sent; the motors were passive all along")
+        return CheckResult(
+            "commands", Severity.WARN, "no command was sent; the motors were passive all along"
+        )
     inside = sent[sent <= (seen[-1] if seen.size else -1)]
     arrived = float(np.mean(np.isin(inside, seen))) if inside.size else 0.0
     text = f"{arrived:.1%} of the commands were seen in force"
     if arrived < 0.5:
-        return Verdict(
+        return CheckResult(
             "commands", Severity.FAIL, f"{text}; the device does not get them. Check the line to it"
         )
-    return Verdict("commands", Severity.WARN if arrived < 0.98 else Severity.OK, text)
+    return CheckResult("commands", Severity.WARN if arrived < 0.98 else Severity.OK, text)
 
 
-def _clamped_by_device(trajectory: Trajectory) -> Verdict:
+def _clamped_by_device(trajectory: Trajectory) -> CheckResult:
     effort = np.mean((trajectory.status & int(Status.EFFORT_CLAMPED)) != 0)
     speed = np.mean((trajectory.status & int(Status.SPEED_CLAMPED)) != 0)
     text = f"the device's own limits were in force: effort {effort:.1%}, speed {speed:.1%} of the time (data)"
-    return Verdict("clamped_by_device", Severity.OK, text)
+    return CheckResult("clamped_by_device", Severity.OK, text)
 
 
-def _clamped_by_us(trajectory: Trajectory) -> Verdict:
+def _clamped_by_us(trajectory: Trajectory) -> CheckResult:
     asked, sent = trajectory.requested_position, trajectory.position_target
     clipped = np.any(np.abs(asked - sent) > CLIP_TOLERANCE, axis=1)
     count = int(np.sum(clipped))
     text = f"our safety filter changed {count} of {clipped.size} commands"
     if count > 0.05 * clipped.size:
-        return Verdict("clamped_by_us", Severity.WARN, f"{text}; ask for smaller targets or raise its limits")
-    return Verdict("clamped_by_us", Severity.OK, text)
+        return CheckResult(
+            "clamped_by_us", Severity.WARN, f"{text}; ask for smaller targets or raise its limits"
+        )
+    return CheckResult("clamped_by_us", Severity.OK, text)
 
 
-def _stopped(trajectory: Trajectory) -> Verdict:
+def _stopped(trajectory: Trajectory) -> CheckResult:
     watchdog = float(np.mean((trajectory.status & int(Status.WATCHDOG)) != 0))
     fault = float(np.mean((trajectory.status & int(Status.FAULT)) != 0))
     stops = float(np.mean((trajectory.status & int(Status.AT_END_STOP)) != 0))
     text = f"watchdog {watchdog:.1%}, fault {fault:.1%}, at an end stop {stops:.1%} of the time"
     if watchdog or fault:
-        return Verdict("stopped", Severity.WARN, f"{text}; the motors were off then, use the part before")
+        return CheckResult("stopped", Severity.WARN, f"{text}; the motors were off then, use the part before")
     if stops:
-        return Verdict("stopped", Severity.WARN, f"{text}; the model's end stops must fit")
-    return Verdict("stopped", Severity.OK, text)
+        return CheckResult("stopped", Severity.WARN, f"{text}; the model's end stops must fit")
+    return CheckResult("stopped", Severity.OK, text)
 
 
-def _hand_over(trajectory: Trajectory) -> Verdict:
+def _hand_over(trajectory: Trajectory) -> CheckResult:
     lost = int(trajectory.metadata.get("hand_over_losses", 0))
     text = f"{lost} control cycles did not reach the recorder"
     if lost:
         text += "; their samples are missing. Is the disk slow or the computer overloaded?"
-    return Verdict("hand_over", Severity.WARN if lost else Severity.OK, text)
+    return CheckResult("hand_over", Severity.WARN if lost else Severity.OK, text)

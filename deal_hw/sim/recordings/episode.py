@@ -19,7 +19,7 @@ SENT = ("target", "stiffness", "damping", "effort_limit", "speed_limit")
 
 
 @dataclass(frozen=True, slots=True)
-class Episode:
+class SampledEpisode:
     """T samples and the commands in force, on a grid of S device periods.
 
     Attributes:
@@ -86,7 +86,7 @@ class Episode:
         """Time from one sample to the next [s]."""
         return self.stride * self.step_s
 
-    def cut(self, rows: slice, periods: slice) -> Episode:
+    def cut(self, rows: slice, periods: slice) -> SampledEpisode:
         """Return the episode with these samples and periods only; indices and the start stay as they are."""
         each = {name: getattr(self, name)[rows] for name in ("sample", "position", "velocity", "usable")}
         # What is the same for all samples has no axis of samples.
@@ -96,7 +96,7 @@ class Episode:
         return dataclasses.replace(self, **each, **some, **sent)
 
 
-def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
+def align(trajectory: Trajectory, description: RobotDescription) -> SampledEpisode:
     """Put a recording on the device's time grid.
 
     A state sample says which command was in force and how long ago the device received it, so the reception
@@ -140,7 +140,7 @@ def align(trajectory: Trajectory, description: RobotDescription) -> Episode:
     usable = armed[rows] & known[rows] & ((trajectory.status[rows] & int(Status.WATCHDOG)) == 0)
     usable &= gap <= 2 * round(description.device_rate_hz / description.state_rate_hz)
     usable &= np.isfinite(trajectory.position[rows]).all(axis=1)
-    return Episode(
+    return SampledEpisode(
         step_s=step_s,
         sample=sample,
         position=trajectory.position[rows],
@@ -170,7 +170,7 @@ def _armed_at(trajectory: Trajectory, armed: npt.NDArray[np.bool_], first: int) 
     return np.asarray(np.where(np.isfinite(found), found, trajectory.position[first]))
 
 
-def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
+def fill_gaps(episode: SampledEpisode, longest_s: float = 0.05) -> SampledEpisode:
     """Return the episode with samples at regular times, lost ones filled in where the gap is short.
 
     What is filled in only holds the place: ``reported`` marks it, and nothing is fitted to it. Without this a
@@ -218,7 +218,7 @@ def fill_gaps(episode: Episode, longest_s: float = 0.05) -> Episode:
     )
 
 
-def thin(episode: Episode, rate_hz: float) -> Episode:
+def thin(episode: SampledEpisode, rate_hz: float) -> SampledEpisode:
     """Return the episode with about so many samples a second; what was sent stays as it is.
 
     States come faster than the motion changes: beyond some samples a control period each costs as much as the

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 BLOCK_S = 1.0
@@ -38,7 +38,7 @@ class GravityGain:
     deviation: FloatArray
 
 
-def gravity_gain(robot: RobotModel, episodes: list[Episode]) -> GravityGain | None:
+def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGain | None:
     """Estimate static gains from how far joints hang; None for motors and floating bases.
 
     Args:

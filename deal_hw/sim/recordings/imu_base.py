@@ -12,7 +12,7 @@ from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_vector
 from deal_hw.sim.legged.leg_odometry import HEIGHT_STD, VELOCITY_STD, Felt, leg_odometry, smooth_orientation
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
 ORIENTATION_SMOOTHER: Final = (7, 3)
@@ -89,13 +89,13 @@ def base_states(
 
 
 def with_base(
-    episode: Episode,
+    episode: SampledEpisode,
     robot: RobotModel,
     feet: tuple[str, ...],
     orientation: FloatArray,
     gyro: FloatArray,
     felt: Felt | None = None,
-) -> Episode:
+) -> SampledEpisode:
     """Return an episode of joints as one of the whole floating robot: joints, orientation and gyro measured.
 
     Args:

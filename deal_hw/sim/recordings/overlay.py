@@ -17,7 +17,7 @@ from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.recordings.episode import Episode, align
+from deal_hw.sim.recordings.episode import SampledEpisode, align
 from deal_hw.sim.recordings.standing import tangent_base, with_sensed_base
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray, IntArray, Status, Trajectory
@@ -183,7 +183,7 @@ def compute_overlay(
     )
 
 
-def _base(episode: Episode, windows: Windows, start: FloatArray, x: FloatArray) -> FloatArray | None:
+def _base(episode: SampledEpisode, windows: Windows, start: FloatArray, x: FloatArray) -> FloatArray | None:
     """Return the base's poses at the points of windows, (W, H + 1, 7); None for a fixed base."""
     if episode.reference is None:
         return None

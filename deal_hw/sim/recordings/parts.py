@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.parameters import LONGEST_LATENCY_S
-from deal_hw.sim.recordings.episode import SENT, Episode
+from deal_hw.sim.recordings.episode import SENT, SampledEpisode
 
 LEAD_S = LONGEST_LATENCY_S
 """Commands kept before a part's first sample: as long as any latency reaches back [s]."""
@@ -28,7 +28,7 @@ SAMPLED = {
 """Axes of what an episode has for each sample; what is the same for all samples has fewer."""
 
 
-def part(episode: Episode, first: int, last: int) -> Episode:
+def part(episode: SampledEpisode, first: int, last: int) -> SampledEpisode:
     """Return the samples first .. last - 1 of an episode, with the commands that act on them.
 
     Set-points without a speed limit depend on nothing older than the latency. With a limit the set-point at
@@ -47,7 +47,7 @@ def part(episode: Episode, first: int, last: int) -> Episode:
     )
 
 
-def stretches(episode: Episode, seconds: float) -> list[Episode]:
+def stretches(episode: SampledEpisode, seconds: float) -> list[SampledEpisode]:
     """Cut an episode into parts of equal length, none longer than ``seconds``; they share end samples."""
     T = len(episode.sample)
     count = max(int(np.ceil((T - 1) * episode.period_s / seconds)), 1)
@@ -55,9 +55,9 @@ def stretches(episode: Episode, seconds: float) -> list[Episode]:
     return [part(episode, int(a), int(b) + 1) for a, b in itertools.pairwise(edges) if b > a]
 
 
-def joined(parts: Sequence[Episode]) -> list[Episode]:
+def joined(parts: Sequence[SampledEpisode]) -> list[SampledEpisode]:
     """Return parts with those put together again that follow each other: the reverse of `stretches`."""
-    found: list[Episode] = []
+    found: list[SampledEpisode] = []
     for after in parts:
         if found and _follows(found[-1], after):
             found[-1] = _joined(found[-1], after)
@@ -66,7 +66,7 @@ def joined(parts: Sequence[Episode]) -> list[Episode]:
     return found
 
 
-def _follows(before: Episode, after: Episode) -> bool:
+def _follows(before: SampledEpisode, after: SampledEpisode) -> bool:
     """Say whether a part begins with the sample that another ends with."""
     return (
         after.first_row == before.first_row + len(before.sample) - 1
@@ -76,7 +76,7 @@ def _follows(before: Episode, after: Episode) -> bool:
     )
 
 
-def _joined(before: Episode, after: Episode) -> Episode:
+def _joined(before: SampledEpisode, after: SampledEpisode) -> SampledEpisode:
     shift = after.origin - before.origin
     samples: dict[str, Any] = {
         name: np.concatenate([getattr(before, name)[:-1], getattr(after, name)])
@@ -90,7 +90,7 @@ def _joined(before: Episode, after: Episode) -> Episode:
     return dataclasses.replace(before, **samples, **sent)
 
 
-def split_last(episode: Episode, share: float) -> tuple[Episode, Episode]:
+def split_last(episode: SampledEpisode, share: float) -> tuple[SampledEpisode, SampledEpisode]:
     """Return an episode without its last part, and that part.
 
     Args:
@@ -101,7 +101,7 @@ def split_last(episode: Episode, share: float) -> tuple[Episode, Episode]:
     return part(episode, 0, at + 1), part(episode, at, len(episode.sample))
 
 
-def spread(parts: Sequence[Episode], seconds: float) -> list[Episode]:
+def spread(parts: Sequence[SampledEpisode], seconds: float) -> list[SampledEpisode]:
     """Return parts that lie evenly over all and add up to about so many seconds; all where they are fewer."""
     lengths = np.array([(len(p.sample) - 1) * p.period_s for p in parts])
     if lengths.sum() <= seconds:

@@ -10,7 +10,7 @@ from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion
 from deal_hw.sim.legged.leg_odometry import Felt
 from deal_hw.sim.parameters.fields import element_id
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.imu_base import with_base
 from deal_hw.types import FloatArray, Trajectory
 
@@ -37,7 +37,7 @@ def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
     return poses
 
 
-def with_sensed_base(episode: Episode, robot: RobotModel, trajectory: Trajectory) -> Episode:
+def with_sensed_base(episode: SampledEpisode, robot: RobotModel, trajectory: Trajectory) -> SampledEpisode:
     """Return an episode of joints with the base from the body's sensors, as ``imu_base`` finds it.
 
     Args:

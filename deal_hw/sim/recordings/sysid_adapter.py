@@ -31,7 +31,7 @@ from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import KINDS, apply_parameters
 from deal_hw.sim.parameters.fields import BatchFields, ModelFields
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import Windows, setpoints
 from deal_hw.types import FloatArray
 
@@ -40,7 +40,7 @@ SENT_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class SysidRecording:
     """Windows of one episode, with the states they start from.
 
     Attributes:
@@ -50,7 +50,7 @@ class Recording:
         velocity: (W, C).
     """
 
-    episode: Episode
+    episode: SampledEpisode
     windows: Windows
     position: FloatArray
     velocity: FloatArray
@@ -116,7 +116,7 @@ def check_space(space: ParameterSpace) -> None:
 def identify(
     robot: RobotModel,
     space: ParameterSpace,
-    recordings: Sequence[Recording],
+    recordings: Sequence[SysidRecording],
     *,
     latency_s: float = 0.0,
     latency_range_s: tuple[float, float] | None = None,
@@ -207,7 +207,7 @@ class _Bridge:
     sysid: Any
     robot: RobotModel
     space: ParameterSpace
-    recordings: Sequence[Recording]
+    recordings: Sequence[SysidRecording]
     latency_s: float
     latency_range_s: tuple[float, float] | None
     steps: int = field(init=False, default=0)
@@ -249,7 +249,7 @@ class _Bridge:
             )
         return spec
 
-    def _measured(self, recording: Recording) -> FloatArray:
+    def _measured(self, recording: SysidRecording) -> FloatArray:
         """Return each window's joint positions, start included, (W, 1 + H, J); NaN where not reported."""
         episode, start = recording.episode, recording.windows.start
         rows = start[:, None] + np.arange(recording.windows.length + 1)

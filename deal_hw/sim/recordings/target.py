@@ -1,8 +1,8 @@
 """Sim-to-sim targets: a robot whose parameters are hidden, recorded as a sensor would see it.
 
 The stand-in for a real robot in benches of robots that have no emulator on a wire: it gives an
-:class:`~deal_hw.sim.recordings.episode.Episode` on the device's grid, as aligning a recording would, and the
-truth beside.
+:class:`~deal_hw.sim.recordings.episode.SampledEpisode` on the device's grid, as aligning a recording
+would, and the truth beside.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, reported
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.imu_base import base_states
 from deal_hw.types import FloatArray
 
@@ -56,7 +56,7 @@ class TargetRecording:
         velocity: True velocities at the samples, (T, C).
     """
 
-    episode: Episode
+    episode: SampledEpisode
     position: FloatArray
     velocity: FloatArray
 
@@ -175,7 +175,7 @@ class _Sensor:
             truth[:, robot.rotation] = to_vector(orientation, reference)
         as_rows = np.ones((len(target), 1))
         description = robot.description
-        episode = Episode(
+        episode = SampledEpisode(
             step_s=robot.step_s,
             sample=np.arange(T) * stride,
             position=position,

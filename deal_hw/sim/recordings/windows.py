@@ -13,7 +13,7 @@ import numpy as np
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.servo import delay, play, slew
-from deal_hw.sim.recordings.episode import Episode
+from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
 SENT_MARGIN_S = 0.05
@@ -43,7 +43,7 @@ class Windows:
 
 
 def cut_windows(
-    episode: Episode, length: int, hop: int | None = None, first: int = 0, latest_s: float = 0.0
+    episode: SampledEpisode, length: int, hop: int | None = None, first: int = 0, latest_s: float = 0.0
 ) -> Windows:
     """Cut an episode into windows in which every sample is usable and what is sent stays the same.
 
@@ -85,7 +85,7 @@ def cut_windows(
     return Windows(start=np.array(starts, dtype=np.int64), length=length, stride=stride)
 
 
-def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> FloatArray:
+def setpoints(batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray) -> FloatArray:
     """Return each member's set-point over the whole episode, (N, S, A).
 
     Args:
@@ -106,7 +106,7 @@ def setpoints(batch: ServoBatch, episode: Episode, latency_s: FloatArray) -> Flo
 
 def predict_windows(
     batch: ServoBatch,
-    episode: Episode,
+    episode: SampledEpisode,
     windows: Windows,
     position: FloatArray,
     velocity: FloatArray,

@@ -28,7 +28,7 @@ from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
-    from deal_hw.calib.search.resume import Checkpoint
+    from deal_hw.calib.search.resume import SearchCheckpoint
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.overlay import Overlay
 
@@ -46,7 +46,7 @@ def open_checkpoint(
     method: CalibrationMethod[Any],
     budget: Budget,
     rng: np.random.Generator,
-) -> Checkpoint:
+) -> SearchCheckpoint:
     """Return the checkpoint of a run that is about to begin or to go on.
 
     Args:
@@ -57,9 +57,9 @@ def open_checkpoint(
         budget: How much it may use.
         rng: The run's generator, before it has drawn anything.
     """
-    from deal_hw.calib.search.resume import Checkpoint, run_identity
+    from deal_hw.calib.search.resume import SearchCheckpoint, run_identity
 
-    return Checkpoint(path, run_identity(problem, method, budget, rng), fresh=not resume)
+    return SearchCheckpoint(path, run_identity(problem, method, budget, rng), fresh=not resume)
 
 
 def check_resume(path: Path, resume: bool) -> None:

@@ -13,10 +13,10 @@ from deal_hw.types import FloatArray
 if TYPE_CHECKING:
     from deal_hw.data.importing.grid import Recording
     from deal_hw.data.importing.table import Table
-    from deal_hw.data.recording.telemetry_checks import Verdict
+    from deal_hw.data.recording.telemetry_checks import CheckResult
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.joint_facts import JointFacts
-    from deal_hw.sim.recordings.episode import Episode
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 GRAVITY_EXPLAINED, GRAVITY_LEAST = 0.5, 0.01
 """Gravity must explain this share of a deviation of at least this size, or no gain is told [rad, m]."""
@@ -70,7 +70,7 @@ def examine_recording(
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
     say: Callable[[str], None],
-) -> list[Verdict]:
+) -> list[CheckResult]:
     """Check a recording and tell what is wrong; return what is worth keeping.
 
     Args:
@@ -112,7 +112,7 @@ def examine_recording(
 
 
 def warn_of_gravity(
-    robot: RobotModel, space: ParameterSpace, episodes: list[Episode], say: Callable[[str], None]
+    robot: RobotModel, space: ParameterSpace, episodes: list[SampledEpisode], say: Callable[[str], None]
 ) -> None:
     """Warn where gravity contradicts a joint's sign or a servo's gain."""
     from deal_hw.sim.recordings.gravity_gain import gravity_gain
@@ -147,7 +147,7 @@ def warn_of_gravity(
 def require_sensitive_parameters(
     robot: RobotModel,
     space: ParameterSpace,
-    episodes: Sequence[Episode],
+    episodes: Sequence[SampledEpisode],
     known_std: FloatArray | None,
     window_s: float,
     threads: int | None,

@@ -23,7 +23,7 @@ from deal_hw.workflows.shipped import balancer
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.sim.engine.model import RobotModel
-    from deal_hw.sim.recordings.episode import Episode
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 HELDOUT_PROFILE = "chirp"
 SAMPLES_A_PERIOD = 4
@@ -169,7 +169,7 @@ def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
 
 def _simulation(
     dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
-) -> tuple[RobotModel, dict[int, Episode]]:
+) -> tuple[RobotModel, dict[int, SampledEpisode]]:
     try:
         from deal_hw.sim.engine.model import load_model
         from deal_hw.sim.recordings.episode import align, thin

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.mjcf.describe import Sampling
-    from deal_hw.sim.recordings.episode import Episode
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 STRETCH_S = 2.5
 """Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
@@ -132,7 +132,7 @@ def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]
     return to_trajectories(table, gains, rates.period_s)
 
 
-def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...]) -> Episode:
+def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...]) -> SampledEpisode:
     """Return a recording on the physics grid, with the base where the robot floats."""
     from deal_hw.sim.recordings.episode import align, fill_gaps
     from deal_hw.sim.recordings.imu_base import with_base
@@ -144,13 +144,13 @@ def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...]) -> E
 
 
 def divide(
-    episodes: Sequence[Episode],
-    judge: Sequence[Episode],
+    episodes: Sequence[SampledEpisode],
+    judge: Sequence[SampledEpisode],
     share: float,
     fit_seconds: float,
     window_s: float,
     say: Callable[[str], None],
-) -> tuple[list[Episode], list[Episode]]:
+) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
     """Return stretches to fit and stretches to judge by.
 
     Args:
@@ -177,6 +177,6 @@ def divide(
     return chosen, [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
 
 
-def seconds_of(episode: Episode) -> float:
+def seconds_of(episode: SampledEpisode) -> float:
     """Return the length of an episode [s]."""
     return (len(episode.sample) - 1) * episode.period_s

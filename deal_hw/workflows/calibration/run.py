@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.control.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
-    from deal_hw.sim.recordings.episode import Episode
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 HELDOUT_WINDOW_S = 0.2
 """The same as in :mod:`deal_hw.calib.validation.metrics`, which is loaded on need."""
@@ -70,8 +70,8 @@ class CalibrationInputs:
 
     robot: RobotModel
     space: ParameterSpace
-    episodes: Sequence[Episode]
-    holdout: Sequence[Episode]
+    episodes: Sequence[SampledEpisode]
+    holdout: Sequence[SampledEpisode]
     shown: Trajectory
     telemetry: Sequence[str]
     provenance: Mapping[str, Any]
@@ -139,8 +139,8 @@ class CalibrateReport:
 def calibrate_episodes(
     robot: RobotModel,
     space: ParameterSpace,
-    episodes: Sequence[Episode],
-    holdout: Sequence[Episode],
+    episodes: Sequence[SampledEpisode],
+    holdout: Sequence[SampledEpisode],
     *,
     method: str,
     budget: Budget,
@@ -244,7 +244,7 @@ def calibrate_episodes(
     return dataclasses.replace(result, heldout_nrmse=errors.nrmse, provenance=provenance)
 
 
-def _require_windows(holdout: Sequence[Episode], window_s: float) -> None:
+def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None:
     """Check before any search that held-out recordings can be judged by.
 
     Raises:

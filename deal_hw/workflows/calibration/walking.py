@@ -15,7 +15,7 @@ from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
-    from deal_hw.sim.recordings.episode import Episode
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 GAIT_SMOOTHING_S = 0.04
 """Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
@@ -33,7 +33,7 @@ def all_walk(robot: RobotModel, recordings: Iterable[Trajectory]) -> bool:
     return robot.base is not None and all(wanted_velocity(r) is not None for r in recordings)
 
 
-def while_walking(episode: Episode, trajectory: Trajectory) -> Episode:
+def while_walking(episode: SampledEpisode, trajectory: Trajectory) -> SampledEpisode:
     """Return the episode without standing up and lying down where it is of a walk."""
     wanted = wanted_velocity(trajectory)
     if wanted is None:
