@@ -15,11 +15,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from deal_hw.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from deal_hw.workflows.calibrate import Calibration as Calibration
     from deal_hw.workflows.calibrate import calibrate as calibrate
-
-__version__ = "0.1.0"
 
 _WORKFLOWS = {"calibrate": "deal_hw.workflows.calibrate", "Calibration": "deal_hw.workflows.calibrate"}
 """Name -> module, imported on use."""

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deal_hw import __version__
 from deal_hw.cli.episode_end import account
 from deal_hw.cli.episode_report import EpisodeReport
 from deal_hw.cli.keyboard import keys
@@ -24,6 +23,7 @@ from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.drivers import ODOMETRY, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
+from deal_hw.version import __version__
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset

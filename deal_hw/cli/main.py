@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TextIO, cast
 
-from deal_hw import __version__
 from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError, short
+from deal_hw.version import __version__
 
 EXIT_OK = 0
 EXIT_ERROR = 2

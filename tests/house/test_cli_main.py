@@ -329,7 +329,7 @@ def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
     loaded = json.loads(done.stderr.splitlines()[-1])
-    assert sorted(loaded) == ["deal_hw.cli", "deal_hw.cli.main", "deal_hw.errors"]
+    assert sorted(loaded) == ["deal_hw.cli", "deal_hw.cli.main", "deal_hw.errors", "deal_hw.version"]
 
 
 @pytest.mark.parametrize("name", ["collect", "deploy", "doctor", "emulate", "replay"])

@@ -12,7 +12,7 @@ from import_graph import imports, module_name, package_folders
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 SERVICES = ("control", "data", "sim", "testing", "viz")
-VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema")
+VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema", "version")
 CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")
 LAYER = {
     **dict.fromkeys(("deal_hw", *VOCABULARY), 0),
