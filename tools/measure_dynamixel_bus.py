@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import tyro
 
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
 from deal_hw.drivers.cartpole.dynamixel.bus import Bus
@@ -31,6 +30,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BY
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import FrameError, TransportTimeoutError
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 QUESTION_BYTES = 16
 """Header 4, id, length 2, instruction, address 2, size 2, two ids, CRC 2."""

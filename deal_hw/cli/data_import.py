@@ -44,7 +44,7 @@ class Import(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Export:
+class Export(Checked):
     """Write the episodes of a dataset for other software."""
 
     path: tyro.conf.Positional[Path]

@@ -16,11 +16,7 @@ from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
 from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.emulate_go2 import read_track
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.episode_report import EpisodeReport, RunReport
-from deal_hw.cli.link import LegOptions, LinkOptions
-from deal_hw.cli.train import Train, read_distribution, train
+from deal_hw.cli.train import Train, train
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.files import write_json
@@ -29,7 +25,12 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
+from deal_hw.workflows.emulation.go2 import read_track
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.settings import LegOptions, LinkOptions
 from deal_hw.workflows.shipped import required_policy
+from deal_hw.workflows.train import read_distribution
 
 STEPS: Final = 300_000
 """Of the fine-tune: a minute of a processor."""

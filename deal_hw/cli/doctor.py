@@ -13,8 +13,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from deal_hw.cli.doctor_machine import examine_machine
-from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers import (
     CAN_BUSES,
@@ -27,6 +25,8 @@ from deal_hw.drivers import (
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.doctor.machine import examine_machine
+from deal_hw.workflows.doctor.robot import examine_robot
 from deal_hw.workflows.options import Range, check_ranges
 
 _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: "FAIL"}
@@ -120,8 +120,8 @@ def _wrapped(lead: str, text: str) -> str:
 
 
 def _examine(config: Doctor) -> Iterator[Finding]:
-    from deal_hw.cli.doctor_can import list_adapters, listen_to_bus
     from deal_hw.drivers.transports.can_transport import open_can
+    from deal_hw.workflows.doctor.can import list_adapters, listen_to_bus
 
     yield from examine_machine()
     yield from list_adapters()

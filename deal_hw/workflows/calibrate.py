@@ -31,7 +31,7 @@ from deal_hw.workflows.calibration.run import (
     residual_std_of,
 )
 from deal_hw.workflows.options import refuse
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say, html_table, silent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,11 +135,8 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
-        lines = [f"<tr>{''.join(f'<th>{html.escape(name)}</th>' for name in head)}</tr>"]
-        for row in self.rows():
-            lines.append(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in _cells(row))}</tr>")
         words = "".join(f"<p>{html.escape(line)}</p>" for line in self._words())
-        return f"<table>{''.join(lines)}</table>{words}"
+        return html_table(head, map(_cells, self.rows())) + words
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -15,9 +15,6 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calibration import Budget, CalibrationResult, Verdict
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode, demonstrate
 from deal_hw.control.loop import Outcome
 from deal_hw.control.vigor import VigorSearch
 from deal_hw.data.recording.dataset import Dataset
@@ -29,6 +26,9 @@ from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
 from deal_hw.workflows.calibration.dataset import choose_episodes
 from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.virtual import VirtualCartpole, VirtualEpisode, demonstrate
+from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.shipped import shipped_policy
 
 

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli import doctor as verb
-from deal_hw.cli import doctor_machine as machine
 from deal_hw.cli.doctor import Doctor, doctor
-from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
@@ -25,6 +23,8 @@ from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Level
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
+from deal_hw.workflows.doctor import machine
+from deal_hw.workflows.doctor.robot import examine_robot
 
 
 def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[Level]:

@@ -26,9 +26,9 @@ LAYER = {
 }
 """Layer of each part; a part may import parts of lower layers and itself."""
 
-BESIDE = {("bench", "cli"), ("cli.bench", "bench"), ("deal_hw", "workflows")}
+BESIDE = {("bench", "cli"), ("cli.bench", "bench"), ("deal_hw", "workflows"), ("deal_hw", "transport")}
 """Benches run what verbs run, which lies in cli where there is no workflow yet; one verb runs the benches.
-The package names its workflows and loads them on use."""
+The package names its workflows and their settings, and loads them on use."""
 
 ROOMS = {
     "calib": (
