@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +16,6 @@ from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, Unknow
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
 
-ROOT = Path(__file__).resolve().parents[2]
 Arrays = dict[str, FloatArray]
 
 
@@ -159,12 +157,3 @@ def test_importing_the_package_loads_nothing() -> None:
     assert told.startswith("[] ") and "'calibrate'" in told
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         deal_hw.calibrat  # noqa: B018
-
-
-def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    """It ends with a table and a model, and is short enough to read at once."""
-    path = ROOT / "examples" / "calibrate_from_arrays.py"
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 40
-    runpy.run_path(str(path))
-    told = capsys.readouterr().out
-    assert "shoulder" in told and "calibrated.xml" in told
