@@ -30,9 +30,13 @@ class Train(TrainSettings):
 
 def train(config: Train) -> Training:
     """Run the verb; see :func:`deal_hw.workflows.train.train`."""
+    bar = _progress_bar(config.quiet)
     try:
-        with _progress_bar(config.quiet) as bar:
+        try:
             training = run(config, _follow(bar))
+        finally:
+            if bar.live.is_started:
+                bar.stop()
     except InterruptedTrainingError as stopped:
         _print(stopped.training)
         print("stopped before the end; --resume goes on from the checkpoint")
@@ -59,6 +63,8 @@ def _follow(bar: Progress) -> TrainingProgress:
     row = bar.add_task("training", total=None, recent=0.0, measures="")
 
     def follow(status: TrainingStatus) -> None:
+        # Not before: what is refused has no bar.
+        bar.start()
         shown = [f"{name} {value:.2f}" for name, value in status.measures.items()][:SHOWN_MEASURES]
         bar.update(
             row, completed=status.steps, total=status.total, recent=status.mean_return,

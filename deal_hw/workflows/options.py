@@ -17,7 +17,7 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, short, shown
@@ -99,17 +99,27 @@ def check_ranges(settings: Any) -> None:
     """
     for name, hint in get_type_hints(type(settings), include_extras=True).items():
         value = getattr(settings, name)
-        kinds = tuple(_kinds(hint))
+        kinds = set(_kinds(hint))
         if get_origin(hint) is Annotated:
             for allowed in (extra for extra in get_args(hint)[1:] if isinstance(extra, Range)):
                 allowed.check(option(name), value)
-                if isinstance(value, str) and not {str, Path} & set(kinds):
-                    raise ConfigurationError(
-                        f"{option(name)} {shown(value)} is no number: allowed are {allowed}"
-                    )
+                _check_number(option(name), value, kinds, allowed)
         choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
         if choices and value is not None and value not in choices:
             raise UnknownNameError(name.replace("_", " "), str(value), map(str, choices))
+
+
+def _check_number(option: str, value: Any, kinds: set[Any], allowed: Range) -> None:
+    """Refuse what Python can give for a number, and a command line cannot."""
+    if isinstance(value, str | Path):
+        fine = bool({str, Path} & kinds)
+    elif isinstance(value, float):
+        fine = float in kinds
+    else:
+        fine = value is not None or NoneType in kinds
+    if not fine:
+        number = "number" if float in kinds else "whole number"
+        raise ConfigurationError(f"{option} {shown(value)} is no {number}: allowed are {allowed}")
 
 
 def _kinds(hint: Any) -> Iterator[Any]:
