@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from deal_hw.workflows.calibrate import calibrate as calibrate
     from deal_hw.workflows.collect import collect as collect
     from deal_hw.workflows.deploy import deploy as deploy
+    from deal_hw.workflows.doctor.examine import doctor as doctor
     from deal_hw.workflows.emulate import EmulatedRobot as EmulatedRobot
     from deal_hw.workflows.emulate import emulate as emulate
     from deal_hw.workflows.excite import excite as excite
@@ -42,6 +43,7 @@ _EXPORTS = {
     "workflows.calibrate": ("calibrate", "Calibration"),
     "workflows.collect": ("collect",),
     "workflows.deploy": ("deploy",),
+    "workflows.doctor.examine": ("doctor",),
     "workflows.emulate": ("emulate", "EmulatedRobot"),
     "workflows.excite": ("excite",),
     "workflows.inspect": ("inspect", "Inspection"),

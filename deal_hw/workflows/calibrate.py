@@ -12,25 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from deal_hw.calib.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
-from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
-from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
-from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
-from deal_hw.workflows.calibration.policy import check_policy
+from deal_hw.workflows.calibration.model import DEFAULT, Recordings
 from deal_hw.workflows.calibration.recordings import Source
-from deal_hw.workflows.calibration.run import (
-    HELDOUT_WINDOW_S,
-    CalibrationInputs,
-    SpaceOverrides,
-    calibrate_episodes,
-    judged,
-    residual_std_of,
+from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S, CalibrationInputs, judged
+from deal_hw.workflows.calibration.settings import (
+    CalibrateSettings,
+    calibrate_inputs,
+    check_source,
+    prepare,
+    usual_method,
 )
-from deal_hw.workflows.options import refuse
 from deal_hw.workflows.say import Say, html_table, silent
 
 
@@ -222,77 +215,48 @@ def calibrate(
     Raises:
         DealHwError: A setting or a recording is unusable; nothing long was begun.
     """
-    check_method(method)
-    if (dataset is None) == (model is None):
-        raise ConfigurationError(
-            "calibrate: name a model and its recordings (model=..., data=[...]), or a dataset (dataset=...), "
-            "not both"
-        )
-    of_model = {
-        "data": data,
-        "columns": columns,
-        "parameters": parameters,
-        "feet": feet,
-        "holdout_part": holdout_part,
-    }
-    of_dataset = {"episodes": episodes, "space": space}
-    others, where = (of_dataset, "dataset") if dataset is None else (of_model, "model")
-    refuse([name for name, value in others.items() if _given(value)], f"that goes with {where}=...")
-    check_policy(method, given=policy is not None, model=dataset is None)
-    overrides = SpaceOverrides(
-        free=tuple(free),
-        known=dict(known or {}),
-        ranges=[(name, low, high) for name, (low, high) in (ranges or {}).items()],
-        xi=range_ratio,
-    )
-    judges = _listed(holdout)
+    check_source(dataset=dataset is not None, model=model is not None)
+    fit, judges = _listed(data), _listed(holdout)
     with contextlib.ExitStack() as kept:
-        if dataset is None:
+        path = None
+        if model is not None:
             from deal_hw.sim.mjcf.model_file import mjcf_file
 
             scratch = Path(tempfile.mkdtemp(prefix="deal-hw-"))
             kept.callback(shutil.rmtree, scratch, ignore_errors=True)
-            recordings = Recordings(
-                model=mjcf_file(model, scratch),
+            path = mjcf_file(model, scratch)
+        settings = CalibrateSettings(
+            dataset=dataset,
+            recordings=Recordings(
+                model=path,
                 columns=None if columns is None else Path(columns),
                 parameters=None if parameters is None else Path(parameters),
                 feet=tuple(feet),
                 holdout_part=holdout_part,
                 fit_seconds=fit_seconds,
-            )
-            inputs = prepare_model(
-                recordings, judges, overrides, std=lambda robot: residual_std_of(residual_std, robot),
-                data=_listed(data), threads=threads, say=say,
-            )  # fmt: skip
-        else:
-            source = DatasetRecordings(
-                folder=Path(dataset),
-                episodes=tuple(episodes),
-                holdout=[_episode(one) for one in judges],
-                policy=None if policy is None else Path(policy),
-            )
-            inputs = prepare_dataset(source, space, overrides, method, say)
-        if method == DEFAULT:
-            told = residual_std is not None or not refine
-            method = method_for(inputs, told=told, real=dataset is None)
-        result = calibrate_episodes(
-            inputs.robot,
-            inputs.space,
-            inputs.episodes,
-            inputs.holdout,
+            ),
+            episodes=tuple(episodes),
+            heldout_window=heldout_window_s,
             method=method,
-            budget=usual_budget(method, population, generations, refine=refine),
-            rng=np.random.default_rng(seed),
-            latency_s=latency_s,
-            latency_range_s=latency_range_s,
+            policy=policy,
+            space=space,
+            free=tuple(free),
+            known=tuple((known or {}).items()),
+            range=tuple((name, low, high) for name, (low, high) in (ranges or {}).items()),
+            xi=range_ratio,
+            latency=latency_s,
+            latency_range=latency_range_s,
+            residual_std=residual_std,
+            population=population,
+            generations=CalibrateSettings.generations if generations is None else generations,
+            refine=refine,
+            seed=seed,
             threads=threads,
-            progress=progress,
-            say=say,
-            known_std=residual_std_of(residual_std, inputs.robot),
-            heldout_window_s=heldout_window_s,
-            policy=inputs.policy,
-            smoothing_s=inputs.smoothing_s,
         )
+        settings.check(fit)
+        inputs = prepare(settings, data=fit, holdout=judges, say=say)
+        chosen = usual_method(settings, inputs, say)
+        result = calibrate_inputs(settings, inputs, chosen, progress=progress, say=say)
         found = Calibration(result=result, inputs=inputs, threads=threads)
         # The model's file is read again when the calibrated one is written.
         weakref.finalize(found, kept.pop_all().close)
@@ -303,13 +267,3 @@ def _listed(given: Any) -> list[Any]:
     """Return one recording, or several, as a list."""
     alone = isinstance(given, str | Path | int | Mapping) or hasattr(given, "columns")
     return [given] if alone else list(given)
-
-
-def _given(value: Any) -> bool:
-    return value is not None and not (isinstance(value, str | list | tuple) and not value)
-
-
-def _episode(number: Any) -> int:
-    if not isinstance(number, int):
-        raise ConfigurationError(f"holdout={number!r}: of a dataset name episodes by number")
-    return number

@@ -121,17 +121,13 @@ def test_recordings_that_are_none_are_refused(
 def test_settings_are_checked_before_anything_long(pendulum: tuple[Path, Path, Path]) -> None:
     """Unknown names are answered with the known ones."""
     model, fit, _ = pendulum
-    with pytest.raises(ConfigurationError, match="or a dataset"):
+    with pytest.raises(ConfigurationError, match="name a dataset"):
         deal_hw.calibrate()
     with pytest.raises(ConfigurationError, match="not both"):
         deal_hw.calibrate(model, fit, dataset="runs/first/dataset")
-    with pytest.raises(
-        ConfigurationError, match=r"episodes would have no effect: that goes with dataset=\.\.\."
-    ):
+    with pytest.raises(ConfigurationError, match="--episodes would have no effect: only datasets take that"):
         deal_hw.calibrate(model, fit, episodes=[0])
-    with pytest.raises(
-        ConfigurationError, match=r"data, feet would have no effect: that goes with model=\.\.\."
-    ):
+    with pytest.raises(ConfigurationError, match="--feet, --data would have no effect: a dataset says it"):
         deal_hw.calibrate(None, fit, dataset="d", feet=["FL"])
     with pytest.raises(ConfigurationError, match="eki runs no policy"):
         deal_hw.calibrate(model, fit, method="eki", policy="pi.onnx")

@@ -58,6 +58,12 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("excite", {**SWEEP, "space": "k99"}, "unknown parameter set 'k99'; known: "),
     ("inspect", {"episode": "none.mcap"}, "none.mcap cannot be read"),
     ("inspect", {"episode": "none.mcap", "window": 0.0}, "--window 0.0 s: allowed are 0.001 to 600 s"),
+    (
+        "doctor",
+        {"robot": "cartpole"},
+        "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`",
+    ),
+    ("doctor", {"seconds": 0.0}, "--seconds 0.0 s: allowed are 0.5 to 600 s"),
     ("emulate", {"robot": "so101"}, "unknown robot to emulate 'so101'; known: cartpole, go2"),
     (
         "emulate",
@@ -75,6 +81,66 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
 ]
 """Verb, arguments, and words of the refusal."""
 
+MODEL = {"model": "m.xml", "data": ["r.csv"]}
+ON_MODEL = "--model m.xml --data r.csv"
+CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
+    ({}, "", "in Python dataset=..., or model=... and data=[...]"),
+    ({**MODEL, "dataset": "d"}, f"d {ON_MODEL}", "not both"),
+    ({"dataset": "d", "data": ["r.csv"]}, "d --data r.csv", "--data would have no effect: a dataset says it"),
+    ({"dataset": "d", "feet": ["FL"]}, "d --feet FL", "--feet would have no effect: a dataset says it"),
+    (
+        {"dataset": "d", "holdout": ["r.csv"]},
+        "d --holdout r.csv",
+        "--holdout r.csv: of a dataset name episodes",
+    ),
+    ({"dataset": "d", "method": "gradient"}, "d --method gradient", "gradient"),
+    (
+        {"dataset": "d", "method": "eki", "policy": "p.onnx"},
+        "d --method eki --policy p.onnx",
+        "runs no policy",
+    ),
+    ({"dataset": "d", "latency_s": 2.0}, "d --latency 2", "--latency 2.0 s: allowed are 0 to"),
+    (
+        {"dataset": "d", "latency_s": 0.01, "latency_range_s": (0.0, 0.01)},
+        "d --latency 0.01 --latency-range 0 0.01",
+        "--latency-range would have no effect: --latency says the latency",
+    ),
+    (
+        {"dataset": "d", "latency_range_s": (0.02, 0.01)},
+        "d --latency-range 0.02 0.01",
+        "give the lower one first",
+    ),
+    ({"dataset": "d", "range_ratio": 0.5}, "d --xi 0.5", "--xi 0.5: allowed are 1.001 to 1000"),
+    ({"dataset": "d", "population": 1}, "d --population 1", "--population 1: allowed are 2 to"),
+    ({"dataset": "d", "seed": -1}, "d --seed -1", "--seed -1: allowed are 0 to"),
+    ({"dataset": "d"}, "d", "d "),
+    (
+        {**MODEL, "episodes": [0]},
+        f"{ON_MODEL} --episodes 0",
+        "--episodes would have no effect: only datasets",
+    ),
+    ({**MODEL, "space": "k9"}, f"{ON_MODEL} --space k9", "--space would have no effect: only datasets"),
+    (
+        {**MODEL, "method": "deal-paper"},
+        f"{ON_MODEL} --method deal-paper",
+        "which recordings of --model do not",
+    ),
+    ({"model": "m.xml"}, "--model m.xml", "--model needs recordings to fit: --data rec.csv"),
+    (
+        {**MODEL, "holdout": ["o.csv"], "holdout_part": 0.5},
+        f"{ON_MODEL} --holdout o.csv --holdout-part 0.5",
+        "give --holdout or --holdout-part, not both",
+    ),
+    (
+        {**MODEL, "holdout_part": 1.0},
+        f"{ON_MODEL} --holdout-part 1",
+        "--holdout-part 1.0: allowed are 0 to 0.95",
+    ),
+    ({**MODEL, "holdout": ["r.csv"]}, f"{ON_MODEL} --holdout r.csv", "is to be fitted and held out"),
+    (MODEL, ON_MODEL, "m.xml"),
+]
+"""Arguments in Python, on the command line, and words of the refusal."""
+
 
 def as_words(verb: str, given: dict[str, Any]) -> list[str]:
     """Return the command line that says the same as arguments in Python."""
@@ -89,12 +155,19 @@ def as_words(verb: str, given: dict[str, Any]) -> list[str]:
     return words
 
 
+ROWS = [
+    *((verb, given, as_words(verb, given), words) for verb, given, words in TABLE),
+    *(("calibrate", given, ["calibrate", *line.split()], words) for given, line, words in CALIBRATE),
+]
+
+
 @pytest.mark.parametrize(
-    ("verb", "given", "words"), TABLE, ids=[f"{verb} {words[:40]}" for verb, _, words in TABLE]
+    ("verb", "given", "line", "words"), ROWS, ids=[f"{verb} {words[:40]}" for verb, *_, words in ROWS]
 )
 def test_both_refuse_with_the_same_words(
     verb: str,
     given: dict[str, Any],
+    line: list[str],
     words: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -105,7 +178,7 @@ def test_both_refuse_with_the_same_words(
     with pytest.raises(DealHwError) as raised:
         getattr(deal_hw, verb)(**given)
     assert words in str(raised.value)
-    assert main(as_words(verb, given)) == EXIT_ERROR
+    assert main(line) == EXIT_ERROR
     told = capsys.readouterr()
     assert told.err == f"deal-hw: error: {raised.value}\n"
     assert not told.out and not list(tmp_path.iterdir())
