@@ -15,7 +15,7 @@ from deal_hw.testing.plain_robots import make_robot, write
 folder = Path(tempfile.mkdtemp())
 model, (recording, *_), other = write(make_robot("double-pendulum", seed=0), folder, seconds=10.0)
 columns = np.genfromtxt(recording, delimiter=",", names=True, deletechars="")
-arrays = {name: columns[name] for name in columns.dtype.names}
+arrays = {name: columns[name] for name in columns.dtype.names or ()}
 
 found = deal_hw.calibrate(model, arrays, holdout=other, say=print)
 print(found.table())

@@ -78,7 +78,7 @@ def collect(settings: CollectSettings) -> RunReport:
             is whole.
         InterruptedRunError: Ctrl-C; the robot is passive.
     """
-    return run(settings, RunView(settings.say))
+    return run(settings, RunView.of_python(settings.say))
 
 
 def run(config: CollectSettings, view: RunView) -> RunReport:

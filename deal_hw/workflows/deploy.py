@@ -59,7 +59,7 @@ def deploy(settings: DeploySettings) -> RunReport:
             is whole.
         InterruptedRunError: Ctrl-C; the robot is passive.
     """
-    return run(settings, RunView(settings.say))
+    return run(settings, RunView.of_python(settings.say))
 
 
 def run(config: DeploySettings, view: RunView) -> RunReport:

@@ -43,7 +43,7 @@ def replay(settings: ReplaySettings) -> RunReport:
             is whole.
         InterruptedRunError: Ctrl-C; the robot is passive.
     """
-    return run(settings, RunView(settings.say))
+    return run(settings, RunView.of_python(settings.say))
 
 
 def run(config: ReplaySettings, view: RunView) -> RunReport:

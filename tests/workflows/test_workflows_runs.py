@@ -19,6 +19,9 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import VERDICT
 from deal_hw.workflows.emulation.process import arguments
 from deal_hw.workflows.emulation.settings import CanOptions, EmulateSettings, Go2Options
+from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.running.view import RunView
+from deal_hw.workflows.say import silent
 from deal_hw.workflows.shipped import required_policy
 
 SECONDS = 0.6
@@ -43,6 +46,20 @@ def test_a_robot_is_emulated_recorded_and_replayed(tmp_path: Path, capfd: pytest
     assert str(run.paths[0]) in run._repr_html_() and "finished" in run._repr_html_()
     assert robot.truth["seed"] == 3 and robot.truth["parameters"]
     assert capfd.readouterr() == ("", "")
+
+
+def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureFixture[str]) -> None:
+    """What the operator must know goes to standard error, unless the program takes sentences itself."""
+    lost = EpisodeReport(
+        path=None, outcome=Outcome.TRIPPED, reason="the link is gone", passive_confirmed=False, cadence=None,
+        clipped={}, cycles_sent=0, states_recorded=0, warnings=("switch it off by hand",),
+    )  # fmt: skip
+    said: list[str] = []
+    for view in (RunView.of_python(silent), RunView.of_python(said.append), RunView()):
+        view.ended(lost)
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
+    assert said == ["tripped: the link is gone", "warning: switch it off by hand"]
 
 
 def test_a_policy_for_another_robot_is_refused_before_the_port(tmp_path: Path) -> None:

@@ -80,7 +80,8 @@ class RunOptions(Checked):
     """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
 
     say: Say = silent
-    """From Python: called with sentences on what happens; ``print`` shows them."""
+    """From Python: called with sentences on what happens; ``print`` shows them. By default warnings alone are
+    told, on standard error."""
 
 
 def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:

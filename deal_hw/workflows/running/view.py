@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from deal_hw.control.handover import Beat
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:
     from deal_hw.workflows.excite import ExciteReport
@@ -27,14 +27,21 @@ class RunView:
 
     Args:
         say: Called with each sentence.
+        warn: Called with what the operator must know, such as a robot that is to be switched off by hand;
+            ``say`` by default.
     """
 
-    def __init__(self, say: Say = silent) -> None:
-        self._say = say
+    def __init__(self, say: Say = silent, warn: Say | None = None) -> None:
+        self._say, self._warn = say, warn or say
+
+    @classmethod
+    def of_python(cls, say: Say) -> RunView:
+        """Return the view of a program that named a ``say``; where it named none, warnings are told aloud."""
+        return cls(say, aloud if say is silent else say)
 
     def warn(self, text: str) -> None:
         """Tell what the operator must know."""
-        self._say(text)
+        self._warn(text)
 
     def note(self, text: str) -> None:
         """Tell what is good to know."""
@@ -53,8 +60,10 @@ class RunView:
 
     def ended(self, report: EpisodeReport) -> None:
         """Tell how an episode ended."""
-        for line in (*report.lines(), *(f"warning: {warning}" for warning in report.warnings)):
+        for line in report.lines():
             self._say(line)
+        for warning in report.warnings:
+            self.warn(f"warning: {warning}")
 
     def confirm(self, warning: str, question: str) -> bool | None:
         """Ask the operator; None where nobody is there to answer."""
