@@ -163,7 +163,13 @@ def calibrate(
     residual_std: float | Mapping[str, float] | None = None,
     feet: Sequence[str] = (),
     holdout_part: float | None = None,
+    leave_out: Sequence[tuple[str, float, float]] = (),
     fit_seconds: float = Recordings().fit_seconds,
+    window_s: float = Recordings().window,
+    physics_step_s: float | None = None,
+    force: bool = False,
+    sample_hz: float | None = None,
+    spike_ratio: float = CalibrateSettings.spike_ratio,
     heldout_window_s: float = HELDOUT_WINDOW_S,
     method: str = DEFAULT,
     refine: bool = True,
@@ -197,7 +203,15 @@ def calibrate(
         residual_std: What a prediction may be off [rad, m], for all or by joint; the sensor noise by default.
         feet: Sphere geoms of a floating robot's feet.
         holdout_part: Without ``holdout`` this last share of each recording only judges; 0.25 by default.
+        leave_out: Stretches of files that the model has no part for, such as a contact: file name, from, to
+            [s from its start].
         fit_seconds: Most to fit, spread evenly over the recordings [s].
+        window_s: Length of the search's longest windows of prediction [s].
+        physics_step_s: Wanted physics step [s]; the MJCF's timestep by default.
+        force: Use recordings although a plausibility check failed.
+        sample_hz: States a second of a dataset that are fitted to [Hz]; four a control period by default.
+        spike_ratio: How many times farther than the joint's fastest motion a sample must jump away and back
+            to be left out.
         heldout_window_s: Held-out predictions restart this often [s].
         method: Name of the method; the one that suits the recordings by default.
         refine: Follow the search by multiple shooting on prediction error.
@@ -233,8 +247,14 @@ def calibrate(
                 parameters=None if parameters is None else Path(parameters),
                 feet=tuple(feet),
                 holdout_part=holdout_part,
+                leave_out=tuple(leave_out),
                 fit_seconds=fit_seconds,
+                window=window_s,
+                physics_step=physics_step_s,
+                force=force,
             ),
+            sample_hz=sample_hz,
+            spike_ratio=spike_ratio,
             episodes=tuple(episodes),
             heldout_window=heldout_window_s,
             method=method,

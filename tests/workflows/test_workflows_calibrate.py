@@ -17,6 +17,7 @@ from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
 
 Arrays = dict[str, FloatArray]
+T = np.arange(400) * 0.01
 
 
 class Frame(dict[str, FloatArray]):
@@ -108,6 +109,23 @@ def test_models_in_memory(pendulum: tuple[Path, Path, Path], tmp_path: Path) -> 
         ([{"time": np.zeros((2, 2, 2))}], r"has shape \(2, 2, 2\)"),
         ([{"speed": np.zeros(5)}], "which channel is the time"),
         ([], "needs recordings to fit"),
+        (
+            [{"time": T, "position": np.zeros((400, 1)), "target": np.zeros((399, 1))}],
+            "which channel is the time of 'target', which has 399 rows and not those of the time",
+        ),
+        (
+            [{"time": T, "position": np.zeros((400, 3)), "target": np.zeros((400, 3))}],
+            r"which joints the 3 columns of 'position' are \(the model has 1: pivot\)",
+        ),
+        (
+            [{"time": T, "position": np.zeros((400, 1)), "target": np.zeros((400, 1)), "joints": ["elbow"]}],
+            r"which of the model's joints \(pivot\) the file's \(elbow\) are",
+        ),
+        ([{"time": T, "position": np.sin(T)[:, None]}], "no commanded positions; name them as `target`"),
+        (
+            [{"time": T, "position": 40 * np.sin(T)[:, None], "target": 40 * np.sin(T)[:, None]}],
+            r"units: pivot: positions reach 40 rad, the joint .* rad \(degrees",
+        ),
     ],
 )
 def test_recordings_that_are_none_are_refused(

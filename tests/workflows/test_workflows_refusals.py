@@ -119,6 +119,14 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
         f"{ON_MODEL} --episodes 0",
         "--episodes would have no effect: only datasets",
     ),
+    (
+        {**MODEL, "sample_hz": 50.0},
+        f"{ON_MODEL} --sample-hz 50",
+        "--sample-hz would have no effect: only data",
+    ),
+    ({"dataset": "d", "force": True}, "d --force", "--force would have no effect: a dataset says it"),
+    ({**MODEL, "window_s": 0.0}, f"{ON_MODEL} --window 0", "--window 0.0 s: allowed are 0.001 to 60 s"),
+    ({**MODEL, "physics_step_s": 1.0}, f"{ON_MODEL} --physics-step 1", "--physics-step 1.0 s: allowed are"),
     ({**MODEL, "space": "k9"}, f"{ON_MODEL} --space k9", "--space would have no effect: only datasets"),
     (
         {**MODEL, "method": "deal-paper"},
