@@ -154,8 +154,8 @@ def as_words(verb: str, given: dict[str, Any]) -> list[str]:
     """Return the command line that says the same as arguments in Python."""
     words = [verb]
     for name, value in given.items():
-        if dataclasses.is_dataclass(value):
-            words += arguments(value, type(value)())  # type: ignore[call-arg]
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            words += arguments(value, type(value)())
         elif name in POSITIONAL:
             words.append(value)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.say import silent
 from deal_hw.workflows.shipped import required_policy
 
+ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 0.6
 
 
@@ -132,3 +134,22 @@ def test_functions_for_a_robot_load_neither_torch_nor_mujoco() -> None:
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told == "[]\n"
+
+
+def test_no_workflow_prints_asks_or_ends_the_program() -> None:
+    """It tells through `say`, and leaves the rest to who called it; the control process is a program."""
+    found = []
+    for path in sorted((ROOT / "deal_hw" / "workflows").rglob("*.py")):
+        if path.name in ("say.py", "control_process.py"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "print",
+                "input",
+                "exit",
+                "sys.exit",
+                "sys.stdout.write",
+                "sys.stderr.write",
+            ):
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node.func)}")
+    assert not found
