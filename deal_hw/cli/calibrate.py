@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
@@ -111,19 +110,11 @@ def calibrate(config: Calibrate) -> CalibrateReport:
             config, work, method, progress=progress, say=say, checkpoint=checkpoint, resume=config.resume,
             keep=folder / SO_FAR,
         )  # fmt: skip
-    settings: dict[str, Any] = {
-        "seed": config.seed,
-        "xi": config.xi,
-        "heldout_window_s": config.heldout_window,
-        "latency_range_s": None if config.latency is not None else list(config.latency_range),
-    }
-    if config.residual_std:
-        settings["residual_std"] = list(config.residual_std)
     report = finish(
         work,
         result,
         folder,
-        settings,
+        config.provenance,
         checkpoint,
         page=config.report,
         advise=config.advise,

@@ -24,7 +24,9 @@ from deal_hw.workflows.calibration.settings import (
     prepare,
     usual_method,
 )
-from deal_hw.workflows.say import Say, html_table, silent
+from deal_hw.workflows.say import Say, html_table, silent, text_table
+
+_HEAD = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,14 +74,7 @@ class Calibration:
 
     def table(self) -> str:
         """Return the parameters with their 90 % intervals, and what to think of them, as text."""
-        head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
-        body = [_cells(row) for row in self.rows()]
-        widths = [max(len(line[k]) for line in (head, *body)) for k in range(len(head))]
-        lines = [
-            "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
-            for line in (head, *body)
-        ]
-        return "\n".join([*lines, "", *self._words()])
+        return "\n".join([text_table(_HEAD, map(_cells, self.rows())), "", *self._words()])
 
     def report(self, path: Path | str) -> Path:
         """Write everything on one HTML page and return its path; takes some seconds.
@@ -90,7 +85,11 @@ class Calibration:
         from deal_hw.calib.report.page import REPORT, write_report
 
         path = Path(path)
-        _, shown = judged(self.inputs, self.result, {}, page=True, advise=False, threads=self.threads)
+        window_s = self.result.provenance["heldout_window_s"]
+        _, shown = judged(
+            self.inputs, self.result, {"heldout_window_s": window_s}, page=True, advise=False,
+            threads=self.threads,
+        )  # fmt: skip
         assert shown is not None
         write_report(path, shown)
         return path / REPORT if path.is_dir() else path
@@ -127,9 +126,8 @@ class Calibration:
         return f"<Calibration of {len(self.result.space)} parameters, {self.colour}; table() shows them>"
 
     def _repr_html_(self) -> str:
-        head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
         words = "".join(f"<p>{html.escape(line)}</p>" for line in self._words())
-        return html_table(head, map(_cells, self.rows())) + words
+        return html_table(_HEAD, map(_cells, self.rows())) + words
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -277,6 +275,7 @@ def calibrate(
         inputs = prepare(settings, data=fit, holdout=judges, say=say)
         chosen = usual_method(settings, inputs, say)
         result = calibrate_inputs(settings, inputs, chosen, progress=progress, say=say)
+        result, _ = judged(inputs, result, settings.provenance, page=False, advise=False, threads=threads)
         found = Calibration(result=result, inputs=inputs, threads=threads)
         # The model's file is read again when the calibrated one is written.
         weakref.finalize(found, kept.pop_all().close)

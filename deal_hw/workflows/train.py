@@ -18,7 +18,7 @@ from deal_hw.policy import VERDICT
 from deal_hw.reading import read_json, reading
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.workflows.options import Checked, File, Range, Seed, from_settings
-from deal_hw.workflows.say import html_table
+from deal_hw.workflows.say import html_table, text_table
 
 if TYPE_CHECKING:
     from deal_hw.policies.onnx_runtime import OnnxPolicy
@@ -106,14 +106,21 @@ class Training:
     checkpoint: Path
     status: TrainingStatus | None
 
+    def table(self) -> str:
+        """Return how far the training came and its files, as text."""
+        return text_table(("training", ""), self._cells())
+
     def _repr_html_(self) -> str:
+        return html_table(("training", ""), self._cells())
+
+    def _cells(self) -> list[tuple[str, Any]]:
         status = self.status
         reached = (
             {} if status is None else {"steps": status.steps, "mean return": f"{status.mean_return:.4g}"}
         )
         measures = {} if status is None else {n: f"{v:.4g}" for n, v in status.measures.items()}
         files = {"policy": self.path, "record": self.record, "checkpoint": self.checkpoint}
-        return html_table(("training", ""), list({**reached, **measures, **files}.items()))
+        return list({**reached, **measures, **files}.items())
 
 
 class InterruptedTrainingError(KeyboardInterrupt):

@@ -71,6 +71,9 @@ def test_what_comes_back_is_shown_and_written(
         assert rows[p.name]["estimate"] == value
         assert p.name in found.table() and p.name in found._repr_html_()
     assert "green" in found.table() and "green" in repr(found)
+    noted = found.result.provenance
+    assert (noted["seed"], noted["heldout_window_s"], noted["latency_range_s"]) == (0, 0.2, [0.0, 0.04])
+    assert "mujoco" in noted["versions"] and noted["recordings"]
     assert found.distribution.digest() == found.result.distribution().digest()
     path = found.save_model(tmp_path / "calibrated.xml")
     written = mujoco.MjModel.from_xml_path(str(path))

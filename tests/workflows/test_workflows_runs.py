@@ -45,7 +45,8 @@ def test_a_robot_is_emulated_recorded_and_replayed(tmp_path: Path, capfd: pytest
     assert again.paths[0].parent == tmp_path / "again" / "episodes" and dry.paths == ()
     assert any("too short for `deal-hw calibrate`" in text for text in said)
     assert "finished: the run is over" in said
-    assert str(run.paths[0]) in run._repr_html_() and "finished" in run._repr_html_()
+    for shown in (run._repr_html_(), run.table()):
+        assert str(run.paths[0]) in shown and "finished" in shown
     assert robot.truth["seed"] == 3 and robot.truth["parameters"]
     assert capfd.readouterr() == ("", "")
 
@@ -121,7 +122,7 @@ def test_a_policy_is_trained_under_what_a_calibration_found(tmp_path: Path) -> N
     assert training.path == tmp_path / "policies" / "policy.onnx" and training.checkpoint.is_file()
     assert json.loads(training.record.read_text(encoding="utf-8"))["robot"] == "cartpole"
     assert training.status is not None and training.status.steps == reached[-1] == 1_200
-    assert str(training.path) in training._repr_html_()
+    assert str(training.path) in training._repr_html_() and "mean return" in training.table()
 
 
 def test_functions_for_a_robot_load_neither_torch_nor_mujoco() -> None:

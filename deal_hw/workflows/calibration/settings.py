@@ -165,6 +165,21 @@ class CalibrateSettings(Checked):
         return residual_std(std, robot) if isinstance(std, tuple) else residual_std_of(std, robot)
 
     @property
+    def provenance(self) -> dict[str, Any]:
+        """What the result notes of the settings: plain JSON values."""
+        std = self.residual_std
+        noted = {
+            "seed": self.seed,
+            "xi": self.xi,
+            "heldout_window_s": self.heldout_window,
+            "latency_range_s": None if self.latency is not None else list(self.latency_range),
+        }
+        if std in ((), None):
+            return noted
+        given = list(std) if isinstance(std, tuple) else dict(std) if isinstance(std, Mapping) else std
+        return {**noted, "residual_std": given}
+
+    @property
     def overrides(self) -> SpaceOverrides:
         """What is changed about the parameters."""
         return SpaceOverrides(free=self.free, known=dict(self.known), ranges=self.range, xi=self.xi)

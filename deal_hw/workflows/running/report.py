@@ -11,8 +11,9 @@ from deal_hw.control.cadence import CadenceReport
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import VelocityError
 from deal_hw.data.recording.excitation import Excitation
-from deal_hw.workflows.say import html_table
+from deal_hw.workflows.say import html_table, text_table
 
+_HEAD = ("episode", "outcome", "reason", "states", "clipped cycles", "recording")
 _EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
 
 
@@ -114,13 +115,18 @@ class RunReport:
         """The recordings, in order."""
         return tuple(episode.path for episode in self.episodes if episode.path is not None)
 
+    def table(self) -> str:
+        """Return a line an episode, as text."""
+        return text_table(_HEAD, self._cells())
+
     def _repr_html_(self) -> str:
-        head = ("episode", "outcome", "reason", "states", "clipped cycles", "recording")
-        rows = [
+        return html_table(_HEAD, self._cells())
+
+    def _cells(self) -> list[tuple[Any, ...]]:
+        return [
             (
                 number, one.outcome.value, one.reason, one.states_recorded, sum(one.clipped.values()),
                 one.path or "",
             )
             for number, one in enumerate(self.episodes)
         ]  # fmt: skip
-        return html_table(head, rows)
