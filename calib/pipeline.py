@@ -1,9 +1,9 @@
 """The whole calibration: checks, a local fit, a search where that is not the answer, uncertainty, validation.
 
 Simulated or real, fixed or floating base: the same :class:`CalibrationPipeline`. How it goes on where the
-local fit does not explain the recordings is a strategy, :class:`Fits`. :class:`Refinement` searches and refines
-down to the sensors' noise; :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits predictions of a
-robot that no model explains.
+local fit does not explain the recordings is a strategy, :class:`Fits`. :class:`Refinement` searches and
+refines down to the sensors' noise; :class:`deal_hw.calib.output_error_fits.OutputErrorFits` fits predictions
+of a robot that no model explains.
 """
 
 from __future__ import annotations

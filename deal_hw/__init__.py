@@ -2,8 +2,11 @@
 
     import deal_hw
 
-    found = deal_hw.calibrate("robot.xml", ["rec.csv"])
-    print(found.table())
+    with deal_hw.emulate("cartpole", seed=1) as robot:  # or a robot of yours on port="/dev/ttyUSB0"
+        deal_hw.collect("cartpole", port=robot.port, out="runs/first")
+        found = deal_hw.calibrate(dataset="runs/first/dataset")
+        policy = deal_hw.train("cartpole", distribution=found, out="runs/first")
+        deal_hw.deploy("cartpole", port=robot.port, policy=policy.path, out="runs/deployed")
 
 Importing this package loads nothing else; a workflow loads what it needs when it is called. The parts live
 in sub-packages: ``workflows`` (the Python API), ``control``, ``data``, ``sim``, ``viz``, ``testing``,
@@ -15,21 +18,50 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from deal_hw.version import __version__ as __version__
+
 if TYPE_CHECKING:
+    from deal_hw.transport import WireOptions as WireOptions
     from deal_hw.workflows.calibrate import Calibration as Calibration
     from deal_hw.workflows.calibrate import calibrate as calibrate
+    from deal_hw.workflows.collect import collect as collect
+    from deal_hw.workflows.deploy import deploy as deploy
+    from deal_hw.workflows.design_excitation import design_excitation as design_excitation
+    from deal_hw.workflows.doctor.examine import doctor as doctor
+    from deal_hw.workflows.emulate import EmulatedRobot as EmulatedRobot
+    from deal_hw.workflows.emulate import emulate as emulate
+    from deal_hw.workflows.inspect import Inspection as Inspection
+    from deal_hw.workflows.inspect import inspect as inspect
+    from deal_hw.workflows.replay import replay as replay
+    from deal_hw.workflows.running.report import RunReport as RunReport
+    from deal_hw.workflows.running.settings import LegOptions as LegOptions
+    from deal_hw.workflows.running.settings import LinkOptions as LinkOptions
+    from deal_hw.workflows.train import Training as Training
+    from deal_hw.workflows.train import train as train
 
-__version__ = "0.1.0"
-
-_WORKFLOWS = {"calibrate": "deal_hw.workflows.calibrate", "Calibration": "deal_hw.workflows.calibrate"}
-"""Name -> module, imported on use."""
+_EXPORTS = {
+    "workflows.calibrate": ("calibrate", "Calibration"),
+    "workflows.collect": ("collect",),
+    "workflows.deploy": ("deploy",),
+    "workflows.doctor.examine": ("doctor",),
+    "workflows.emulate": ("emulate", "EmulatedRobot"),
+    "workflows.design_excitation": ("design_excitation",),
+    "workflows.inspect": ("inspect", "Inspection"),
+    "workflows.replay": ("replay",),
+    "workflows.running.report": ("RunReport",),
+    "workflows.running.settings": ("LinkOptions", "LegOptions"),
+    "workflows.train": ("train", "Training"),
+    "transport": ("WireOptions",),
+}
+"""Module -> names, imported on use."""
+_MODULES = {name: f"deal_hw.{module}" for module, names in _EXPORTS.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _WORKFLOWS:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_WORKFLOWS[name]), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_WORKFLOWS})
+    return sorted({*globals(), *_MODULES})

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("deal_hw", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("deal_hw")
 
-REAL_TIME = {"cli", "contracts", "control", "drivers", "tools"}
+REAL_TIME = {"cli", "contracts", "control", "drivers", "tools", "workflows"}
 """Folders of tests with processes that run in real time; two of these at once would disturb each other."""
 
 

@@ -13,12 +13,12 @@ from typing import Any, Self
 
 from bridge_client import PATIENCE_S
 
-from deal_hw.cli.emulator_process import VerbProcess
 from deal_hw.cli.keys import Make, make
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.transports.certificates import sign
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.emulation.process import VerbProcess
 
 
 def make_keys(folder: Path, *addresses: str) -> None:

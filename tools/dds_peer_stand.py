@@ -21,7 +21,7 @@ from typing import Any
 import tyro
 
 from deal_hw.bench.rows import describe_call
-from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 ROOT = Path(__file__).resolve().parents[1]
 PEER = ROOT / "build/dds_peer/go2_peer"

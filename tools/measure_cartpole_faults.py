@@ -38,8 +38,9 @@ STOPPED = "stopped"
 DEPLOY = """
 import sys
 from pathlib import Path
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import run_episodes
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.cli.show import Terminal
+from deal_hw.workflows.running.supervised import run_episodes
 from deal_hw.errors import DealHwError
 
 policy, wanted, seconds, wire, port, dataset, *dry = sys.argv[1:]
@@ -48,7 +49,9 @@ plan = RunPlan(
     dry_run=bool(dry), home=not dry,
 )
 try:
-    code = run_episodes(plan, port=port, dataset=Path(dataset), episodes=1, purpose="deploy").exit_code
+    code = run_episodes(
+        plan, port=port, dataset=Path(dataset), episodes=1, purpose="deploy", view=Terminal()
+    ).exit_code
 except KeyboardInterrupt:
     code = 130
 except DealHwError as error:

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import write_rows
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.drivers import make_robot
 from deal_hw.errors import TransportTimeoutError
 from deal_hw.testing.robot_suite import default_command
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 WIRE_MS = {"serial": (0.28, 0.45), "can": (0.81, 1.35), "odrive": (1.0, 1.08), "dynamixel": (0.27, 1.76)}
 """Command and state: 28 and 45 bytes at 1 Mbaud; 3 and 5 frames of 135 bits at 500 kbit/s; for the ODrive

@@ -23,7 +23,6 @@ import numpy as np
 import tyro
 
 from deal_hw.bench.rows import write_rows
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import become_realtime
 from deal_hw.drivers.cartpole.dynamixel.bus import Bus
@@ -32,6 +31,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import BLOCK_ADDRESS, BLOCK_BY
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import FrameError, TransportTimeoutError
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 QUESTION_BYTES = 16
 """Header 4, id, length 2, instruction, address 2, size 2, two ids, CRC 2."""

@@ -17,14 +17,14 @@ import numpy as np
 
 from deal_hw.bench.rows import write_rows
 from deal_hw.calibration import Budget
-from deal_hw.cli.calibrate import calibrate_episodes
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
-from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.emulation.virtual import VirtualCartpole
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy
 
 RANGE_RATIO = 5.0

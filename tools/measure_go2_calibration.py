@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import describe_call
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
 from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
 PATIENCE_S = 1800.0

@@ -23,10 +23,10 @@ from side_process import SideProcess
 from stall_monitor import Account, watch_stalls
 
 from deal_hw.bench.rows import describe_machine, write_rows
-from deal_hw.cli.emulate_go2 import free_port
-from deal_hw.cli.seconds_bar import seconds_bar
+from deal_hw.cli.show import seconds_bar
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.options import Range, check_ranges
 
 _START_S: Final = 30.0

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from deal_hw.bench.rows import describe_call
-from deal_hw.cli.demo_go2 import PROFILE, PROFILE_S
-from deal_hw.cli.virtual_go2 import walk
 from deal_hw.control.velocity_error import velocity_error
 from deal_hw.drivers.go2.emulator.profiles import PROFILES
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.types import FloatArray, RobotState
+from deal_hw.workflows.emulation.virtual_go2 import walk
+from deal_hw.workflows.emulation.walk_script import PROFILE, PROFILE_S
 from deal_hw.workflows.shipped import shipped_policy
 
 NAMES = ("stand", "ahead", "left", "turn")

@@ -115,7 +115,7 @@ def _port(given: str | None) -> Iterator[str]:
     if given is not None:
         yield given
         return
-    command = [sys.executable, "-m", "deal_hw.cli.emulate", "--nominal", "--profile", "sensor"]
+    command = [sys.executable, "-m", "deal_hw", "emulate", "--nominal", "--profile", "sensor"]
     process = subprocess.Popen([*command, "--parent", str(os.getpid())], stdout=subprocess.PIPE, text=True)
     try:
         # A device does not stand still because the machine is busy; an emulator should not either.

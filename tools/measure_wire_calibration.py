@@ -26,9 +26,9 @@ from deal_hw.bench.rows import write_rows
 from deal_hw.cli.bench import parse_seeds
 from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.link import LinkOptions
 from deal_hw.errors import DealHwError
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.settings import LinkOptions
 
 NOT_THERE = {"odrive": ("servo.speed_limit",)}
 """Parameters that a wire's device does not have."""

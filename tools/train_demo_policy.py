@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.cli.train import train_policy, udr_distribution
 from deal_hw.drivers import recorded_description
 from deal_hw.policies.checkpoint import read_checkpoint, write_checkpoint
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.tasks import training_task
 from deal_hw.training import TrainingFiles, TrainingStatus
+from deal_hw.workflows.train import train_policy, udr_distribution
 
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
 FILES = {"ant": "ant_udr", "go2": "go2_walk"}

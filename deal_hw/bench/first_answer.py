@@ -21,12 +21,12 @@ import numpy as np
 
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.calibration import Budget, Progress
-from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.model import Recordings
-from deal_hw.workflows.calibration.run import CalibrationInputs
+from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
+from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare, usual_method
 
 KEY = ("task", "seed")
 
@@ -105,20 +105,20 @@ class _Ask:
         return files
 
 
-def _written(robot: PlainRobot, ask: _Ask) -> Calibrate:
+def _written(robot: PlainRobot, ask: _Ask) -> CalibrateSettings:
     model, fit, held_out = write(robot, ask.folder, seconds=ask.seconds)
-    return Calibrate(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,), quiet=True)
+    return CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
 
 
-def _double_pendulum(ask: _Ask) -> Calibrate:
+def _double_pendulum(ask: _Ask) -> CalibrateSettings:
     return _written(make_robot("double-pendulum", ask.seed), ask)
 
 
-def _cart_pole(ask: _Ask) -> Calibrate:
+def _cart_pole(ask: _Ask) -> CalibrateSettings:
     return _written(make_robot("cart-pole", ask.seed), ask)
 
 
-def _torque_arm(ask: _Ask) -> Calibrate:
+def _torque_arm(ask: _Ask) -> CalibrateSettings:
     """Return an arm of two links that is driven by torques, not by servos."""
     robot = make_robot("double-pendulum", ask.seed)
     gains = {name.partition(".")[0]: value for name, value in _stiffness(robot.model).items()}
@@ -143,7 +143,7 @@ def _stiffness(mjcf: str) -> dict[str, float]:
     return {name: float(kp) for name, kp in re.findall(r'joint="(\w+)" kp="([^"]*)"', mjcf)}
 
 
-def _so101(ask: _Ask) -> Calibrate:
+def _so101(ask: _Ask) -> CalibrateSettings:
     from deal_hw.drivers.so101.description import DESCRIPTION
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
@@ -160,10 +160,10 @@ def _so101(ask: _Ask) -> Calibrate:
         fit_seconds=30.0,
         physics_step=0.004,
     )
-    return Calibrate(recordings=recordings, holdout=tuple(files[len(fitted) :]), quiet=True)
+    return CalibrateSettings(recordings=recordings, holdout=tuple(files[len(fitted) :]))
 
 
-def _go2(ask: _Ask) -> Calibrate:
+def _go2(ask: _Ask) -> CalibrateSettings:
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
     name = "go2_suspended"
@@ -177,10 +177,10 @@ def _go2(ask: _Ask) -> Calibrate:
         columns=files[0].with_name("columns.yaml"),
         window=0.2,
     )
-    return Calibrate(recordings=recordings, quiet=True)
+    return CalibrateSettings(recordings=recordings)
 
 
-PROBLEMS: Mapping[str, Callable[[_Ask], Calibrate]] = {
+PROBLEMS: Mapping[str, Callable[[_Ask], CalibrateSettings]] = {
     "double-pendulum": _double_pendulum,
     "cart-pole": _cart_pole,
     "torque-arm": _torque_arm,
@@ -230,7 +230,7 @@ def run_cell(
     threads: int | None,
     settings: FirstAnswerSettings = SETTINGS,
 ) -> Row:
-    """Calibrate one robot both ways; an error is kept in the row.
+    """CalibrateSettings one robot both ways; an error is kept in the row.
 
     Args:
         name: A name in `PROBLEMS`.
@@ -282,7 +282,7 @@ class _Shown:
 
 def _compared(
     work: CalibrationInputs,
-    config: Calibrate,
+    config: CalibrateSettings,
     seed: int,
     budget: Budget,
     threads: int | None,

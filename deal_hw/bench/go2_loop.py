@@ -17,10 +17,6 @@ import numpy as np
 
 from deal_hw.bench.rows import Cells, Row, per_parameter
 from deal_hw.calibration import CalibrationResult
-from deal_hw.cli.calibrate import Calibrate, calibrate
-from deal_hw.cli.demo_go2 import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
-from deal_hw.cli.train import train_policy, udr_distribution
-from deal_hw.cli.virtual_go2 import walk
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity import ScriptVelocity
 from deal_hw.control.velocity_error import velocity_error
@@ -32,7 +28,11 @@ from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingFiles
+from deal_hw.workflows.calibrate import calibrate
+from deal_hw.workflows.emulation.virtual_go2 import walk
+from deal_hw.workflows.emulation.walk_script import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
 from deal_hw.workflows.shipped import required_policy
+from deal_hw.workflows.train import train_policy, udr_distribution
 
 POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
 WALKS: Final = 3
@@ -76,19 +76,7 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
         out.mkdir(parents=True, exist_ok=True)
         began = time.process_time()
         dataset = recorded(truth, out)
-        found = calibrate(
-            Calibrate(
-                dataset=dataset,
-                out=out,
-                space="walk",
-                holdout=(1,),
-                seed=seed,
-                threads=threads,
-                report=False,
-                advise=False,
-                quiet=True,
-            )
-        )
+        found = calibrate(dataset=dataset, space="walk", holdout=1, seed=seed, threads=threads)
         row |= calibration_part(found.result, truth)
         row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
         row |= policies_part(found.result, truth, steps, out, train=train)

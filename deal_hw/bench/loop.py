@@ -18,7 +18,6 @@ from deal_hw.bench.rows import Cells, Row, per_parameter
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import Truth
@@ -26,6 +25,7 @@ from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
 from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.shipped import required_policy
 
 TASK_EPISODES = 5
@@ -138,8 +138,8 @@ def transfer_row(case: Case, result: CalibrationResult, folder: Path) -> dict[st
     Returns:
         The row's part that concerns the policies.
     """
-    from deal_hw.cli.train import train_policy
     from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.workflows.train import train_policy
 
     d, truth = case, case.truth
     if truth is None:

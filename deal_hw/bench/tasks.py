@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deal_hw.calib.data.problem import PopulationPolicy
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
-from deal_hw.cli.virtual import VirtualCartpole, demonstrate
 from deal_hw.control.excitation_level import ATTEMPTS
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
@@ -25,6 +23,8 @@ from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps
 from deal_hw.sim.recordings.target import Behaviour, Sensing, TargetRecording, record_target
 from deal_hw.types import FloatArray
+from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy
 
 DEMONSTRATION_S = 4.0

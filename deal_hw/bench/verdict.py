@@ -16,7 +16,6 @@ import numpy as np
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.calib.validation.verdict import SETTINGS, trust
 from deal_hw.calibration import Budget, CalibrationResult
-from deal_hw.cli.calibrate import Calibrate, calibrate_episodes, prepare, usual_method
 from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import (
     CAUSES,
@@ -29,6 +28,8 @@ from deal_hw.testing.plain_robots import (
     write,
 )
 from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare, usual_method
 
 KEY = ("task", "fault", "seed")
 RIGHT = ""
@@ -70,7 +71,7 @@ def table(cells: Sequence[tuple[str, str, int]], *, budget: Budget, threads: int
 
 
 def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int | None) -> dict[str, Any]:
-    """Calibrate one robot; an error is kept in the row.
+    """CalibrateSettings one robot; an error is kept in the row.
 
     Args:
         kind: A name in `KINDS`.
@@ -83,9 +84,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
     row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as name:
         model, fit, held_out = write(robot, Path(name))
-        config = Calibrate(
-            recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,), quiet=True
-        )
+        config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
         try:
             work = prepare(config)
             method = usual_method(config, work)

@@ -12,8 +12,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from deal_hw.cli.emulate_common import run_until, signalled
-from deal_hw.cli.emulate_go2 import free_port
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.claim import LocalClaim
 from deal_hw.control.realtime import FIFO_PRIORITY, priority
@@ -26,6 +24,8 @@ from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpo
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.emulation.common import run_until, signalled
+from deal_hw.workflows.emulation.go2 import free_port
 from deal_hw.workflows.options import Checked, Range, given, refuse
 
 ROBOTS = ("go2",)

@@ -9,11 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from deal_hw.cli.data_import import Export, Import, export_recordings, import_recordings
 from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.repair import RepairReport, repair, verify
 from deal_hw.errors import DatasetError
+from deal_hw.workflows.import_export import (
+    ExportSettings,
+    ImportSettings,
+    export_recordings,
+    import_recordings,
+)
+from deal_hw.workflows.say import aloud
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,6 +59,20 @@ class Repair:
     """Print JSON instead of sentences."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Import(ImportSettings):
+    """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/how-to/import.md."""
+
+    paths: tyro.conf.Positional[tuple[Path, ...]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(ExportSettings):
+    """Write the episodes of a dataset for other software."""
+
+    path: tyro.conf.Positional[Path]
+
+
 Data = (
     Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
@@ -74,9 +94,14 @@ def data(config: Info | Verify | Repair | Import | Export) -> int:
     if isinstance(config, Info):
         return _info(config)
     if isinstance(config, Import):
-        return import_recordings(config)
+        dataset = import_recordings(config, aloud)
+        if dataset is not None:
+            print(f"{dataset.folder}: {len(dataset.episodes)} episodes of {dataset.description['name']}")
+        return EXIT_OK
     if isinstance(config, Export):
-        return export_recordings(config)
+        count, robot = export_recordings(config, aloud)
+        print(f"{config.out}: {count} LeRobot episodes of {robot}")
+        return EXIT_OK
     reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))
     if config.json:
         values = [{**asdict(report), "sound": report.sound} for report in reports]

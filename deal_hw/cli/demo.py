@@ -21,11 +21,11 @@ import tyro
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import CalibrateReport
-from deal_hw.cli.episode_report import RunReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.options import Checked, Range, Seed, given, refuse
+from deal_hw.workflows.running.report import RunReport
 
 
 @dataclass(frozen=True, kw_only=True)

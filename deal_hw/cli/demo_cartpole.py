@@ -10,12 +10,12 @@ from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
 from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.episode_report import RunReport
-from deal_hw.cli.link import LinkOptions
 from deal_hw.cli.train import Train, train
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.types import FloatArray
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.settings import LinkOptions
 from deal_hw.workflows.shipped import required_policy
 
 EPISODES = 3

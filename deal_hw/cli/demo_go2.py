@@ -16,11 +16,7 @@ from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
 from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.emulate_go2 import read_track
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.episode_report import EpisodeReport, RunReport
-from deal_hw.cli.link import LegOptions, LinkOptions
-from deal_hw.cli.train import Train, read_distribution, train
+from deal_hw.cli.train import Train, train
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.files import write_json
@@ -29,30 +25,19 @@ from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
+from deal_hw.workflows.emulation.go2 import read_track
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.walk_script import HELDOUT, HELDOUT_S, PROFILE, PROFILE_S, write_script
+from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.settings import LegOptions, LinkOptions
 from deal_hw.workflows.shipped import required_policy
+from deal_hw.workflows.train import read_distribution
 
 STEPS: Final = 300_000
 """Of the fine-tune: a minute of a processor."""
 PORTS: Final = {"dds": "lo", "zenoh": "tcp/127.0.0.1:0"}
-PROFILE: Final = (
-    (0.0, (0.0, 0.0, 0.0)),
-    (2.0, (1.0, 0.0, 0.0)),
-    (7.0, (0.0, 0.5, 0.0)),
-    (12.0, (0.0, 0.0, 1.0)),
-)
-"""What every policy walks: time [s], velocity ahead and to the left [m/s], turn [rad/s]."""
-PROFILE_S: Final = 17.0
-HELDOUT: Final = (
-    (0.0, (0.0, 0.0, 0.0)),
-    (1.0, (0.5, 0.0, 0.0)),
-    (4.0, (0.3, 0.0, 0.3)),
-    (6.0, (0.0, -0.2, 0.0)),
-)
-"""What only judges the calibration; gentle, or every second robot falls (docs/how-to/training.md)."""
-HELDOUT_S: Final = 8.0
 ATTEMPTS: Final = 3
 """Walks, until one to calibrate from is whole."""
-Script = tuple[tuple[float, tuple[float, float, float]], ...]
 
 
 def check(config: Demo) -> None:
@@ -201,13 +186,6 @@ def _emulated(config: Demo, name: str, *options: str) -> Iterator[_Emulated]:
         # The raw bytes are nobody's need here, and half of the recorder's work.
         link = LinkOptions(transport=transport, record_wire=False)
         yield _Emulated(port=emulator.port, link=link, track=track)
-
-
-def write_script(path: Path, script: Script) -> Path:
-    """Write velocities as ``deploy --velocity`` reads them; return the file."""
-    rows = [",".join(f"{value:g}" for value in (time_s, *velocity)) for time_s, velocity in script]
-    path.write_text("\n".join(("time_s,x,y,yaw", *rows)) + "\n", encoding="utf-8")
-    return path
 
 
 def _on_stand(config: Demo, folder: RunFolder, stages: Stages) -> tuple[CalibrateReport, Path]:

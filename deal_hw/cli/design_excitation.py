@@ -1,332 +1,70 @@
-"""``deal-hw design-excitation``: compute what to play on a robot so that a recording of it tells most."""
+"""``deal-hw design-excitation``: compute the most informative motion to play on a robot."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import tyro
 
-from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.excitation import RichBehaviour, RichConfig
-from deal_hw.control.excitation_plan import (
-    ExcitationBehaviour,
-    ExcitationDesign,
-    ExcitationPlan,
-    make_plan,
-)
-from deal_hw.description import RobotDescription
-from deal_hw.drivers import parameter_spaces, recorded_description
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
-from deal_hw.parameters import ParameterDistribution, ParameterSpace
-from deal_hw.workflows.options import Range, Ratio, Seed, Threads, check_ranges, given, refuse
-from deal_hw.workflows.shipped import balancer
-
-if TYPE_CHECKING:
-    from deal_hw.calib.design.excitation_search import Optimum
-
-BALANCE_S = 0.6
-GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
-SEARCH = ("calibration", "space", "range_ratio", "criterion", "draws", "confirm", "candidates", "rounds")
+from deal_hw.workflows.design_excitation import ExcitationReport, ExcitationSettings, run
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignExcitation:
+class DesignExcitation(ExcitationSettings):
     """Compute what to play on a robot so that a recording of it tells most."""
 
     robot: tyro.conf.Positional[str]
-    """The robot, such as cartpole."""
-
-    out: Path
-    """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
-
-    family: Literal["optimal", "multisine", "chirp", "steps", "sway"] = "optimal"
-    """optimal: the most informative of many of the others, by simulation; multisine: a sum of sines with a
-    low peak; chirp: a sweep; steps: random set-points; sway: the body moves over standing feet (go2)."""
-
-    seconds: Annotated[float, Range(0.5, 600, "s")] = 4.0
-    """Length of the recording [s]."""
-
-    amplitude: Annotated[float, Range(1e-3, 1)] = 1.0
-    """Not for optimal: share of the largest amplitude that the safety limits allow."""
-
-    low_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 0.3
-    """Not for optimal: least frequency of multisine, chirp and sway."""
-
-    high_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 5.0
-    """Not for optimal: greatest frequency of multisine, chirp and sway."""
-
-    effort: Annotated[float, Range(1e-3, 1000)] = 1.0
-    """Not for optimal: factor on the effort limit that is sent from SPLIT on."""
-
-    speed: Annotated[float, Range(1e-3, 1000)] = 1.0
-    """Not for optimal: factor on the speed limit that is sent from SPLIT on."""
-
-    split: Annotated[float, Range(0, 1)] = 0.5
-    """Not for optimal: fraction of the run from which on the two factors hold; 0 for all of it."""
-
-    policy: Path | None = None
-    """Policy that balances at first (.onnx); by default the one shipped for the robot, if any."""
-
-    calibration: Path | None = None
-    """distribution.json of a calibration: robots are drawn from it instead of the whole ranges."""
-
-    space: str = ""
-    """Parameters to tell, such as k9; by default the robot's first set."""
-
-    range_ratio: Annotated[float, Ratio] = 5.0
-    """Ranges reach a factor RANGE-RATIO to either side of nominal."""
-
-    criterion: Literal["determinant", "mean"] = "determinant"
-    """determinant: most information in all; mean: least mean standard deviation."""
-
-    draws: Annotated[int, Range(1, 10_000)] = 24
-    """Robots that each candidate is tried on."""
-
-    confirm: Annotated[int, Range(1, 10_000)] = 24
-    """Other robots on which the best candidates are judged in the end."""
-
-    candidates: Annotated[int, Range(1, 100_000)] = 40
-    """Random candidates."""
-
-    rounds: Annotated[int, Range(0, 100_000)] = 24
-    """Changes that are tried on the best of them."""
-
-    seed: Seed = 0
-    """Fixes everything random."""
-
-    threads: Threads = None
-    """Simulation threads; by default all CPUs."""
 
     quiet: bool = False
     """Print nothing but errors."""
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if not self.low_hz < self.high_hz:
-            raise ConfigurationError(f"--low-hz {self.low_hz:g} must be below --high-hz {self.high_hz:g}")
 
-
-@dataclass(frozen=True, kw_only=True)
-class ExciteReport:
-    """What was computed.
-
-    Attributes:
-        plan: What will be played.
-        path: Where it was written.
-        optimum: How it was found; None where it was not searched.
-    """
-
-    plan: ExcitationPlan
-    path: Path
-    optimum: Optimum | None = None
-
-
-def design_excitation(config: DesignExcitation) -> ExciteReport:
-    """Compute an excitation, write it, return it.
-
-    Raises:
-        DealHwError: A setting is unusable, or no candidate keeps the limits.
-    """
-    default = DesignExcitation(robot=config.robot, out=config.out)
-    if config.family == "optimal":
-        refuse(
-            given(config, default, GIVEN_DESIGN),
-            "--family optimal searches it; name another",
-        )
-        if config.calibration is not None:
-            refuse(given(config, default, ("space", "range_ratio")), "--calibration says what is known")
-    else:
-        refuse(
-            given(config, default, SEARCH),
-            f"--family {config.family} is not searched; use --family optimal",
-        )
-    description = recorded_description(config.robot)
-    most_hz = description.control_rate_hz / 2
-    if config.family in ("multisine", "chirp", "sway") and config.high_hz > most_hz:
-        raise ConfigurationError(
-            f"--high-hz {config.high_hz:g}: {config.robot} takes {description.control_rate_hz:g} commands a "
-            f"second, which carry up to {most_hz:g} Hz"
-        )
-    balance = balancer(description, config.policy)
-    optimum = None
-    if config.family == "optimal":
-        optimum = _search(config, description, balance)
-        plan = optimum.plan
-    elif config.family == "sway":
-        plan = _sway(config, description)
-    else:
-        plan = make_plan(description, _given_design(config, balance is not None))
-    plan.write(config.out)
+def design_excitation(config: DesignExcitation) -> ExcitationReport:
+    """Run the verb; see :func:`deal_hw.workflows.design_excitation.design_excitation`."""
+    report = run(config, note if not config.quiet and sys.stderr.isatty() else None)
     if not config.quiet:
-        print(plan.words)
-        print(
-            f"written: {config.out}; play it with `deal-hw collect {config.robot} --excite {config.out} ...`"
-        )
-    return ExciteReport(plan=plan, path=config.out, optimum=optimum)
+        print_design(config.robot, report)
+    return report
 
 
-def _sway(config: DesignExcitation, description: RobotDescription) -> ExcitationPlan:
-    if description.name != "go2":
-        raise ConfigurationError(
-            f"robot {description.name!r} does not sway: that is for go2, which stands on four feet; choose "
-            "another --family"
-        )
-    try:
-        from deal_hw.drivers.go2.motions import sway_plan
-        from deal_hw.sim.engine.model import load_model
-    except ModuleNotFoundError as err:
-        raise MissingExtraError(str(err.name), "calib") from err
-    return sway_plan(
-        load_model(description),
-        np.random.default_rng(config.seed),
-        config.seconds,
-        (config.low_hz, config.high_hz),
-        config.amplitude,
-    )
-
-
-def _given_design(config: DesignExcitation, balances: bool) -> ExcitationDesign:
-    if config.family == "optimal" or config.family == "sway":
-        raise RuntimeError(f"unreachable: {config.family} has no design")
-    whole = config.split <= 0
-    return ExcitationDesign(
-        family=config.family,
-        seconds=config.seconds,
-        amplitude=config.amplitude,
-        low_hz=config.low_hz,
-        high_hz=config.high_hz,
-        split=1.0 if whole else config.split,
-        effort=(config.effort, 1.0) if whole else (1.0, config.effort),
-        speed=(config.speed, 1.0) if whole else (1.0, config.speed),
-        seed=config.seed,
-        balance_s=_balance_s(config.seconds) if balances else 0.0,
-    )
-
-
-def _balance_s(seconds: float) -> float:
-    return min(BALANCE_S, 0.25 * seconds)
-
-
-def _search(
-    config: DesignExcitation, description: RobotDescription, balance: Callable[[], Behaviour] | None
-) -> Optimum:
-    try:
-        from deal_hw.calib.design.excitation_search import SearchSettings, search_excitation
-        from deal_hw.calib.design.experiment_design import Experiment
-        from deal_hw.sim.engine.model import load_model
-    except ModuleNotFoundError as err:
-        raise MissingExtraError(str(err.name), "calib") from err
-    settings = SearchSettings(
-        candidates=config.candidates,
-        rounds=config.rounds,
-        criterion=config.criterion,
-    )
-    rng = np.random.default_rng(config.seed)
-    quiet_plan = make_plan(
-        description,
-        ExcitationDesign(
-            family="steps",
-            seconds=config.seconds,
-            amplitude=0.01,
-            balance_s=_balance_s(config.seconds) if balance is not None else 0.0,
-        ),
-    )
-
-    def play(plan: ExcitationPlan) -> Behaviour:
-        return ExcitationBehaviour(plan, description, balance() if balance is not None else None)
-
-    experiment = Experiment(
-        load_model(description),
-        _knowledge(config),
-        config.seconds,
-        config.draws,
-        rng,
-        rest=lambda: play(quiet_plan),
-        threads=config.threads,
-    )
-    references: dict[str, Callable[[], Behaviour]] = {
-        family: _player(play, make_plan(description, design))
-        for family, design in _plain_designs(config, balance is not None).items()
-    }
-    if balance is not None:
-        rich = RichConfig(duration_s=config.seconds)
-        references["rich"] = lambda: RichBehaviour(description, balance(), rich, config.seed)
-    shown = not config.quiet and sys.stderr.isatty()
-    optimum = search_excitation(
-        experiment,
-        rng,
-        settings,
-        balance=balance,
-        references=references,
-        confirmation=experiment.afresh(config.confirm, rng),
-        notify=_note if shown else None,
-    )
-    if not config.quiet:
-        print_optimum(experiment.space, optimum, experiment.refused)
-    return optimum
-
-
-def _player(play: Callable[[ExcitationPlan], Behaviour], plan: ExcitationPlan) -> Callable[[], Behaviour]:
-    return lambda: play(plan)
-
-
-def _plain_designs(config: DesignExcitation, balances: bool) -> dict[str, ExcitationDesign]:
-    balance_s = _balance_s(config.seconds) if balances else 0.0
-    return {
-        "multisine": ExcitationDesign(
-            family="multisine", seconds=config.seconds, balance_s=balance_s, seed=config.seed
-        ),
-        "chirp": ExcitationDesign(family="chirp", seconds=config.seconds, balance_s=balance_s),
-    }
-
-
-def _knowledge(config: DesignExcitation) -> ParameterDistribution:
-    from deal_hw.calib.design.experiment_design import default_knowledge
-
-    if config.calibration is not None:
-        from deal_hw.cli.train import read_distribution
-
-        path = config.calibration
-        return read_distribution(path / "distribution.json" if path.is_dir() else path)
-    table = parameter_spaces(config.robot)
-    name = config.space or next(iter(table))
-    if name not in table:
-        raise UnknownNameError("parameter set", name, table)
-    return default_knowledge(table[name]().with_ratio(config.range_ratio))
-
-
-def _note(done: int, total: int, text: str) -> None:
+def note(done: int, total: int, text: str) -> None:
+    """Show how far a search is."""
     print(f"\r{done}/{total} {text:<60.60}", end="" if done < total else "\n", file=sys.stderr, flush=True)
 
 
-def print_optimum(space: ParameterSpace, optimum: Optimum, refused: int) -> None:
-    """Print what the best excitation and the plain ones are predicted to tell."""
+def print_design(robot: str, report: ExcitationReport) -> None:
+    """Print a motion and, where it was searched, what it and the plain ones are predicted to tell."""
+    if report.optimum is not None:
+        _print_optimum(report)
+    print(report.plan.words)
+    print(f"written: {report.path}; play it with `deal-hw collect {robot} --excite {report.path} ...`")
+
+
+def _print_optimum(report: ExcitationReport) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    optimum = report.optimum
+    if optimum is None or report.space is None:
+        return
     table = Table(title="predicted standard deviation (% of the value; in the unit on a linear scale)")
     table.add_column("parameter")
     columns = {"optimal": optimum.prediction, **optimum.references}
     for name in columns:
         table.add_column(name, justify="right")
-    for k, p in enumerate(space):
+    for k, p in enumerate(report.space):
         factor = 100.0 if p.scale == "log" else 1.0
         cells = [f"{factor * c.std[k]:.2f}" if c.usable else "-" for c in columns.values()]
         table.add_row(p.name, *cells)
     table.add_row(
         "information [nats]", *[f"{c.gain:.1f}" if c.usable else c.tripped for c in columns.values()]
     )
-    console = Console()
-    console.print(table)
+    Console().print(table)
     discarded = sum(optimum.tripped.values())
     reasons = "; ".join(f"{count} x {why}" for why, count in optimum.tripped.items())
     print(
         f"{optimum.tried} candidates, {discarded} discarded"
         + (f" ({reasons})" if reasons else "")
-        + (f"; {refused} draws of parameters refused" if refused else "")
+        + (f"; {report.refused} draws of parameters refused" if report.refused else "")
     )

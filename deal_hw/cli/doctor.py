@@ -6,82 +6,29 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import tyro
 
-from deal_hw.cli.doctor_machine import examine_machine
-from deal_hw.cli.doctor_serial import examine_robot
-from deal_hw.clock import MonotonicClock
-from deal_hw.drivers import (
-    CAN_BUSES,
-    TOPIC_TRANSPORTS,
-    can_bus,
-    default_transport,
-    make_robot,
-    make_topic_transport,
-)
-from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.findings import Finding, Level
-from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import Range, check_ranges
+from deal_hw.workflows.doctor.examine import DoctorReport, DoctorSettings, examine
 
 _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: "FAIL"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Doctor:
+class Doctor(DoctorSettings):
     """Find out what is wrong with this computer, the link and the robot; sends no command to a motor.
 
     Without a robot only this computer is examined.
     """
 
     robot: tyro.conf.Positional[str] = ""
-    """The robot to listen to, such as go2."""
-
-    port: str = ""
-    """Where it is: a network interface (dds), an endpoint (zenoh), a serial port or a CAN bus."""
-
-    transport: str = ""
-    """How it is reached; by default the robot's usual way."""
-
-    state_check: Literal["strict", "length"] = "strict"
-    """What the states of a Go2 must pass: strict, or length to leave head and checksum out."""
-
-    seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
-    """How long to listen to the robot [s]."""
-
-    wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
-    """More about a network."""
 
     json: Path | None = None
     """Write the findings to this file."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if bool(self.robot) != bool(self.port):
-            raise ConfigurationError(
-                "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"
-            )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DoctorReport:
-    """What was found.
-
-    Attributes:
-        findings: All findings, in the order of the examination.
-    """
-
-    findings: tuple[Finding, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """For the shell: 0, or 1 where something does not work."""
-        return int(any(finding.level is Level.FAIL for finding in self.findings))
 
 
 def doctor(config: Doctor) -> DoctorReport:
@@ -93,7 +40,7 @@ def doctor(config: Doctor) -> DoctorReport:
     """
     found: list[Finding] = []
     area = ""
-    for finding in _examine(config):
+    for finding in examine(config):
         if finding.area != area:
             area = finding.area
             print(area)
@@ -121,55 +68,3 @@ def _wrapped(lead: str, text: str) -> str:
         break_long_words=False,
         break_on_hyphens=False,
     )
-
-
-def _examine(config: Doctor) -> Iterator[Finding]:
-    from deal_hw.cli.doctor_can import list_adapters, listen_to_bus
-    from deal_hw.drivers.transports.can_transport import open_can
-
-    yield from examine_machine()
-    yield from list_adapters()
-    yield from _interfaces(config.port)
-    if not config.robot:
-        return
-    name = config.transport or default_transport(config.robot)
-    clock = MonotonicClock()
-    try:
-        if name not in TOPIC_TRANSPORTS:
-            if name in CAN_BUSES:
-                bus, nodes = can_bus(name, config.port)
-                yield from listen_to_bus(open_can(bus, clock), clock, min(1.0, config.seconds), *nodes)
-            if name == "dynamixel":
-                from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
-
-                yield from examine_servos(config.port, clock)
-            robot = make_robot(config.robot, name, config.port, clock, config.wire)
-            yield from examine_robot(config.robot, robot, clock, config.seconds)
-            return
-        from deal_hw.drivers.go2.doctor import Doctor
-
-        link = make_topic_transport(name, config.port, clock, config.wire)
-        yield from Doctor(link, clock, config.seconds, config.state_check).run()
-    except DealHwError as error:
-        yield Finding("link", Level.FAIL, str(error))
-
-
-def _interfaces(port: str) -> Iterator[Finding]:
-    from deal_hw.drivers.transports.interfaces import list_interfaces
-
-    for interface in list_interfaces():
-        level, remedy = Level.OK, ""
-        if port in (interface.name, *interface.addresses) and not interface.carrier:
-            level, remedy = Level.FAIL, "is the cable in, and is the robot switched on?"
-        elif not interface.multicast and not interface.loopback and interface.up:
-            level = Level.WARN
-            remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
-        elif (
-            not interface.multicast and interface.loopback and port in (interface.name, *interface.addresses)
-        ):
-            level = Level.NOTE
-            remedy = (
-                "deal-hw's own programs meet here; programs on the vendor's SDK find nothing until "
-                f"`ip link set {interface.name} multicast on`"
-            )
-        yield Finding("interfaces", level, str(interface), remedy)

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TextIO, cast
 
-from deal_hw import __version__
 from deal_hw.errors import DealHwError, MissingExtraError, UnknownNameError, short
+from deal_hw.version import __version__
 
 EXIT_OK = 0
 EXIT_ERROR = 2
@@ -222,8 +222,9 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
             getattr(module, verb.config),
             prog=f"deal-hw {name}",
             args=list(arguments),
-            config=(tyro.conf.FlagCreatePairsOff,),
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed),
             console_outputs=speak,
+            registry=_rules(),
         )
 
     try:
@@ -238,6 +239,48 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
             raise cause from None
         settings = read(speak=True)
     return settings, getattr(module, verb.function)
+
+
+def _rules() -> Any:
+    """Return how words become values where settings say more than the parser knows.
+
+    Files and folders, which Python may also name by a string, are paths. Choices are left to the settings,
+    which refuse wrong ones with the same words from Python.
+    """
+    from pathlib import Path
+    from typing import Literal, get_args, get_origin
+
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
+        choices = get_args(info.type)
+        if get_origin(info.type) is not Literal or not all(isinstance(one, str) for one in choices):
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=f"{{{','.join(choices)}}}",
+            instance_from_str=lambda words: words[0],
+            is_instance=lambda value: isinstance(value, str),
+            str_from_instance=lambda value: [value],
+        )
+
+    @registry.primitive_rule
+    def path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path | str | None] | None:
+        optional = info.type == Path | str | None
+        if not optional and info.type != Path | str:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="{None}|PATH" if optional else "PATH",
+            instance_from_str=lambda words: None if optional and words[0] == "None" else Path(words[0]),
+            is_instance=lambda value: isinstance(value, Path | str) or (optional and value is None),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return registry
 
 
 def run(name: str, arguments: Sequence[str]) -> int:

@@ -7,47 +7,21 @@ from pathlib import Path
 
 import tyro
 
-from deal_hw.cli.episode_report import RunReport
-from deal_hw.cli.link import RunOptions, plan_options
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import dataset_folder, run_episodes
-from deal_hw.control.behaviours import ReplayBehaviour
-from deal_hw.data.recording.reader import read_trajectory
-from deal_hw.drivers import driver_description
+from deal_hw.cli.show import Terminal
+from deal_hw.workflows.replay import ReplaySettings, run
+from deal_hw.workflows.running.report import RunReport
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay(RunOptions):
+class Replay(ReplaySettings):
     """Send a recording's commands again, through the safety filter, and record what happens."""
 
     episode: tyro.conf.Positional[Path]
-    """The recording (.mcap)."""
 
-    robot: str = ""
-    """The robot; by default the one that was recorded."""
+    quiet: bool = False
+    """Print nothing but errors."""
 
 
 def replay(config: Replay) -> RunReport:
-    """Replay a recording from the robot's start pose and return how it went.
-
-    Raises:
-        DatasetError: The recording cannot be read or holds no command.
-        DealHwError: What made it fail; the robot is passive and what was recorded is whole.
-    """
-    trajectory = read_trajectory(config.episode)
-    robot = config.robot or str(trajectory.metadata.get("robot", ""))
-    behaviour = ReplayBehaviour(trajectory, driver_description(robot))
-    plan = RunPlan(
-        **plan_options(robot, config.link, config.legs, walks=False),
-        profile="replay",
-        recording=str(config.episode.resolve()),
-        seconds=behaviour.duration_s,
-    )
-    return run_episodes(
-        plan,
-        port=config.port,
-        dataset=dataset_folder(config.out, config.dataset, required=False),
-        episodes=1,
-        purpose="replay",
-        quiet=config.quiet,
-    )
+    """Run the verb; see :func:`deal_hw.workflows.replay.replay`."""
+    return run(config, Terminal(config.quiet))

@@ -12,26 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from deal_hw.calib.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, CalibrationResult, ProgressCallback
-from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
-from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
-from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
-from deal_hw.workflows.calibration.policy import check_policy
+from deal_hw.workflows.calibration.model import DEFAULT, Recordings
 from deal_hw.workflows.calibration.recordings import Source
-from deal_hw.workflows.calibration.run import (
-    HELDOUT_WINDOW_S,
-    CalibrationInputs,
-    SpaceOverrides,
-    calibrate_episodes,
-    judged,
-    residual_std_of,
+from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S, CalibrationInputs, judged
+from deal_hw.workflows.calibration.settings import (
+    CalibrateSettings,
+    calibrate_inputs,
+    check_source,
+    prepare,
+    usual_method,
 )
-from deal_hw.workflows.options import refuse
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say, html_table, silent, text_table
+
+_HEAD = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,14 +79,7 @@ class Calibration:
 
     def table(self) -> str:
         """Return the parameters with their 90 % intervals, and what to think of them, as text."""
-        head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
-        body = [_cells(row) for row in self.rows()]
-        widths = [max(len(line[k]) for line in (head, *body)) for k in range(len(head))]
-        lines = [
-            "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
-            for line in (head, *body)
-        ]
-        return "\n".join([*lines, "", *self._words()])
+        return "\n".join([text_table(_HEAD, map(_cells, self.rows())), "", *self._words()])
 
     def report(self, path: Path | str) -> Path:
         """Write everything on one HTML page and return its path; takes some seconds.
@@ -102,7 +90,15 @@ class Calibration:
         from deal_hw.calib.report.page import REPORT, write_report
 
         path = Path(path)
-        _, shown = judged(self.inputs, self.result, {}, page=True, advise=False, threads=self.threads)
+        window_s = self.result.provenance["heldout_window_s"]
+        _, shown = judged(
+            self.inputs,
+            self.result,
+            {"heldout_window_s": window_s},
+            page=True,
+            advise=False,
+            threads=self.threads,
+        )
         assert shown is not None
         write_report(path, shown)
         return path / REPORT if path.is_dir() else path
@@ -139,12 +135,8 @@ class Calibration:
         return f"<Calibration of {len(self.result.space)} parameters, {self.colour}; table() shows them>"
 
     def _repr_html_(self) -> str:
-        head = ("parameter", "unit", "nominal", "estimate", "90 % interval", "verdict")
-        lines = [f"<tr>{''.join(f'<th>{html.escape(name)}</th>' for name in head)}</tr>"]
-        for row in self.rows():
-            lines.append(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in _cells(row))}</tr>")
         words = "".join(f"<p>{html.escape(line)}</p>" for line in self._words())
-        return f"<table>{''.join(lines)}</table>{words}"
+        return html_table(_HEAD, map(_cells, self.rows())) + words
 
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -178,7 +170,13 @@ def calibrate(
     residual_std: float | Mapping[str, float] | None = None,
     feet: Sequence[str] = (),
     holdout_part: float | None = None,
+    leave_out: Sequence[tuple[str, float, float]] = (),
     fit_seconds: float = Recordings().fit_seconds,
+    window_s: float = Recordings().window,
+    physics_step_s: float | None = None,
+    force: bool = False,
+    sample_hz: float | None = None,
+    spike_ratio: float = CalibrateSettings.spike_ratio,
     heldout_window_s: float = HELDOUT_WINDOW_S,
     method: str = DEFAULT,
     refine: bool = True,
@@ -212,7 +210,15 @@ def calibrate(
         residual_std: What a prediction may be off [rad, m], for all or by joint; the sensor noise by default.
         feet: Sphere geoms of a floating robot's feet.
         holdout_part: Without ``holdout`` this last share of each recording only judges; 0.25 by default.
+        leave_out: Stretches of files that the model has no part for, such as a contact: file name, from, to
+            [s from its start].
         fit_seconds: Most to fit, spread evenly over the recordings [s].
+        window_s: Length of the search's longest windows of prediction [s].
+        physics_step_s: Wanted physics step [s]; the MJCF's timestep by default.
+        force: Use recordings although a plausibility check failed.
+        sample_hz: States a second of a dataset that are fitted to [Hz]; four a control period by default.
+        spike_ratio: How many times farther than the joint's fastest motion a sample must jump away and back
+            to be left out.
         heldout_window_s: Held-out predictions restart this often [s].
         method: Name of the method; the one that suits the recordings by default.
         refine: Follow the search by multiple shooting on prediction error.
@@ -230,82 +236,55 @@ def calibrate(
     Raises:
         DealHwError: A setting or a recording is unusable; nothing long was begun.
     """
-    check_method(method)
-    if (dataset is None) == (model is None):
-        raise ConfigurationError(
-            "calibrate: name a model and its recordings (model=..., data=[...]), or a dataset (dataset=...), "
-            "not both"
-        )
-    of_model = {
-        "data": data,
-        "columns": columns,
-        "parameters": parameters,
-        "feet": feet,
-        "holdout_part": holdout_part,
-    }
-    of_dataset = {"episodes": episodes, "space": space}
-    others, where = (of_dataset, "dataset") if dataset is None else (of_model, "model")
-    refuse([name for name, value in others.items() if _given(value)], f"that goes with {where}=...")
-    check_policy(method, given=policy is not None, model=dataset is None)
-    overrides = SpaceOverrides(
-        free=tuple(free),
-        known=dict(known or {}),
-        ranges=[(name, low, high) for name, (low, high) in (ranges or {}).items()],
-        range_ratio=range_ratio,
-    )
-    judges = _listed(holdout)
+    check_source(dataset=dataset is not None, model=model is not None)
+    fit, judges = _listed(data), _listed(holdout)
     with contextlib.ExitStack() as kept:
-        if dataset is None:
+        path = None
+        if model is not None:
             from deal_hw.sim.mjcf.model_file import mjcf_file
 
             scratch = Path(tempfile.mkdtemp(prefix="deal-hw-"))
             kept.callback(shutil.rmtree, scratch, ignore_errors=True)
-            recordings = Recordings(
-                model=mjcf_file(model, scratch),
+            path = mjcf_file(model, scratch)
+        settings = CalibrateSettings(
+            dataset=dataset,
+            recordings=Recordings(
+                model=path,
                 columns=None if columns is None else Path(columns),
                 parameters=None if parameters is None else Path(parameters),
                 feet=tuple(feet),
                 holdout_part=holdout_part,
+                leave_out=tuple(leave_out),
                 fit_seconds=fit_seconds,
-            )
-            inputs = prepare_model(
-                recordings,
-                judges,
-                overrides,
-                std=lambda robot: residual_std_of(residual_std, robot),
-                data=_listed(data),
-                threads=threads,
-                say=say,
-            )
-        else:
-            source = DatasetRecordings(
-                folder=Path(dataset),
-                episodes=tuple(episodes),
-                holdout=[_episode(one) for one in judges],
-                policy=None if policy is None else Path(policy),
-            )
-            inputs = prepare_dataset(source, space, overrides, method, say)
-        if method == DEFAULT:
-            told = residual_std is not None or not refine
-            method = method_for(inputs, told=told, real=dataset is None)
-        result = calibrate_episodes(
-            inputs.robot,
-            inputs.space,
-            inputs.episodes,
-            inputs.holdout,
+                window=window_s,
+                physics_step=physics_step_s,
+                force=force,
+            ),
+            sample_hz=sample_hz,
+            spike_ratio=spike_ratio,
+            episodes=tuple(episodes),
+            heldout_window=heldout_window_s,
             method=method,
-            budget=usual_budget(method, population, generations, refine=refine),
-            rng=np.random.default_rng(seed),
-            latency_s=latency_s,
-            latency_range_s=latency_range_s,
+            policy=policy,
+            space=space,
+            free=tuple(free),
+            known=tuple((known or {}).items()),
+            range=tuple((name, low, high) for name, (low, high) in (ranges or {}).items()),
+            range_ratio=range_ratio,
+            latency=latency_s,
+            latency_range=latency_range_s,
+            residual_std=residual_std,
+            population=population,
+            generations=CalibrateSettings.generations if generations is None else generations,
+            refine=refine,
+            seed=seed,
             threads=threads,
-            progress=progress,
-            say=say,
-            known_std=residual_std_of(residual_std, inputs.robot),
-            heldout_window_s=heldout_window_s,
-            policy=inputs.policy,
-            smoothing_s=inputs.smoothing_s,
         )
+        settings.check(fit)
+        inputs = prepare(settings, data=fit, holdout=judges, say=say)
+        chosen = usual_method(settings, inputs, say)
+        result = calibrate_inputs(settings, inputs, chosen, progress=progress, say=say)
+        result, _ = judged(inputs, result, settings.provenance, page=False, advise=False, threads=threads)
         found = Calibration(result=result, inputs=inputs, threads=threads)
         # The model's file is read again when the calibrated one is written.
         weakref.finalize(found, kept.pop_all().close)
@@ -316,13 +295,3 @@ def _listed(given: Any) -> list[Any]:
     """Return one recording, or several, as a list."""
     alone = isinstance(given, str | Path | int | Mapping) or hasattr(given, "columns")
     return [given] if alone else list(given)
-
-
-def _given(value: Any) -> bool:
-    return value is not None and not (isinstance(value, str | list | tuple) and not value)
-
-
-def _episode(number: Any) -> int:
-    if not isinstance(number, int):
-        raise ConfigurationError(f"holdout={number!r}: of a dataset name episodes by number")
-    return number

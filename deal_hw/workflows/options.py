@@ -1,21 +1,26 @@
-"""What every verb's settings share: ranges of numbers, and options that have no effect where they are given.
+"""What all settings share: ranges of numbers, choices, and options that have no effect where they are given.
 
 A number of a settings dataclass carries its range in its type::
 
     seconds: Annotated[float, Range(0.1, 3600, "s")] = 4.0
 
-and :func:`check_ranges`, called in ``__post_init__``, refuses what lies outside. A test sweeps over all
-verbs, so a number without a range does not pass.
+and :func:`check_ranges`, called in ``__post_init__``, refuses what lies outside, and what is none of a
+``Literal``. So the command line and Python refuse the same with the same words. A test sweeps over all verbs,
+so a number without a range does not pass.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from deal_hw.errors import ConfigurationError, short
+from deal_hw.errors import ConfigurationError, UnknownNameError, short, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,12 @@ class Range:
         return f"{self.low:.12g} to {self.high:.12g}{self._unit}"
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+S = TypeVar("S")
+
+File = Path | str
+"""A file or folder, by its path."""
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Threads = Annotated[int | None, Range(1, 1024)]
 RunSeconds = Annotated[float, Range(0.02, 3600, "s")]
@@ -79,22 +90,47 @@ def option(name: str) -> str:
 
 
 def check_ranges(settings: Any) -> None:
-    """Check the numbers of a settings dataclass against the ranges in their types.
+    """Check the numbers and choices of a settings dataclass against their types.
 
     Raises:
-        ConfigurationError: One lies outside; the message names option, value and range.
+        ConfigurationError: A number lies outside its range, or is none; the message names option, value and
+            range.
+        UnknownNameError: A name is none of the choices.
     """
-    for name, allowed in ranges(type(settings)):
-        allowed.check(option(name), getattr(settings, name))
-
-
-def ranges(settings: type[Any]) -> Iterator[tuple[str, Range]]:
-    """Yield the fields of a settings dataclass that have a range."""
-    for name, hint in get_type_hints(settings, include_extras=True).items():
+    for name, hint in get_type_hints(type(settings), include_extras=True).items():
+        value = getattr(settings, name)
+        kinds = set(_kinds(hint))
         if get_origin(hint) is Annotated:
-            for extra in get_args(hint)[1:]:
-                if isinstance(extra, Range):
-                    yield name, extra
+            for allowed in (extra for extra in get_args(hint)[1:] if isinstance(extra, Range)):
+                allowed.check(option(name), value)
+                _check_number(option(name), value, kinds, allowed)
+        choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+        if choices and value is not None and value not in choices:
+            raise UnknownNameError(name.replace("_", " "), str(value), map(str, choices))
+
+
+def _check_number(option: str, value: Any, kinds: set[Any], allowed: Range) -> None:
+    """Refuse what Python can give for a number, and a command line cannot."""
+    if isinstance(value, str | Path):
+        fine = bool({str, Path} & kinds)
+    elif isinstance(value, float):
+        fine = float in kinds
+    else:
+        fine = value is not None or NoneType in kinds
+    if not fine:
+        number = "number" if float in kinds else "whole number"
+        raise ConfigurationError(f"{option} {shown(value)} is no {number}: allowed are {allowed}")
+
+
+def _kinds(hint: Any) -> Iterator[Any]:
+    """Yield the types that a hint names: the members of unions and of tuples."""
+    if get_origin(hint) is Annotated:
+        yield from _kinds(get_args(hint)[0])
+    elif get_origin(hint) in (UnionType, Union, tuple):
+        for part in get_args(hint):
+            yield from _kinds(part)
+    else:
+        yield hint
 
 
 def given(settings: Any, default: Any, names: Iterable[str] = ()) -> list[str]:
@@ -121,3 +157,27 @@ def refuse(options: Iterable[str], reason: str) -> None:
     """
     if found := list(options):
         raise ConfigurationError(f"{', '.join(found)} would have no effect: {reason}")
+
+
+def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Callable[P, R]]:
+    """Let a function of settings take them as arguments: what a verb refuses, the function refuses.
+
+    Args:
+        settings: The settings' class; the function gets its signature, and refuses unknown names by
+            :class:`UnknownNameError`.
+    """
+    signature = inspect.signature(settings)
+
+    def with_arguments(function: Callable[[S], R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name in kwargs:
+                if name not in signature.parameters:
+                    raise UnknownNameError(f"argument of {function.__name__}", name, signature.parameters)
+            return function(settings(*args, **kwargs))
+
+        del call.__wrapped__
+        call.__signature__ = signature  # type: ignore[attr-defined]
+        return call
+
+    return with_arguments

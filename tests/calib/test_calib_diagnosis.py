@@ -17,10 +17,10 @@ from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.diagnosis import Diagnosis, Evidence, evidence, find_play, name_causes
 from deal_hw.calib.validation.random_delay import FOLDS, random_delay
 from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, held_direction
-from deal_hw.cli.calibrate import Calibrate, prepare
 from deal_hw.testing.plain_robots import Fault, PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
 DAMPING = 2.0
@@ -228,7 +228,7 @@ def _truth(kind: str, fault: Fault | None, folder: Path) -> tuple[PlainRobot, Pr
     """Return a simulated robot's recordings, and what a fit from its own values makes of them."""
     robot = make_robot(kind, 3, fault)
     model, paths, held_out = write(robot, folder, seconds=5.0)
-    config = Calibrate(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,), quiet=True)
+    config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
     work = prepare(config)
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
     theta = np.array([robot.truth[name] for name in work.space.names])

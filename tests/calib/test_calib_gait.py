@@ -13,12 +13,12 @@ from deal_hw.calib.methods import make_method
 from deal_hw.calib.output_error_fits import FORCES, GAIT, _holding, _scaled_together
 from deal_hw.calib.uncertainty.intervals import PosteriorShape, Uncertainty
 from deal_hw.calibration import Z90
-from deal_hw.cli.calibrate import Calibrate, usual_method
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.workflows.calibration.run import CalibrationInputs
+from deal_hw.workflows.calibration.settings import CalibrateSettings, usual_method
 
 SHARE = 0.04
 """Standard deviation of each parameter before."""
@@ -87,7 +87,7 @@ def test_a_walk_is_fitted_by_gait_unless_something_else_is_asked_for() -> None:
 
     def method(*, walks: bool, **settings: str) -> str:
         work = cast("CalibrationInputs", SimpleNamespace(robot=robot, walks=walks))
-        return usual_method(Calibrate(quiet=True, **settings), work)  # type: ignore[arg-type]
+        return usual_method(CalibrateSettings(**settings), work)  # type: ignore[arg-type]
 
     assert method(walks=True) == "gait"
     assert method(walks=False) == "default"

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from deal_hw.calibration import read_result
-from deal_hw.cli.calibrate import Calibrate, calibrate, prepare
-from deal_hw.cli.virtual import VirtualCartpole
+from deal_hw.cli.calibrate import Calibrate, calibrate
 from deal_hw.control.behaviours import Behaviour, HoldBehaviour
 from deal_hw.control.excitation import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
+from deal_hw.workflows.calibration.settings import prepare
+from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 
 def record(folder: Path, runs: list[tuple[str, Behaviour, float]]) -> Path:

@@ -6,14 +6,13 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from deal_hw.cli.collect import Collect, _excitation
+from deal_hw.cli.collect import Collect
 from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
-from deal_hw.cli.virtual import VirtualCartpole
 from deal_hw.control.excitation_plan import ExcitationBehaviour, read_plan
 from deal_hw.control.loop import Outcome
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -21,6 +20,10 @@ from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
 from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.workflows.collect import _excitation
+from deal_hw.workflows.emulation.virtual import VirtualCartpole
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
+from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.shipped import shipped_policy
 
 POLICY = str(shipped_policy("cartpole") or "")
@@ -101,14 +104,17 @@ def test_seeds_give_other_multisines() -> None:
 
 def test_collect_finds_what_to_play(optimal: Path) -> None:
     """A family keeps SECONDS, a file says how long it is, no excitation leaves the profile."""
-    base = {"robot": "cartpole", "port": "x"}
-    assert _excitation(Collect(**base, excite="chirp", seconds=3.0)) == ("chirp", 3.0)  # type: ignore[arg-type]
-    assert _excitation(Collect(**base, excite=str(optimal))) == (str(optimal), 2.0)  # type: ignore[arg-type]
-    assert _excitation(Collect(**base)) == ("", 4.0)  # type: ignore[arg-type]
+
+    def found(**settings: Any) -> tuple[str, float]:
+        return _excitation(Collect(robot="cartpole", port="x", **settings), RunView())
+
+    assert found(excite="chirp", seconds=3.0) == ("chirp", 3.0)
+    assert found(excite=str(optimal)) == (str(optimal), 2.0)
+    assert found() == ("", 4.0)
     with pytest.raises(ConfigurationError, match="--out RUN"):
-        _excitation(Collect(**base, excite="optimal"))  # type: ignore[arg-type]
+        found(excite="optimal")
     with pytest.raises(ConfigurationError, match="multisine, chirp, or a file"):
-        _excitation(Collect(**base, excite="sine"))  # type: ignore[arg-type]
+        found(excite="sine")
 
 
 def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> None:
@@ -129,7 +135,7 @@ def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> Non
 def test_playing_needs_no_extra(optimal: Path) -> None:
     """The control process plays an optimal excitation without torch, mujoco and scipy."""
     code = (
-        "import sys; from deal_hw.cli.run_plan import RunPlan, make_behaviour; "
+        "import sys; from deal_hw.workflows.running.plan import RunPlan, make_behaviour; "
         "from deal_hw.drivers import robot_description; import deal_hw.cli.collect; "
         f"plan = RunPlan(robot='cartpole', profile='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
         "seconds=2.0); make_behaviour(plan, robot_description('cartpole')); "

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli import doctor as verb
-from deal_hw.cli import doctor_machine as machine
 from deal_hw.cli.doctor import Doctor, doctor
-from deal_hw.cli.doctor_serial import examine_robot
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
@@ -25,6 +23,9 @@ from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Level
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
+from deal_hw.workflows.doctor import machine
+from deal_hw.workflows.doctor.examine import judge_interfaces
+from deal_hw.workflows.doctor.robot import examine_robot
 
 
 def levels(findings: Iterator[Finding] | tuple[Finding, ...], area: str) -> set[Level]:
@@ -112,9 +113,9 @@ def test_a_cable_that_is_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
         Interface("lo", ("127.0.0.1",), up=True, carrier=True, multicast=False, loopback=True),
     )
     monkeypatch.setattr(interfaces, "list_interfaces", lambda: known)
-    found = list(verb._interfaces("192.168.123.99"))
+    found = list(judge_interfaces("192.168.123.99"))
     assert [f.level for f in found] == [Level.FAIL, Level.WARN, Level.OK]
-    (lo,) = [f for f in verb._interfaces("127.0.0.1") if f.message.startswith("lo ")]
+    (lo,) = [f for f in judge_interfaces("127.0.0.1") if f.message.startswith("lo ")]
     assert (lo.level, "ip link set lo multicast on" in lo.remedy) == (Level.NOTE, True)
     assert "cable" in found[0].remedy
     assert "multicast on" in found[1].remedy
@@ -151,7 +152,7 @@ def test_what_is_printed_fits_the_terminal(
 ) -> None:
     """80 columns, but for words that are longer; the second line of a remedy is below its first."""
     long = Finding("states", Level.FAIL, "word " * 40, "remedy " * 30)
-    monkeypatch.setattr(verb, "_examine", lambda config: iter([long]))
+    monkeypatch.setattr(verb, "examine", lambda config: iter([long]))
     monkeypatch.setenv("COLUMNS", "80")
     assert doctor(Doctor()).exit_code == 1
     lines = capsys.readouterr().out.splitlines()

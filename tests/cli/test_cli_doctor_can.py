@@ -9,10 +9,7 @@ import subprocess
 import can
 import pytest
 
-from deal_hw.cli import doctor_can
 from deal_hw.cli.doctor import Doctor, doctor
-from deal_hw.cli.doctor_can import listen_to_bus
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.cartpole.can_emulator import SlcanAdapter, can_devices
 from deal_hw.drivers.cartpole.emulator import CanFaults
@@ -21,6 +18,9 @@ from deal_hw.drivers.transports.can_transport import open_can
 from deal_hw.drivers.transports.slcan_transport import SlcanTransport
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.findings import Level
+from deal_hw.workflows.doctor import can as doctor_can
+from deal_hw.workflows.doctor.can import listen_to_bus
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 CHANNELS = (f"doctor{number}" for number in itertools.count())
 

@@ -14,7 +14,6 @@ import pytest
 
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.design_excitation import DesignExcitation, design_excitation
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import VirtualClock
 from deal_hw.control.excitation_limits import room
 from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
@@ -33,6 +32,7 @@ from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth
 from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness", "damping"))
 
@@ -225,7 +225,7 @@ def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
     design_excitation(DesignExcitation(robot="go2", out=path, family="sway", seconds=1.0, quiet=True))
     code = (
         "import json, sys\n"
-        "from deal_hw.cli.run_plan import RunPlan, make_behaviour\n"
+        "from deal_hw.workflows.running.plan import RunPlan, make_behaviour\n"
         "from deal_hw.drivers.go2.descriptions.driver import DRIVER\n"
         f"plan = RunPlan(robot='go2', profile='excite', excite={str(path)!r}, seconds=1.0)\n"
         "make_behaviour(plan, DRIVER)\n"

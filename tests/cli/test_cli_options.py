@@ -154,6 +154,28 @@ def test_every_number_has_a_range(settings: type[Any], name: str, hint: Any) -> 
             assert fine, f"{settings.__name__}.{name} takes {number}"
 
 
+def choices() -> list[tuple[type[Any], str]]:
+    """Return every field of every verb's settings that takes one of a few names."""
+    return list(
+        {
+            (settings, name)
+            for verb in VERBS.values()
+            for settings in dataclasses_of(getattr(importlib.import_module(verb.module), verb.config))
+            for name, hint in typing.get_type_hints(settings).items()
+            if "Literal['" in str(hint)
+        }
+    )
+
+
+def test_every_choice_is_checked() -> None:
+    """The parser leaves choices to the settings: each refuses another name and lists those that it takes."""
+    found = choices()
+    assert len(found) >= 10
+    for settings, name in found:
+        with pytest.raises(UnknownNameError, match=f"unknown {name.replace('_', ' ')} 'nosuch'; known: "):
+            make(settings, **{name: "nosuch"})
+
+
 def test_a_range_says_milliseconds_where_seconds_are_small() -> None:
     """Option, value and range are in the message, and a latency's range is in ms."""
     with pytest.raises(ConfigurationError, match=r"^--latency 12 s: allowed are 0 to 40 ms$"):

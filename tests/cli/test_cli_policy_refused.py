@@ -11,13 +11,14 @@ import onnx
 import pytest
 
 from deal_hw.cli.main import main
-from deal_hw.cli.run_plan import RunPlan, check_plan
+from deal_hw.cli.show import Terminal
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import PolicyError
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.policy import VERDICT
 from deal_hw.testing.faulty_policy import faulty_policy
+from deal_hw.workflows.running.plan import RunPlan, check_plan
 from deal_hw.workflows.shipped import shipped_policy
 
 REFUSED = 2
@@ -119,6 +120,6 @@ def test_a_policy_of_a_red_calibration_is_asked_about(
     monkeypatch.setattr("builtins.input", answer)
     plan = RunPlan(robot="cartpole", policy=str(path))
     with pytest.raises(PolicyError, match="not run; calibrate again"):
-        check_plan(plan, DESCRIPTION)
-    assert check_plan(plan, DESCRIPTION).policy_digest
+        check_plan(plan, DESCRIPTION, Terminal())
+    assert check_plan(plan, DESCRIPTION, Terminal()).policy_digest
     assert len(asked) == 2

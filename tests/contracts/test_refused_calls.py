@@ -16,10 +16,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from deal_hw.cli import supervised
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
-from deal_hw.cli.train import train_policy, udr_distribution
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.control.waveforms import Sweep, random_steps
 from deal_hw.data.export.lerobot import export_lerobot
@@ -56,6 +52,10 @@ from deal_hw.testing.faults import FaultRates
 from deal_hw.transport import WireOptions
 from deal_hw.viz.screenshot import save_screenshot
 from deal_hw.viz.serve import serve_web
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running import supervised
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
+from deal_hw.workflows.train import train_policy, udr_distribution
 
 PLAN = RunPlan(robot="cartpole")
 RNG = np.random.default_rng(0)

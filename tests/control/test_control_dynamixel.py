@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.episode_report import EpisodeReport
-from deal_hw.cli.link import LinkOptions
 from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.types import Status, Trajectory
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.running.settings import LinkOptions
 
 LINK = LinkOptions(transport="dynamixel")
 PATIENT = "?answer_s=0.02"

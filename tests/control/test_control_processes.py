@@ -21,10 +21,7 @@ import pytest
 
 from deal_hw.cli.collect import Collect, collect
 from deal_hw.cli.deploy import Deploy, deploy
-from deal_hw.cli.episode_report import RunReport
 from deal_hw.cli.replay import Replay, replay
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import InterruptedRunError, run_episodes
 from deal_hw.control.loop import Outcome
 from deal_hw.control.process_channel import RUNNING, Beat
 from deal_hw.data.recording.dataset import Dataset
@@ -45,6 +42,9 @@ from deal_hw.errors import (
 from deal_hw.testing.faulty_policy import RARE_M_S, faulty_policy
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
 from deal_hw.types import Status
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.supervised import InterruptedRunError, run_episodes
 
 AT_BEAT = 25
 """Faults happen half a second into the run."""
@@ -58,7 +58,7 @@ class Emulator:
     """An emulated cart-pole in a process of its own."""
 
     def __init__(self, *options: str) -> None:
-        command = [sys.executable, "-m", "deal_hw.cli.emulate", "--nominal", "--profile", "sensor", *options]
+        command = [sys.executable, "-m", "deal_hw", "emulate", "--nominal", "--profile", "sensor", *options]
         command += ["--parent", str(os.getpid())]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         if self.process.stdout is None:
@@ -136,7 +136,7 @@ def run(
         robot="cartpole", profile="chirp", seconds=seconds, dry_run=dry, passive_timeout_s=PASSIVE_S
     )
     return run_episodes(
-        plan, port=emulator.port, dataset=folder, episodes=1, purpose="collect", quiet=True, on_beat=on_beat
+        plan, port=emulator.port, dataset=folder, episodes=1, purpose="collect", on_beat=on_beat
     )
 
 
@@ -233,7 +233,6 @@ def test_ctrl_c_in_every_other_phase_ends_passively(emulator: Emulator, tmp_path
             dataset=tmp_path,
             episodes=1,
             purpose="collect",
-            quiet=True,
             on_beat=on_beat,
         )
     assert done
@@ -302,8 +301,8 @@ def test_a_killed_supervisor_leaves_a_passive_robot_and_no_process(
     program = f"""
         import os
         from pathlib import Path
-        from deal_hw.cli.run_plan import RunPlan
-        from deal_hw.cli.supervised import run_episodes
+        from deal_hw.workflows.running.plan import RunPlan
+        from deal_hw.workflows.running.supervised import run_episodes
 
         def on_beat(beat):
             if beat.phase == "running" and beat.count == {AT_BEAT}:
@@ -311,7 +310,7 @@ def test_a_killed_supervisor_leaves_a_passive_robot_and_no_process(
 
         run_episodes(
             RunPlan(robot="cartpole", profile="chirp", seconds={LONG}), port={emulator.port!r},
-            dataset=Path({str(tmp_path)!r}), episodes=1, purpose="collect", quiet=True, on_beat=on_beat,
+            dataset=Path({str(tmp_path)!r}), episodes=1, purpose="collect", on_beat=on_beat,
         )
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
@@ -466,7 +465,7 @@ def test_a_policy_that_returns_nan_trips_at_once(emulator: Emulator, tmp_path: P
     # The verb refuses a wanted velocity for a robot without legs; the plan takes it.
     plan = RunPlan(robot="cartpole", policy=str(policy), velocity=f"{RARE_M_S},0,0")
     report = run_episodes(
-        plan, port=emulator.port, dataset=tmp_path / "dataset", episodes=1, purpose="deploy", quiet=True
+        plan, port=emulator.port, dataset=tmp_path / "dataset", episodes=1, purpose="deploy"
     )
     assert (report.outcome, report.exit_code) == (Outcome.TRIPPED, 3)
     assert report.episodes[0].reason == "the policy asked for a command that is not finite"
@@ -503,10 +502,11 @@ def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy
     """All that they import, the policy runtime and the driver included."""
     program = """
         import json, sys
-        import deal_hw.cli.collect, deal_hw.cli.deploy, deal_hw.cli.replay, deal_hw.cli.control_process
+        import deal_hw.cli.collect, deal_hw.cli.deploy, deal_hw.cli.replay
+        import deal_hw.workflows.running.control_process
         import deal_hw.data.recording.dataset, deal_hw.data.recording.recorder_process
         import deal_hw.policies.onnx_runtime
-        from deal_hw.cli.run_plan import RunPlan, make_behaviour
+        from deal_hw.workflows.running.plan import RunPlan, make_behaviour
         from deal_hw.clock import MonotonicClock
         from deal_hw.drivers import make_robot
         robot = make_robot("cartpole", "serial", "/dev/null", MonotonicClock())

@@ -14,10 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.episode_report import RunReport
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import run_episodes
 from deal_hw.control.loop import Outcome
 from deal_hw.control.posture import PostureConfig
 from deal_hw.control.process_channel import RUNNING, Beat
@@ -25,6 +21,10 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.errors import SafetyError
 from deal_hw.types import Status
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.supervised import run_episodes
 
 pytestmark = pytest.mark.slow
 
@@ -63,7 +63,6 @@ class Rig:
             dataset=folder,
             episodes=1,
             purpose="collect",
-            quiet=True,
             on_beat=on_beat,
         )
 
@@ -97,7 +96,9 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 def control_pid() -> int:
     """Return the pid of the control process."""
     for pid in Path(f"/proc/self/task/{threading.get_native_id()}/children").read_text().split():
-        if "deal_hw.cli.control_process" in Path(f"/proc/{pid}/cmdline").read_text().split("\0"):
+        if "deal_hw.workflows.running.control_process" in Path(f"/proc/{pid}/cmdline").read_text().split(
+            "\0"
+        ):
             return int(pid)
     raise AssertionError("there is no control process")
 

@@ -12,8 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from deal_hw.cli.data import data
-from deal_hw.cli.data_import import Export, Import
+from deal_hw.cli.data import Export, Import, data
 from deal_hw.cli.main import parse
 from deal_hw.data.checks.plausibility import examine
 from deal_hw.data.importing.columns import parse_column_map, read_column_map

@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.emulate_settings import CanOptions, Emulate
-from deal_hw.cli.emulator_process import EmulatorProcess
-from deal_hw.cli.link import LinkOptions
+from deal_hw.cli.emulate import Emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers import claim_name, make_robot
@@ -44,6 +42,9 @@ from deal_hw.testing.faults import FaultRates, FaultyTransport, OneBadFrame, Rec
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, WireOptions
 from deal_hw.types import RobotState, Status
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.settings import CanOptions
+from deal_hw.workflows.running.settings import LinkOptions
 
 MS = 1_000_000
 

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.emulate import emulate
-from deal_hw.cli.emulate_settings import Emulate
-from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import adopt_robot, make_robot
 from deal_hw.drivers.cartpole import protocol
@@ -29,6 +27,7 @@ from deal_hw.errors import (
 from deal_hw.testing.robot_suite import default_command
 from deal_hw.transport import Message
 from deal_hw.types import Status
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 MS = 1_000_000
 

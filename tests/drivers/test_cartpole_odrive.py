@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers import make_robot
 from deal_hw.drivers.cartpole import protocol
@@ -33,6 +32,7 @@ from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame, RecordFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.types import RobotState, Status
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 MS = 1_000_000
 PARTS = OdriveSettings()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 pytest.importorskip("cyclonedds", reason="pip install 'deal-hw[dds]'")
 pytest.importorskip("mujoco", reason="pip install 'deal-hw[sim]'")

@@ -242,7 +242,7 @@ def test_a_text_nested_too_deep_is_no_claim() -> None:
 
 def test_over_zenoh_the_second_run_is_refused() -> None:
     """Two clients of one end point, as two runs against one bridge; free again after the release."""
-    from deal_hw.cli.emulate_go2 import free_port
+    from deal_hw.workflows.emulation.go2 import free_port
 
     port = free_port("tcp/127.0.0.1:0")
     with ZenohTransport(port, CLOCK, WireOptions(listen=True)):

@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.cli.emulate import emulate
-from deal_hw.cli.emulate_go2 import free_port, make_transport, summary
-from deal_hw.cli.emulate_settings import Emulate, Go2Options
-from deal_hw.cli.emulator_process import EmulatorProcess
+from deal_hw.cli.emulate import Emulate, emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
@@ -25,6 +22,9 @@ from deal_hw.drivers.go2.messages.rpc import Request, decode_response, encode_re
 from deal_hw.errors import ConfigurationError, TransportTimeoutError, UnknownNameError
 from deal_hw.testing.memory_wire import MemoryWire
 from deal_hw.transport import Message, WireOptions
+from deal_hw.workflows.emulation.go2 import free_port, make_transport, summary
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.settings import Go2Options
 
 MS = 1_000_000
 ZERO = np.zeros(12)

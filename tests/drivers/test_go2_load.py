@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.cli.emulate_go2 import read_track, tracking
 from deal_hw.drivers.go2.descriptions.floor import JOINTS, TRUNK_KG, walk_space
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.drivers.go2.descriptions.on_stand_recording import parameter_space
@@ -16,6 +15,7 @@ from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth, nominal_truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
+from deal_hw.workflows.emulation.go2 import read_track, tracking
 
 GRAVITY = 9.81
 

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.cli.demo_go2 import write_script
-from deal_hw.cli.virtual_go2 import VirtualWalk, walk
 from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity import ScriptVelocity
 from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
@@ -18,6 +16,8 @@ from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.legged.weighing import standing_mass
+from deal_hw.workflows.emulation.virtual_go2 import VirtualWalk, walk
+from deal_hw.workflows.emulation.walk_script import write_script
 from deal_hw.workflows.shipped import shipped_policy
 
 SEED = 1

@@ -342,7 +342,13 @@ def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
     loaded = json.loads(done.stderr.splitlines()[-1])
-    assert sorted(loaded) == ["deal_hw.cli", "deal_hw.cli.main", "deal_hw.errors", "deal_hw.install"]
+    assert sorted(loaded) == [
+        "deal_hw.cli",
+        "deal_hw.cli.main",
+        "deal_hw.errors",
+        "deal_hw.install",
+        "deal_hw.version",
+    ]
 
 
 @pytest.mark.parametrize("name", ["collect", "deploy", "doctor", "emulate", "replay"])

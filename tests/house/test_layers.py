@@ -12,7 +12,17 @@ from import_graph import imports, module_name, package_folders
 ROOT = Path(__file__).resolve().parents[2]
 LEAVES = ("calib", "drivers", "policies")
 SERVICES = ("control", "data", "sim", "testing", "viz")
-VOCABULARY = ("errors", "types", "clock", "findings", "reading", "schema", "install", "child_process")
+VOCABULARY = (
+    "errors",
+    "types",
+    "clock",
+    "findings",
+    "reading",
+    "schema",
+    "install",
+    "child_process",
+    "version",
+)
 CONTRACTS = ("description", "robot", "transport", "policy", "parameters", "calibration", "training")
 LAYER = {
     **dict.fromkeys(("deal_hw", *VOCABULARY), 0),
@@ -26,9 +36,9 @@ LAYER = {
 }
 """Layer of each part; a part may import parts of lower layers and itself."""
 
-BESIDE = {("bench", "cli"), ("cli.bench", "bench"), ("deal_hw", "workflows")}
-"""Benches run what verbs run, which lies in cli where there is no workflow yet; one verb runs the benches.
-The package names its workflows and loads them on use."""
+BESIDE = {("cli.bench", "bench"), ("deal_hw", "workflows"), ("deal_hw", "transport")}
+"""One verb runs the benches.
+The package names its workflows and their settings, and loads them on use."""
 
 ROOMS = {
     "calib": (
@@ -217,6 +227,8 @@ def test_repository_keeps_the_order() -> None:
         ("drivers/x.py", "import mujoco", "loads mujoco"),
         ("deal_hw/cli/x.py", "import rerun as rr", "loads rerun"),
         ("deal_hw/cli/x.py", "from deal_hw.bench import rows", "cli imports bench"),
+        ("deal_hw/bench/x.py", "from deal_hw.cli import calibrate", "bench imports cli"),
+        ("deal_hw/workflows/x.py", "from deal_hw.cli import main", "workflows imports cli"),
         ("deal_hw/control/x.py", "import serial", "loads serial"),
         ("deal_hw/utils/x.py", "from deal_hw.types import Status", "deal_hw.utils.x stands in no layer"),
         ("deal_hw/cli/x.py", "import deal_hw.helpers", "deal_hw.helpers stands in no layer"),
@@ -247,7 +259,10 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
             "drivers/go2/robot.py",
             "from deal_hw.drivers.go2 import takeover\nfrom deal_hw.drivers.go2.messages import rpc",
         ),
-        ("deal_hw/bench/x.py", "from deal_hw.cli.calibrate import calibrate\nimport deal_hw.calib.methods"),
+        (
+            "deal_hw/bench/x.py",
+            "from deal_hw.workflows.calibrate import calibrate\nimport deal_hw.calib.methods",
+        ),
         ("deal_hw/cli/bench.py", "from deal_hw.bench import rows"),
         ("deal_hw/policy.py", "import numpy\nfrom deal_hw.description import RobotDescription"),
         ("deal_hw/viz/x.py", "import rerun\nfrom deal_hw.sim.model import build"),

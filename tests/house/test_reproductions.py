@@ -29,10 +29,8 @@ from mcap.writer import CompressionType, Writer
 
 from deal_hw.cli.calibrate import Calibrate
 from deal_hw.cli.collect import Collect
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.cli.main import main
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import run_episodes
+from deal_hw.cli.show import Terminal
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.loop import ControlLoop, LoopConfig
@@ -56,6 +54,9 @@ from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError, DatasetError, PortBusyError, SafetyError
 from deal_hw.findings import Finding, Level
 from deal_hw.testing.faulty_policy import faulty_policy
+from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.supervised import run_episodes
 
 S = 1_000_000_000
 PATIENCE_S = 60.0
@@ -128,21 +129,23 @@ def run(
 ) -> None:
     """Run a plan, and record nothing."""
     run_episodes(
-        plan, port=port, dataset=None, episodes=1, purpose="collect", quiet=quiet, on_beat=on_beat
-    )  # fmt: skip
+        plan, port=port, dataset=None, episodes=1, purpose="collect", view=Terminal(quiet), on_beat=on_beat
+    )
 
 
 def control_pid() -> int:
     """Return the pid of this process's control process."""
     for pid in Path(f"/proc/self/task/{threading.get_native_id()}/children").read_text().split():
-        if "deal_hw.cli.control_process" in Path(f"/proc/{pid}/cmdline").read_text().split("\0"):
+        if "deal_hw.workflows.running.control_process" in Path(f"/proc/{pid}/cmdline").read_text().split(
+            "\0"
+        ):
             return int(pid)
     raise AssertionError("there is no control process")
 
 
 def where(name: str) -> Any:
     """Return the module that starts a run's processes: supervised.py was split after d5a5f8c."""
-    for module in ("deal_hw.cli.episode", "deal_hw.cli.supervised"):
+    for module in ("deal_hw.workflows.running.episode", "deal_hw.workflows.running.supervised"):
         with contextlib.suppress(ModuleNotFoundError):
             found = importlib.import_module(module)
             if hasattr(found, name):
@@ -153,8 +156,8 @@ def where(name: str) -> Any:
 SUPERVISOR = """
 import os, signal, sys, threading
 from pathlib import Path
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import run_episodes
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.supervised import run_episodes
 
 port, number = sys.argv[1:]
 
@@ -168,7 +171,7 @@ def on_beat(beat):
 
 
 plan = RunPlan(robot="go2", transport="zenoh", profile="hold", seconds=600.0)
-run_episodes(plan, port=port, dataset=None, episodes=1, purpose="collect", quiet=True, on_beat=on_beat)
+run_episodes(plan, port=port, dataset=None, episodes=1, purpose="collect", on_beat=on_beat)
 """
 
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import onnx
 import pytest
 
-from deal_hw.cli.emulate_go2 import free_port
-from deal_hw.cli.emulator_process import EmulatorProcess
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.install import install_line
 from deal_hw.policies.onnx_runtime import SPEC_KEY
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
+from deal_hw.workflows.emulation.go2 import free_port
+from deal_hw.workflows.emulation.process import EmulatorProcess
 
 EXTRAS = (
     "torch",
@@ -47,8 +47,9 @@ FINISHED, TRIPPED = 0, 3
 REACH_GO2 = """
 import json, sys
 
-from deal_hw.cli import collect, control_process, deploy, doctor, supervised
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
+from deal_hw.cli import collect, deploy, doctor
+from deal_hw.workflows.running import control_process, supervised
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.loop import ControlLoop, LoopConfig
 from deal_hw.control.safety import Safety

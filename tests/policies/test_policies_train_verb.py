@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import deal_hw.cli.train as train_module
-from deal_hw.cli.train import Train, read_distribution, train, udr_distribution
+from deal_hw.cli.train import Train, train
 from deal_hw.drivers import driver_description
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, UnknownNameError
@@ -19,6 +19,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import VERDICT
 from deal_hw.training import TrainingProgress, TrainingStatus
+from deal_hw.workflows.train import read_distribution, udr_distribution
 
 STEPS = 1_200
 """Enough for a few updates."""
@@ -101,7 +102,7 @@ def test_a_go2_is_trained_stopped_and_resumed(
     assert record["training"]["algorithm"] == "ppo" and record["reached"]["steps"] == 96
     assert {"velocity_error_m_s", "yaw_error_rad_s", "falls_a_minute"} <= record["reached"]["measures"].keys()
     assert list((policies / "policy_tensorboard").iterdir())
-    policy = train(dataclasses.replace(config, resume=True))
+    policy = train(dataclasses.replace(config, resume=True)).policy
     assert [status.steps for status in seen] == [96, 192]
     whole = json.loads((policies / "policy.json").read_text(encoding="utf-8"))
     assert whole["resumed"] and whole["cpu_seconds"] > record["cpu_seconds"]

@@ -17,7 +17,6 @@ import onnx
 import pytest
 from onnx import helper
 
-from deal_hw.cli.run_plan import RunPlan, check_plan, make_behaviour
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.ant.description import DESCRIPTION as ANT
@@ -33,6 +32,7 @@ from deal_hw.policies.trial_states import ProbeStates
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.testing.faulty_policy import Fault, faulty_policy
 from deal_hw.testing.linear_policy import CARTPOLE_GAINS, feedback_spec
+from deal_hw.workflows.running.plan import RunPlan, check_plan, make_behaviour
 from deal_hw.workflows.shipped import shipped_policy
 
 SPEC = feedback_spec(CARTPOLE)
@@ -81,7 +81,7 @@ def test_the_shipped_policies_pass(description: RobotDescription) -> None:
 def test_this_process_does_not_open_the_network() -> None:
     """The process that will watch over the robot loads no onnxruntime for the trial."""
     code = (
-        "import sys; from deal_hw.cli.run_plan import RunPlan, check_plan; "
+        "import sys; from deal_hw.workflows.running.plan import RunPlan, check_plan; "
         "from deal_hw.workflows.shipped import shipped_policy; "
         "from deal_hw.drivers.cartpole.description import DESCRIPTION; "
         "plan = RunPlan(robot='cartpole', policy=str(shipped_policy('cartpole'))); "

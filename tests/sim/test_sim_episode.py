@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deal_hw.cli.virtual import VirtualCartpole, VirtualEpisode
 from deal_hw.control.excitation import RichBehaviour, RichConfig, Segment
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.truth import nominal_truth
@@ -17,6 +16,7 @@ from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps
 from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import Trajectory
+from deal_hw.workflows.emulation.virtual import VirtualCartpole, VirtualEpisode
 
 SEGMENT = Segment(start=0.5, stop=1.0, effort_limit=0.4, speed_limit=2.0)
 

@@ -14,6 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
+import deal_hw
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.inspect_ import Inspect, inspect
 from deal_hw.clock import VirtualClock
@@ -72,6 +73,23 @@ def test_without_a_calibration_the_nominal_model_is_shown(episode_file: Path, tm
     assert list(report.overlay.predictions) == ["nominal"]
 
 
+def test_from_python_predictions_come_back(
+    episode_file: Path, result: CalibrationResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows, text, HTML and file of the same predictions; nothing is printed, and no window opens."""
+    found = deal_hw.inspect(str(episode_file), calibration=result)
+    nominal, calibrated = found.rows()
+    assert (nominal["model"], calibrated["model"]) == ("nominal", "calibrated")
+    assert found.overlay is not None
+    for joint, error in zip(
+        found.overlay.joint_names, found.overlay.predictions["nominal"].position_nrmse, strict=True
+    ):
+        assert nominal[joint] == error and f"{joint} {100 * error:.2g} %" in found.table()
+        assert f"{100 * error:.2g} %" in found._repr_html_()
+    assert found.save(str(tmp_path / "new" / "a.rrd")).stat().st_size > 100_000
+    assert capsys.readouterr().out == ""
+
+
 def test_unarmed_recordings_are_shown_without_predictions(
     trajectory: Trajectory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,6 +122,8 @@ def test_without_a_desktop_other_ways_are_named(episode_file: Path, monkeypatch:
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(ConfigurationError, match=r"--web .* --save FILE\.rrd or --screenshot FILE\.png"):
         inspect(Inspect(episode=episode_file))
+    with pytest.raises(ConfigurationError, match=r"--web .* --save FILE\.rrd or --screenshot FILE\.png"):
+        deal_hw.inspect(episode_file).show()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

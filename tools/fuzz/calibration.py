@@ -19,8 +19,6 @@ from mcap_ros2.writer import Writer
 
 from deal_hw.calib.search.resume import SearchCheckpoint, pack
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
-from deal_hw.cli.emulate_common import read_truth
-from deal_hw.cli.train import read_distribution
 from deal_hw.data.importing.columns import read_column_map
 from deal_hw.data.importing.grid import common_period, to_trajectories
 from deal_hw.data.importing.load import load_tables
@@ -30,6 +28,8 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.compiling import problem_of
 from deal_hw.sim.parameters.template import template
 from deal_hw.sim.parameters.yaml_space import read_space
+from deal_hw.workflows.emulation.common import read_truth
+from deal_hw.workflows.train import read_distribution
 from fuzz.kind import FileKind, Kind
 from fuzz.mutations import damage_bytes, damage_json
 

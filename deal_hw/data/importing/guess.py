@@ -11,7 +11,7 @@ import numpy as np
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
-from deal_hw.errors import DatasetError
+from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
 _WORDS = {
@@ -161,7 +161,10 @@ def _from_arrays(
     by_order = not names
     if len(names) != width:
         if names or joints is None or len(joints) != width:
-            raise _unguessed(channels, f"which joints the {width} columns of {array!r} are")
+            model = (
+                "" if joints is None else f" (the model has {len(joints)}: {short(', '.join(joints), 80)})"
+            )
+            raise _unguessed(channels, f"which joints the {width} columns of {array!r} are{model}")
         names = list(joints)
     found = _rename(channels, names, joints)
     topic = array.rpartition(".")[0]
@@ -289,7 +292,9 @@ def _guess_command_time(channels: Channels, target: str) -> TimeColumn | None:
     for name in ("command_time", "time_command", "target_time", "command_time_s"):
         if name in channels.arrays:
             return TimeColumn(column=name, unit=_unit_of(channels.arrays[name]))
-    raise _unguessed(channels, f"which channel is the time of {target!r}")
+    rows = len(channels.arrays[target]) if target in channels.arrays else 0
+    other = f", which has {rows} rows and not those of the time" if rows else ""
+    raise _unguessed(channels, f"which channel is the time of {target!r}{other}")
 
 
 def _unit_of(stamps: FloatArray) -> str:

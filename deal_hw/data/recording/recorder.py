@@ -19,7 +19,6 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from typing_extensions import Self
 
-import deal_hw
 from deal_hw.clock import Clock
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.schemas import (
@@ -35,6 +34,7 @@ from deal_hw.data.recording.schemas import (
 )
 from deal_hw.errors import DatasetError
 from deal_hw.types import JointCommand, RobotState
+from deal_hw.version import __version__
 
 FLUSH_INTERVAL_S = 0.05
 """Longest time a record waits for its chunk to be closed: half the loss that is allowed, so that a busy
@@ -42,7 +42,7 @@ machine may be late by as much again."""
 FORMAT_VERSION = 1
 METADATA_NAME = "deal-hw"
 END_NAME = "deal-hw.end"
-LIBRARY = f"deal-hw/{deal_hw.__version__}"
+LIBRARY = f"deal-hw/{__version__}"
 
 
 class EpisodeRecorder:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -24,7 +23,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
@@ -158,7 +157,7 @@ def keeping_best(best: BestSoFar, folder: Path, robot: RobotModel) -> Iterator[N
 
             with interrupts_deferred():
                 write_result(folder, robot, best.result)
-            print(f"\nbest so far: {best.sentence}; written to {folder}, without intervals", file=sys.stderr)
+            aloud(f"\nbest so far: {best.sentence}; written to {folder}, without intervals")
         raise
 
 
@@ -169,13 +168,12 @@ def saying_how_to_resume(path: Path) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if path.exists():
-            print(
+            aloud(
                 f"\ncalibration stopped; its state is in {path}: "
                 "the same command with --resume goes on, to the same numbers",
-                file=sys.stderr,
             )
         else:
-            print("\ncalibration stopped before its first generation; nothing is kept", file=sys.stderr)
+            aloud("\ncalibration stopped before its first generation; nothing is kept")
         raise
 
 
@@ -220,5 +218,5 @@ def watching(
         if watch:
             address, page = stack.enter_context(live_viewer())
             if page:
-                print(f"watch the search at {page}  (this machine only)", file=sys.stderr)
+                aloud(f"watch the search at {page}  (this machine only)")
         yield stack.enter_context(population_view(space, address=address, save=save, predict=predict)).show

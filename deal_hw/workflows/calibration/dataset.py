@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +71,7 @@ def prepare_dataset(
 
     dataset = Dataset.open(source.folder)
     robot_name = dataset.description["name"]
-    fit, holdout = choose_episodes(dataset, source.episodes, source.holdout)
+    fit, holdout = choose_episodes(dataset, source.episodes, source.holdout, say)
     space = overrides.apply(named_space(robot_name, space_name))
     episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
@@ -130,7 +129,7 @@ def named_space(robot: str, name: str = "") -> ParameterSpace:
 
 
 def choose_episodes(
-    dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int]
+    dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int], say: Say = silent
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the episodes to fit and those to judge by.
 
@@ -143,10 +142,7 @@ def choose_episodes(
     held = tuple(holdout) or tuple(i for i in every if profiles[i] == HELDOUT_PROFILE and i not in episodes)
     repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
     if repeated:
-        print(
-            f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)",
-            file=sys.stderr,
-        )
+        say(f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)")
     fit = tuple(episodes) or tuple(i for i in every if i not in held and i not in repeated)
     both = sorted(set(fit) & set(held))
     if both:

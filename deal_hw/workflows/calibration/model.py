@@ -87,8 +87,8 @@ class Recordings(Checked):
     """Use recordings although a plausibility check failed."""
 
 
-def write_parameters(config: Recordings) -> int:
-    """Write a commented parameter file for a model; return 0.
+def write_parameters(config: Recordings) -> Path:
+    """Write a commented parameter file for a model and return its path.
 
     Raises:
         ConfigurationError: There is no model, or the file exists.
@@ -103,9 +103,7 @@ def write_parameters(config: Recordings) -> int:
 
     text = template(compile_mjcf(config.model), config.model.name)
     path.write_text(text, encoding="utf-8")
-    again = f"deal-hw calibrate --model {config.model} --parameters {path} --data ..."
-    print(f"written: {path}; edit it, then: {again}")
-    return 0
+    return path
 
 
 def prepare_model(

@@ -7,7 +7,6 @@ import dataclasses
 import math
 import os
 import shutil
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -36,7 +35,7 @@ from deal_hw.workflows.calibration.best_so_far import (
 )
 from deal_hw.workflows.calibration.walking import GAIT_SMOOTHING_S
 from deal_hw.workflows.options import Range
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say, aloud, silent
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
@@ -363,7 +362,7 @@ def finish(
             checkpoint.unlink(missing_ok=True)
             shutil.rmtree(folder / SO_FAR, ignore_errors=True)
     except KeyboardInterrupt:
-        print(f"\ninterrupted after the end: the results in {folder} are whole", file=sys.stderr)
+        aloud(f"\ninterrupted after the end: the results in {folder} are whole")
         raise
     return CalibrateReport(result=result, files=files)
 

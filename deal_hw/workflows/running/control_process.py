@@ -1,8 +1,8 @@
 """The control process: the one place where robot, behaviour, safety and loop come together in real time.
 
-Started by the supervisor as ``python -m deal_hw.cli.control_process`` with its orders as JSON on standard
-input and with the open port, the recorder's socket and the status socket as inherited descriptors. It writes
-neither to disk nor to the terminal, and imports neither torch, mujoco nor scipy.
+Started by the supervisor as ``python -m deal_hw.workflows.running.control_process`` with its orders as JSON
+on standard input and with the open port, the recorder's socket and the status socket as inherited
+descriptors. It writes neither to disk nor to the terminal, and imports neither torch, mujoco nor scipy.
 """
 
 from __future__ import annotations
@@ -91,13 +91,13 @@ def _run(
     orders: dict[str, Any], status: StatusSender, clock: MonotonicClock, stopper: _Stopper
 ) -> dict[str, Any]:
     # Imported here, so that a stop during these imports is answered, too.
-    from deal_hw.cli.run_plan import RunPlan, make_behaviour
     from deal_hw.control.loop import ControlLoop, LoopConfig
     from deal_hw.control.passive import PassiveConfig
     from deal_hw.control.safety import Safety
     from deal_hw.control.velocity import KeyboardVelocity, NotedVelocity
     from deal_hw.control.velocity_error import VELOCITY_EVENT, velocity_data
     from deal_hw.drivers import adopt_robot, make_robot
+    from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
     plan = RunPlan.from_json(orders)
     can_send = not plan.dry_run

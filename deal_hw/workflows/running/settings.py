@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
-
-import tyro
 
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import Checked, given, refuse
+from deal_hw.workflows.options import Checked, File, given, refuse
+from deal_hw.workflows.say import Say, silent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +39,7 @@ class LegOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinkOptions:
+class LinkOptions(Checked):
     """How the robot is reached, beyond the port."""
 
     transport: str = ""
@@ -55,7 +53,7 @@ class LinkOptions:
     record_wire: bool = True
     """Record the raw bytes, too."""
 
-    wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
+    wire: WireOptions = field(default_factory=WireOptions)
     """More about a network."""
 
 
@@ -68,25 +66,26 @@ class RunOptions(Checked):
     slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
     tcp/127.0.0.1:7447 (zenoh)."""
 
-    link: tyro.conf.OmitArgPrefixes[LinkOptions] = field(default_factory=LinkOptions)
+    link: LinkOptions = field(default_factory=LinkOptions)
     """How the robot is reached, beyond the port."""
 
-    legs: tyro.conf.OmitArgPrefixes[LegOptions] = field(default_factory=LegOptions)
+    legs: LegOptions = field(default_factory=LegOptions)
     """What a robot with legs needs to be told."""
 
-    out: Path | None = None
+    out: File | None = None
     """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET nothing is recorded; collect needs
     one of the two."""
 
-    dataset: Path | None = None
+    dataset: File | None = None
     """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
 
-    quiet: bool = False
-    """Print nothing but errors."""
+    say: Say = silent
+    """From Python: called with sentences on what happens; ``print`` shows them. By default warnings alone are
+    told, on standard error."""
 
 
 def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:
-    """Return the fields of a :class:`~deal_hw.cli.run_plan.RunPlan` that follow from the options.
+    """Return the fields of a :class:`~deal_hw.workflows.running.plan.RunPlan` that follow from the options.
 
     Args:
         robot: The robot's name.

@@ -6,7 +6,6 @@ import contextlib
 import gc
 import re
 import socket
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -15,19 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.cli.emulate_common import (
+from deal_hw.control.velocity_error import Track
+from deal_hw.drivers.go2.emulator.faults import FaultPlan
+from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError, shown
+from deal_hw.reading import reading
+from deal_hw.transport import TopicTransport, WireOptions
+from deal_hw.workflows.emulation.common import (
     happenings,
     read_truth,
     realtime_priority,
     reveal,
     run_until,
 )
-from deal_hw.cli.emulate_settings import DEFAULT_PORTS, Emulate
-from deal_hw.control.velocity_error import Track
-from deal_hw.drivers.go2.emulator.faults import FaultPlan
-from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError, shown
-from deal_hw.reading import reading
-from deal_hw.transport import TopicTransport, WireOptions
+from deal_hw.workflows.emulation.settings import DEFAULT_PORTS, EmulateSettings
+from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
@@ -53,15 +53,17 @@ def make_transport(name: str, port: str, options: WireOptions) -> TopicTransport
     return drivers.make_topic_transport(name, port, MonotonicClock(), options)
 
 
-def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) -> int:
-    """Run the emulator until it is stopped or the time given; return the exit status.
-
-    The first line on standard output is ``port PORT``.
+def emulate_go2(
+    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
+) -> None:
+    """Run the emulator until it is stopped or the time given.
 
     Args:
         config: What to emulate.
         stop: Ends it.
         cut: Cuts the wire.
+        announce: Called with the port first, and with what was revealed at the end.
+        say: Called with what happened at the end.
     """
     try:
         from deal_hw.drivers.go2.emulator.emulator import Go2Emulator
@@ -80,8 +82,8 @@ def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) ->
     with realtime_priority():
         try:
             emulator.open()
-            print(f"port {port}", flush=True)
-            print(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends", flush=True)
+            announce(f"port {port}")
+            announce(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends")
 
             log = device.log
             with (
@@ -102,10 +104,9 @@ def emulate_go2(config: Emulate, stop: threading.Event, cut: threading.Event) ->
         finally:
             emulator.close()
     report = emulator.report()
-    reveal(report, on_stdout=config.reveal, path=config.reveal_to)
+    reveal(report, announce if config.reveal else silent, config.reveal_to)
     for line in summary(report):
-        print(line, file=sys.stderr)
-    return 0
+        say(line)
 
 
 @contextlib.contextmanager
@@ -182,13 +183,13 @@ def free_port(port: str) -> str:
         return f"{found['host']}:{probe.getsockname()[1]}"
 
 
-def _truth(config: Emulate) -> Truth:
+def _truth(config: EmulateSettings) -> Truth:
     from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Truth, draw_truth, nominal_truth
 
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return read_truth(config.truth_from, Truth.from_json)
+        return read_truth(Path(config.truth_from), Truth.from_json)
     return draw_truth(
         config.profile,
         config.seed,
@@ -196,7 +197,7 @@ def _truth(config: Emulate) -> Truth:
     )
 
 
-def _device(config: Emulate, truth: Truth) -> Go2Device:
+def _device(config: EmulateSettings, truth: Truth) -> Go2Device:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
 

@@ -1,29 +1,28 @@
-"""`deal-hw data import` and `deal-hw data export`: recordings in and out of our own files."""
+"""What ``deal-hw data import`` and ``data export`` do: recordings in and out of our own files."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
 from deal_hw.workflows.options import Checked, Range, given, refuse
+from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
+    from deal_hw.data.recording.dataset import Dataset
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Import(Checked):
-    """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/how-to/import.md."""
+@dataclass(frozen=True, kw_only=True)
+class ImportSettings(Checked):
+    """Settings of :func:`import_recordings`."""
 
-    paths: tyro.conf.Positional[tuple[Path, ...]]
+    paths: tuple[Path, ...]
     """CSV, NPZ or MCAP files, or folders of LeRobot datasets; of one robot."""
     out: Path
     """The dataset to make or add to."""
@@ -43,11 +42,11 @@ class Import(Checked):
     """Check and tell, but write nothing."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Export:
-    """Write the episodes of a dataset for other software."""
+@dataclass(frozen=True, kw_only=True)
+class ExportSettings(Checked):
+    """Settings of :func:`export_recordings`."""
 
-    path: tyro.conf.Positional[Path]
+    path: Path
     """A dataset (DIR), or an episode (DIR/episodes/000000.mcap)."""
     out: Path
     """The folder to write."""
@@ -57,11 +56,15 @@ class Export:
     """What the robot did, in words."""
 
 
-def import_recordings(config: Import) -> int:
-    """Run the verb.
+def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | None:
+    """Make a dataset of recordings of any robot, or add to one; refuse what is not plausible.
+
+    Args:
+        config: Settings.
+        say: Called with sentences on what was guessed, found and resampled.
 
     Returns:
-        0.
+        The dataset; None where nothing was to be written.
 
     Raises:
         DatasetError: A recording cannot be read, understood or trusted.
@@ -73,18 +76,18 @@ def import_recordings(config: Import) -> int:
     from deal_hw.data.importing.store import minimal_description, write_dataset
 
     if config.description is not None:
-        default = Import(paths=config.paths, out=config.out)
+        default = ImportSettings(paths=config.paths, out=config.out)
         refuse(given(config, default, ("name", "device_periods")), "--description says it")
     columns = None if config.columns is None else read_column_map(config.columns)
-    facts = _joint_facts(config.model)
+    facts = _joint_facts(config.model, say)
     described = None if config.description is None else _description(config.description)
     joints = described["joint_names"] if described is not None else None if facts is None else facts.names
-    tables = [table for path in config.paths for table in load_tables(path, columns, joints, _say)]
+    tables = [table for path in config.paths for table in load_tables(path, columns, joints, say)]
     problems = {
         table.name: [
             v.to_json()
             for v in examine_recording(
-                table, facts, config.force, servo=_takes_positions(facts, table), say=_say
+                table, facts, config.force, servo=_takes_positions(facts, table), say=say
             )
         ]
         for table in tables
@@ -94,12 +97,12 @@ def import_recordings(config: Import) -> int:
     for part in recordings:
         how = part.trajectory.metadata["import"]
         stretch = f", stretch {how['stretch'] + 1} of {how['stretches']}" if how["stretches"] > 1 else ""
-        _say(
+        say(
             f"{how['file']}{stretch}: {part.trajectory.duration_s:.4g} s at {1 / period:.6g} Hz, samples "
             f"{how['method']}, largest shift {how['largest_shift_s'] * 1e3:.3g} ms"
         )
     if config.dry_run:
-        return 0
+        return None
     values = described or minimal_description(
         recordings,
         config.name or (config.model or config.paths[0]).stem,
@@ -108,9 +111,7 @@ def import_recordings(config: Import) -> int:
         mjcf=config.model,
         rates_per_sample=config.device_periods,
     )
-    dataset = write_dataset(config.out, recordings, values, {"plausibility": problems}, _say)
-    print(f"{dataset.folder}: {len(dataset.episodes)} episodes of {dataset.description['name']}")
-    return 0
+    return write_dataset(config.out, recordings, values, {"plausibility": problems}, say)
 
 
 def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
@@ -121,11 +122,15 @@ def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
     return bool(facts.servo[at].any() or not facts.motor[at].any())
 
 
-def export_recordings(config: Export) -> int:
-    """Run the verb.
+def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, str]:
+    """Write the episodes of a dataset for other software.
+
+    Args:
+        config: Settings.
+        say: Called with sentences on what was mended in the dataset.
 
     Returns:
-        0.
+        How many episodes, and the robot's name.
 
     Raises:
         DatasetError: It cannot be read, or the folder cannot be written.
@@ -136,29 +141,23 @@ def export_recordings(config: Export) -> int:
     from deal_hw.data.recording.reader import read_trajectory
 
     if config.path.is_dir():
-        dataset = Dataset.open(config.path, _say)
+        dataset = Dataset.open(config.path, say)
         paths = [dataset.path(index) for index in range(len(dataset.episodes))]
     else:
         paths = [config.path]
     trajectories = [read_trajectory(path) for path in paths]
     robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
-    count = export_lerobot(trajectories, config.out, robot, config.task)
-    print(f"{config.out}: {count} LeRobot episodes of {robot}")
-    return 0
+    return export_lerobot(trajectories, config.out, robot, config.task), robot
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
-
-
-def _joint_facts(model: Path | None) -> JointFacts | None:
+def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:
     if model is None:
         return None
     from deal_hw.sim.mjcf.joint_facts import joint_facts
 
     facts = joint_facts(model)
     if facts.left_out:
-        _say(
+        say(
             f"{model.name}: joints of several coordinates are not read from recordings: "
             f"{', '.join(facts.left_out)}"
         )

@@ -6,10 +6,10 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from deal_hw.cli.episode_report import EpisodeReport
 from deal_hw.control.loop import Outcome
 from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.supervisor import OPERATOR, SUSPENDED, ChildEnd
+from deal_hw.workflows.running.report import EpisodeReport
 
 _LINK_WARNING = 0.01
 """Share of corrupt and missing state frames above which the operator is told."""

@@ -1,22 +1,19 @@
-"""What collect, deploy and replay report: each episode, the whole run, and how it goes meanwhile."""
+"""What collect, deploy and replay report: each episode and the whole run."""
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from deal_hw import errors
-from deal_hw.cli.seconds_bar import seconds_bar
 from deal_hw.control.loop import Outcome
 from deal_hw.control.loop_timing import LoopTimingReport
-from deal_hw.control.process_channel import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.control.velocity_error import VelocityError
 from deal_hw.data.recording.excitation import Excitation
+from deal_hw.workflows.say import html_table, text_table
 
+_HEAD = ("episode", "outcome", "reason", "states", "clipped cycles", "recording")
 _EXIT_CODES = {Outcome.FINISHED: 0, Outcome.TRIPPED: 3, Outcome.FAILED: 2, Outcome.STOPPED: 130}
 
 
@@ -67,6 +64,22 @@ class EpisodeReport:
             "error": self.error,
         }
 
+    def lines(self) -> list[str]:
+        """Return the account for the operator; warnings are extra."""
+        lines = [f"{self.outcome.value}: {self.reason}"]
+        if self.loop_timing is not None:
+            lines += ["  " + line for line in self.loop_timing.lines()]
+        for limit, cycles in self.clipped.items():
+            lines.append(f"  clipped by the safety filter: {limit} in {cycles} cycles")
+        if self.path is not None:
+            lines.append(f"  recorded {self.states_recorded} states in {self.path}")
+        if self.walk is not None and self.walk.seconds:
+            lines.append(
+                f"  velocity error, by leg odometry and IMU: {self.walk.velocity_m_s:.2f} m/s, "
+                f"{self.walk.yaw_rad_s:.2f} rad/s over {self.walk.seconds:.0f} s of walking"
+            )
+        return lines
+
     def raise_error(self) -> None:
         """Raise the error that ended the episode, as the class that it was in the control process."""
         if self.outcome is not Outcome.FAILED:
@@ -102,44 +115,27 @@ class RunReport:
         """For the shell: 0 finished, 2 failed, 3 tripped by the safety module, 130 stopped."""
         return _EXIT_CODES[self.outcome]
 
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The recordings, in order."""
+        return tuple(episode.path for episode in self.episodes if episode.path is not None)
 
-def print_report(report: EpisodeReport) -> None:
-    """Print an account for the operator."""
-    print(f"{report.outcome.value}: {report.reason}")
-    if report.loop_timing is not None:
-        print("\n".join("  " + line for line in report.loop_timing.lines()))
-    for limit, cycles in report.clipped.items():
-        print(f"  clipped by the safety filter: {limit} in {cycles} cycles")
-    if report.path is not None:
-        print(f"  recorded {report.states_recorded} states in {report.path}")
-    if report.walk is not None and report.walk.seconds:
-        print(
-            f"  velocity error, by leg odometry and IMU: {report.walk.velocity_m_s:.2f} m/s, "
-            f"{report.walk.yaw_rad_s:.2f} rad/s over {report.walk.seconds:.0f} s of walking"
-        )
-    for warning in report.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    def table(self) -> str:
+        """Return a line an episode, as text."""
+        return text_table(_HEAD, self._cells())
 
+    def _repr_html_(self) -> str:
+        return html_table(_HEAD, self._cells())
 
-@contextlib.contextmanager
-def progress(title: str, seconds: float) -> Iterator[Callable[[Beat], None]]:
-    """Show a progress bar on a terminal; everywhere, each second, trouble in making the robot passive."""
-    with seconds_bar(title, seconds) as bar:
-        started_ns = 0
-        trouble = ""
-
-        def on_beat(beat: Beat) -> None:
-            nonlocal started_ns, trouble
-            if beat.phase.startswith(f"{MAKING_PASSIVE}: ") and beat.phase != trouble:
-                trouble = beat.phase
-                print(f"{title}: {trouble}", file=sys.stderr, flush=True)
-            if beat.phase != RUNNING:
-                bar.say(f"{title}: {beat.phase}")
-                return
-            if not started_ns:
-                started_ns = beat.stamp_ns
-                bar.say(title)
-            if beat.count % 10 == 0:
-                bar.passed((beat.stamp_ns - started_ns) * 1e-9)
-
-        yield on_beat
+    def _cells(self) -> list[tuple[Any, ...]]:
+        return [
+            (
+                number,
+                one.outcome.value,
+                one.reason,
+                one.states_recorded,
+                sum(one.clipped.values()),
+                one.path or "",
+            )
+            for number, one in enumerate(self.episodes)
+        ]

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.clock import VirtualClock
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_level import ATTEMPTS, ExcitationLevelSearch, shortfalls
@@ -28,6 +27,7 @@ from deal_hw.drivers.cartpole.truth import Truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, Trajectory
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 _START_NS = 10**9
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import select
 import subprocess
 import sys
 from collections.abc import Sequence
 from types import TracebackType
+from typing import Any
 
 from typing_extensions import Self
 
 from deal_hw.errors import TransportError
+from deal_hw.workflows.options import option
 
 START_TIMEOUT_S = 60.0
 
@@ -111,3 +114,25 @@ class EmulatorProcess(VerbProcess):
 
     def __init__(self, robot: str, *options: str) -> None:
         super().__init__("emulate", robot, *options, what="the emulator")
+
+
+def arguments(settings: Any, default: Any) -> list[str]:
+    """Return the command-line options that say what differs from a verb's usual settings.
+
+    Args:
+        settings: A settings dataclass, perhaps with others in it.
+        default: The same without options.
+    """
+    words: list[str] = []
+    for field in dataclasses.fields(settings):
+        value, usual = getattr(settings, field.name), getattr(default, field.name)
+        flag = option(field.name)
+        if value == usual:
+            continue
+        if dataclasses.is_dataclass(value):
+            words += arguments(value, usual)
+        elif isinstance(value, bool):
+            words.append(flag if value else flag.replace("--", "--no-", 1))
+        else:
+            words += [flag, *map(str, value if isinstance(value, tuple) else (value,))]
+    return words

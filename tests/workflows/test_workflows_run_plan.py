@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deal_hw.cli.run_plan import RunPlan, make_behaviour
 from deal_hw.control.behaviours import HoldBehaviour
 from deal_hw.control.excitation import RichConfig, Segment
 from deal_hw.control.posture import PostureBehaviour, PostureConfig
@@ -19,6 +18,7 @@ from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
 from deal_hw.types import RobotState, Status
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 SEGMENT = Segment(**{f.name: getattr(RichConfig().segments[0], f.name) for f in dataclasses.fields(Segment)})
 POSTURE = PostureConfig(fold_s=1.0, rise_s=2.0, settle_s=0.5, lie_s=1.5)

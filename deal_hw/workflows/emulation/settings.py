@@ -1,4 +1,4 @@
-"""Settings of ``deal-hw emulate``."""
+"""Settings of ``deal_hw.emulate``."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import Range, Ratio, Seed, Share, check_ranges, given
+from deal_hw.workflows.options import File, Range, Ratio, Seed, Share, check_ranges, given
 
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 """Transports of the Go2, and where its emulator is by default: on this machine alone."""
@@ -64,7 +62,7 @@ class Go2Options:
     key: Path | None = None
     """Zenoh over TLS: its private key (PEM)."""
 
-    faults: tyro.conf.OmitArgPrefixes[Go2Faults] = field(default_factory=Go2Faults)
+    faults: Go2Faults = field(default_factory=Go2Faults)
     """Faults of the Go2, which begin so long after the first stiff command."""
 
     def __post_init__(self) -> None:
@@ -176,10 +174,10 @@ CARTPOLE_RANGE_RATIO = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Emulate:
-    """Emulate a robot in real time on a port of its own, with physics that nobody can look inside."""
+class EmulateSettings:
+    """Settings of :func:`deal_hw.emulate`."""
 
-    robot: tyro.conf.Positional[str] = "cartpole"
+    robot: str = field(default="cartpole", kw_only=False)
     """The robot to emulate."""
 
     transport: str | None = None
@@ -203,20 +201,20 @@ class Emulate:
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
 
-    truth_from: Path | None = None
+    truth_from: File | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
     firmware: Literal["python", "host", "avr"] = "python"
     """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
     under simavr (docs/how-to/firmware.md)."""
 
-    link: Path | None = None
+    link: File | None = None
     """Make a symbolic link to the port here."""
 
     reveal: bool = False
     """Print the truth and what happened as one line of JSON at the end."""
 
-    reveal_to: Path | None = None
+    reveal_to: File | None = None
     """Write the same to this JSON file at the end."""
 
     duration_s: Annotated[float | None, Range(0, 1e7, "s")] = None
@@ -247,20 +245,20 @@ class Emulate:
     return_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """The port comes back under --link so long after it vanished [s]; without it the emulator ends there."""
 
-    events_to: Path | None = None
+    events_to: File | None = None
     """Append to this file what the robot is told, while it happens: lines of JSON with device time [ms], host
     time [ns] and what it was."""
 
     parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
 
-    can: tyro.conf.OmitArgPrefixes[CanOptions] = field(default_factory=CanOptions)
+    can: CanOptions = field(default_factory=CanOptions)
     """The CAN bus of a cart-pole."""
 
-    servo: tyro.conf.OmitArgPrefixes[ServoOptions] = field(default_factory=ServoOptions)
+    servo: ServoOptions = field(default_factory=ServoOptions)
     """The servos of a cart-pole."""
 
-    go2: tyro.conf.OmitArgPrefixes[Go2Options] = field(default_factory=Go2Options)
+    go2: Go2Options = field(default_factory=Go2Options)
     """Options of the Go2 alone."""
 
     def __post_init__(self) -> None:

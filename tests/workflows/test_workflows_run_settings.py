@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.link import LegOptions, LinkOptions, plan_options
-from deal_hw.cli.run_plan import RunPlan
 from deal_hw.clock import VirtualClock
 from deal_hw.control.posture import PostureConfig
 from deal_hw.drivers import make_robot
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.settings import LegOptions, LinkOptions, plan_options
 
 
 @pytest.mark.parametrize(

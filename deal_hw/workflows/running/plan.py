@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +30,7 @@ from deal_hw.errors import ConfigurationError, PolicyError, UnknownNameError
 from deal_hw.policy import VERDICT, Policy
 from deal_hw.schema import OPEN, from_values
 from deal_hw.transport import WireOptions
+from deal_hw.workflows.running.view import RunView
 
 Profile = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
 """What a run does; `balance` runs the policy all the time."""
@@ -128,11 +128,16 @@ class RunPlan:
         return from_values(cls, values)
 
 
-def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
+def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | None = None) -> RunPlan:
     """Check all that a plan names before anybody touches the robot.
 
     A policy is tried in a process of its own, see :mod:`deal_hw.policies.trial`: its network is not opened in
     this one.
+
+    Args:
+        plan: The plan.
+        description: The robot.
+        view: What is told and asked; by default nothing.
 
     Returns:
         The plan, with the digest of the policy that was checked.
@@ -150,14 +155,13 @@ def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
             try_policy(policy, description)
             digests.append(policy.digest)
             if policy.spec.training.get(VERDICT) == "red" and not plan.trust_calibration:
-                _ask(Path(plan.policy))
+                _ask(Path(plan.policy), view or RunView())
             walks = plan.profile not in ("excite", "rich")
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
-            if limited:
-                print(
+            if limited and view is not None:
+                view.warn(
                     f"--velocity {plan.velocity} may ask for more [m/s, m/s, rad/s] than "
-                    f"{Path(plan.policy).stem} was trained for: {'; '.join(limited)}",
-                    file=sys.stderr,
+                    f"{Path(plan.policy).stem} was trained for: {'; '.join(limited)}"
                 )
             return policy
 
@@ -165,7 +169,7 @@ def check_plan(plan: RunPlan, description: RobotDescription) -> RunPlan:
     return dataclasses.replace(plan, policy_digest=digests[-1])
 
 
-def _ask(policy: Path) -> None:
+def _ask(policy: Path, view: RunView) -> None:
     """Ask whether to run a policy that was trained under a calibration that is not to be used.
 
     Raises:
@@ -175,10 +179,10 @@ def _ask(policy: Path) -> None:
         f"{policy.name} was trained under a calibration whose verdict is red: it explains the robot worse "
         "than the model did, or nothing says otherwise"
     )
-    if not sys.stdin.isatty():
+    answer = view.confirm(f"warning: {seen}", "run it all the same?")
+    if answer is None:
         raise PolicyError(f"{seen}; calibrate again and retrain, or run it with --trust-calibration")
-    print(f"warning: {seen}", file=sys.stderr)
-    if input("run it all the same? [y/N] ").strip().lower() not in ("y", "yes"):
+    if not answer:
         raise PolicyError("not run; calibrate again and retrain")
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.keyboard import HELP, keys
-from deal_hw.cli.run_plan import RunPlan
-from deal_hw.cli.supervised import run_episodes
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.running.keyboard import HELP, keys
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.supervised import run_episodes
 
 PATIENCE_S = 20.0
 STOP = "(stop)"

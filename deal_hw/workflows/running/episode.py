@@ -8,11 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deal_hw import __version__
-from deal_hw.cli.episode_end import account
-from deal_hw.cli.episode_report import EpisodeReport
-from deal_hw.cli.keyboard import keys
-from deal_hw.cli.run_plan import RunPlan
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.process_channel import (
@@ -32,6 +27,12 @@ from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.drivers import ODOMETRY, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
+from deal_hw.version import __version__
+from deal_hw.workflows.running.episode_end import account
+from deal_hw.workflows.running.keyboard import keys
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
@@ -53,8 +54,9 @@ class Episode:
         task: str,
         attempt: int = 0,
         keep_fds: tuple[int, ...] = (),
+        say: Say = silent,
     ) -> None:
-        self._keep_fds = keep_fds
+        self._keep_fds, self._say = keep_fds, say
         self.signal = ""
         """Name of the signal by which the operator ended it; "" where there was none."""
         self._plan, self._robot, self._port, self._store = plan, robot, port, store
@@ -91,7 +93,7 @@ class Episode:
                 raise
         port_fd = self._robot.fileno()
         supervisor = Supervisor(
-            module="deal_hw.cli.control_process",
+            module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
             passive=lambda phase, in_vain: self._make_passive(phase, in_vain, supervisor, on_beat),
@@ -100,7 +102,7 @@ class Episode:
             keep_fds=self._keep_fds,
         )
         listening = (
-            keys(supervisor.tell, lambda: supervisor.stop(OPERATOR))
+            keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say)
             if self._plan.velocity == "keyboard"
             else contextlib.nullcontext()
         )

@@ -10,12 +10,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from deal_hw.cli.run_plan import RunPlan
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.claim import LocalClaim
 from deal_hw.control.realtime import TRANSPORT_PRIORITY, priority
 from deal_hw.drivers import claim_name, wire_claim
 from deal_hw.robot import Robot
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.say import Say
 
 HOLDS_LAST_COMMAND = (
     "note: {robot} holds its last command for ever. deal-hw damps it when a run ends, when one of its two "
@@ -64,12 +65,11 @@ def connected(robot: Robot) -> Iterator[None]:
         robot.disconnect()
 
 
-def suspend() -> None:
+def suspend(say: Say) -> None:
     """Stop this process, as Ctrl-Z asked for; say what happened once it goes on."""
-    print("the robot is passive and the run is over; stopped (Ctrl-Z)", file=sys.stderr, flush=True)
+    say("the robot is passive and the run is over; stopped (Ctrl-Z)")
     os.kill(os.getpid(), signal.SIGSTOP)
-    print(
+    say(
         "deal-hw goes on after Ctrl-Z. The robot was made passive before, and the run does not go on: start "
-        "it again",
-        file=sys.stderr,
+        "it again"
     )

@@ -16,6 +16,8 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
+from deal_hw.workflows.options import File
+from deal_hw.workflows.say import Say
 
 T = TypeVar("T")
 _PARENT_CHECK_STEPS = 100
@@ -42,7 +44,7 @@ def signalled() -> Iterator[tuple[threading.Event, threading.Event]]:
 
 
 @contextlib.contextmanager
-def happenings(path: Path | None, *logs: Sequence[tuple[int, int, str]]) -> Iterator[Callable[[], None]]:
+def happenings(path: File | None, *logs: Sequence[tuple[int, int, str]]) -> Iterator[Callable[[], None]]:
     """Yield a function that appends to a file what is new in the logs, one line of JSON an entry.
 
     A program that tests a robot's commander reads there what the robot was told, while it happens.
@@ -55,7 +57,7 @@ def happenings(path: Path | None, *logs: Sequence[tuple[int, int, str]]) -> Iter
         yield lambda: None
         return
     told = [0] * len(logs)
-    with path.open("a", encoding="utf-8") as file:
+    with Path(path).open("a", encoding="utf-8") as file:
 
         def tell() -> None:
             for number, log in enumerate(logs):
@@ -103,10 +105,9 @@ def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
         return parse(values)
 
 
-def reveal(values: Mapping[str, Any], *, on_stdout: bool, path: Path | None) -> None:
-    """Print the truth as one line of JSON, write it to a file, both or neither."""
+def reveal(values: Mapping[str, Any], announce: Say, path: File | None) -> None:
+    """Tell the truth as one line of JSON; write it to a file, too, where one is given."""
     text = json.dumps(values)
-    if on_stdout:
-        print(text, flush=True)
+    announce(text)
     if path is not None:
-        path.write_text(text + "\n", encoding="utf-8")
+        Path(path).write_text(text + "\n", encoding="utf-8")

@@ -12,6 +12,7 @@ import tty
 from collections.abc import Callable, Iterator
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.say import Say, aloud
 
 STOP_KEYS = ("\x1b", "p")
 """Escape and p make the robot passive."""
@@ -31,7 +32,7 @@ def check_terminal() -> None:
 
 
 @contextlib.contextmanager
-def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[None]:
+def keys(pressed: Callable[[str], None], stop: Callable[[], None], say: Say = aloud) -> Iterator[None]:
     """Call ``pressed`` for each key, and ``stop`` for those that make the robot passive, from a thread.
 
     ``stop`` is called once: a key that is held repeats, and a second stop would kill the control process. It
@@ -64,7 +65,7 @@ def keys(pressed: Callable[[str], None], stop: Callable[[], None]) -> Iterator[N
     thread = threading.Thread(target=read, name="keys", daemon=True)
     tty.setcbreak(fd)
     thread.start()
-    print(HELP, file=sys.stderr)
+    say(HELP)
     try:
         yield
     finally:

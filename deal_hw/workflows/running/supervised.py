@@ -5,23 +5,25 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw import errors
-from deal_hw.cli.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
-from deal_hw.cli.episode import Episode
-from deal_hw.cli.episode_report import EpisodeReport, RunReport, print_report, progress
-from deal_hw.cli.keyboard import check_terminal
-from deal_hw.cli.run_plan import RunPlan, check_plan
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.excitation_level import ExcitationLevelSearch, shortfalls
 from deal_hw.control.loop import Outcome
 from deal_hw.control.process_channel import Beat
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
+from deal_hw.workflows.options import File
+from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
+from deal_hw.workflows.running.episode import Episode
+from deal_hw.workflows.running.keyboard import check_terminal
+from deal_hw.workflows.running.plan import RunPlan, check_plan
+from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.view import OnBeat, RunView, ignore
+from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
@@ -42,11 +44,7 @@ class InterruptedRunError(KeyboardInterrupt):
         self.report, self.signal = report, signal
 
 
-def _ignore(beat: Beat) -> None:
-    return
-
-
-def _both(first: Callable[[Beat], None], second: Callable[[Beat], None]) -> Callable[[Beat], None]:
+def _both(first: OnBeat, second: OnBeat) -> OnBeat:
     def on_beat(beat: Beat) -> None:
         first(beat)
         second(beat)
@@ -54,7 +52,7 @@ def _both(first: Callable[[Beat], None], second: Callable[[Beat], None]) -> Call
     return on_beat
 
 
-def dataset_folder(out: Path | None, dataset: Path | None, *, required: bool = True) -> Path | None:
+def dataset_folder(out: File | None, dataset: File | None, *, required: bool = True) -> Path | None:
     """Return the dataset's folder from the options --out and --dataset.
 
     Raises:
@@ -64,7 +62,9 @@ def dataset_folder(out: Path | None, dataset: Path | None, *, required: bool = T
         raise errors.ConfigurationError("give --out RUN or --dataset DIR, not both")
     if out is None and dataset is None and required:
         raise errors.ConfigurationError("give --out RUN (the episodes go to RUN/dataset) or --dataset DIR")
-    return out / "dataset" if out is not None else dataset
+    if out is not None:
+        return Path(out) / "dataset"
+    return None if dataset is None else Path(dataset)
 
 
 def run_episodes(
@@ -75,8 +75,8 @@ def run_episodes(
     episodes: int,
     purpose: str,
     task: str = "",
-    quiet: bool = False,
-    on_beat: Callable[[Beat], None] = _ignore,
+    view: RunView | None = None,
+    on_beat: OnBeat = ignore,
     attempts: int = 1,
 ) -> RunReport:
     """Run episodes one after the other on one port, each in a control process of its own.
@@ -88,7 +88,7 @@ def run_episodes(
         episodes: How many.
         purpose: "collect", "deploy" or "replay", for the metadata.
         task: For the metadata.
-        quiet: Whether to print nothing.
+        view: What is told and asked; by default nothing.
         on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
         attempts: How often an episode of the profile `rich` is recorded at most, stronger each time, until it
             moves enough; see :mod:`deal_hw.control.excitation_level`.
@@ -97,6 +97,7 @@ def run_episodes(
         DealHwError: What made it fail, after the robot was made passive and the recording closed.
         InterruptedRunError: The operator ended the program.
     """
+    view = view or RunView()
     if episodes < 1:
         raise errors.ConfigurationError(f"--episodes {episodes}: at least 1")
     plan = dataclasses.replace(plan, port=port)
@@ -113,17 +114,17 @@ def run_episodes(
     )
     # Whatever is wrong with settings, policy or recording should be said before anybody touches the robot.
     ExcitationLevelSearch(plan.excitation_level, attempts)
-    plan = check_plan(plan, robot.description)
+    plan = check_plan(plan, robot.description, view)
     reports: list[EpisodeReport] = []
-    if not robot.watchdog_s and not plan.dry_run and not quiet:
-        print(HOLDS_LAST_COMMAND.format(robot=plan.robot), file=sys.stderr)
+    if not robot.watchdog_s and not plan.dry_run:
+        view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot))
     # The supervisor connects to the robot itself, so that a wrong port is known before a process is started.
     # From then on it only keeps the port, until the control process is dead.
     with (
-        _suspended_last(),
+        _suspended_last(view.warn),
         claimed(plan) as claim,
         connected(robot),
-        _open_dataset(dataset, robot.description) as store,
+        _open_dataset(dataset, robot.description, view.warn) as store,
     ):
         if store is not None and plan.policy_digest:
             store.keep_policy(Path(plan.policy), plan.policy_digest)
@@ -136,17 +137,18 @@ def run_episodes(
             again = True
             while again:
                 episode = dataclasses.replace(episode, excitation_level=search.level)
-                run = Episode(episode, robot, port, store, purpose, task, len(search.attempts), claim)
-                with contextlib.nullcontext(_ignore) if quiet else progress(title, plan.total_s) as show:
+                run = Episode(
+                    episode, robot, port, store, purpose, task, len(search.attempts), claim, view.warn
+                )
+                with view.progress(title, plan.total_s) as show:
                     reports.append(run.run(_both(show, on_beat)))
-                if not quiet:
-                    print_report(reports[-1])
+                view.ended(reports[-1])
                 if run.signal:
                     report = RunReport(dataset=dataset, episodes=tuple(reports))
                     raise InterruptedRunError(report, run.signal)
                 again = _to_repeat(search, episode, reports[-1], robot.description)
                 if search.words:
-                    print(f"warning: {search.words}", file=sys.stderr)
+                    view.warn(f"warning: {search.words}")
             if reports[-1].outcome is not Outcome.FINISHED:
                 break
     reports[-1].raise_error()
@@ -154,13 +156,13 @@ def run_episodes(
 
 
 @contextlib.contextmanager
-def _suspended_last() -> Iterator[None]:
+def _suspended_last(say: Say) -> Iterator[None]:
     """Stop for Ctrl-Z only when all is given back: a stopped program must hold neither claim nor wire."""
     try:
         yield
     except InterruptedRunError as interrupted:
         if interrupted.signal == signal.SIGTSTP.name:
-            suspend()
+            suspend(say)
         raise
 
 
@@ -176,11 +178,11 @@ def _to_repeat(
 
 
 @contextlib.contextmanager
-def _open_dataset(folder: Path | None, description: RobotDescription) -> Iterator[Dataset | None]:
+def _open_dataset(folder: Path | None, description: RobotDescription, say: Say) -> Iterator[Dataset | None]:
     if folder is None:
         yield None
         return
     from deal_hw.data.recording.dataset import Dataset
 
-    with Dataset.create_or_open(folder, description, lambda text: print(text, file=sys.stderr)) as store:
+    with Dataset.create_or_open(folder, description, say) as store:
         yield store

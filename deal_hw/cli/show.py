@@ -1,0 +1,122 @@
+"""What the terminal shows of a run: a progress bar, sentences, the account of each episode."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from deal_hw.cli.design_excitation import note, print_design
+from deal_hw.control.process_channel import MAKING_PASSIVE, RUNNING, Beat
+from deal_hw.workflows.design_excitation import ExcitationReport
+from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.running.view import OnBeat, RunView, ignore
+from deal_hw.workflows.say import aloud
+
+
+class SecondsBar:
+    """A bar on the terminal; without one, nothing.
+
+    Args:
+        bar: A rich Progress; None: there is no terminal.
+        title: What is going on.
+        seconds: How long it takes [s].
+    """
+
+    def __init__(self, bar: Any, title: str, seconds: float) -> None:
+        self._bar, self._seconds = bar, seconds
+        self._task = bar.add_task(title, total=seconds) if bar is not None else None
+
+    def passed(self, seconds: float) -> None:
+        """So many seconds have passed [s]."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=min(seconds, self._seconds))
+
+    def say(self, title: str) -> None:
+        """Something else is going on."""
+        if self._bar is not None:
+            self._bar.update(self._task, description=title)
+
+
+@contextlib.contextmanager
+def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[SecondsBar]:
+    """Show a bar while the block runs, if standard error is a terminal and nobody asked for quiet."""
+    if quiet or not sys.stderr.isatty():
+        yield SecondsBar(None, title, seconds)
+        return
+    # Only here: rich takes longer to load than all else that a robot's computer needs.
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield SecondsBar(bar, title, seconds)
+
+
+class Terminal(RunView):
+    """Tells on standard error, prints accounts, asks on standard input.
+
+    Args:
+        quiet: Whether to tell only what the operator must know.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        super().__init__(aloud)
+        self._quiet = quiet
+
+    def note(self, text: str) -> None:
+        """See :class:`RunView`."""
+        if not self._quiet:
+            super().note(text)
+
+    @contextlib.contextmanager
+    def progress(self, title: str, seconds: float) -> Iterator[OnBeat]:
+        """Show a progress bar on a terminal; everywhere, each second, trouble in making the robot passive."""
+        if self._quiet:
+            yield ignore
+            return
+        with seconds_bar(title, seconds) as bar:
+            started_ns = 0
+            trouble = ""
+
+            def on_beat(beat: Beat) -> None:
+                nonlocal started_ns, trouble
+                if beat.phase.startswith(f"{MAKING_PASSIVE}: ") and beat.phase != trouble:
+                    trouble = beat.phase
+                    print(f"{title}: {trouble}", file=sys.stderr, flush=True)
+                if beat.phase != RUNNING:
+                    bar.say(f"{title}: {beat.phase}")
+                    return
+                if not started_ns:
+                    started_ns = beat.stamp_ns
+                    bar.say(title)
+                if beat.count % 10 == 0:
+                    bar.passed((beat.stamp_ns - started_ns) * 1e-9)
+
+            yield on_beat
+
+    def notify(self, done: int, total: int, text: str) -> None:
+        """See :class:`RunView`."""
+        if not self._quiet and sys.stderr.isatty():
+            note(done, total, text)
+
+    def designed(self, robot: str, report: ExcitationReport) -> None:
+        """See :class:`RunView`."""
+        if not self._quiet:
+            print_design(robot, report)
+
+    def ended(self, report: EpisodeReport) -> None:
+        """See :class:`RunView`."""
+        if self._quiet:
+            return
+        print("\n".join(report.lines()))
+        for warning in report.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
+
+    def confirm(self, warning: str, question: str) -> bool | None:
+        """See :class:`RunView`."""
+        if not sys.stdin.isatty():
+            return None
+        print(warning, file=sys.stderr)
+        return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")

@@ -1,0 +1,300 @@
+"""Settings of a calibration, and what reads and checks what they name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from deal_hw.calib.methods import check_method, usual_budget
+from deal_hw.calibration import LATENCY_RANGE_S, Budget, CalibrationResult, ProgressCallback
+from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
+from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
+from deal_hw.workflows.calibration.policy import check_policy
+from deal_hw.workflows.calibration.recordings import Source
+from deal_hw.workflows.calibration.run import (
+    HELDOUT_WINDOW_S,
+    CalibrationInputs,
+    SpaceOverrides,
+    calibrate_episodes,
+    residual_std,
+    residual_std_of,
+)
+from deal_hw.workflows.calibration.walking import WALK_TELLS
+from deal_hw.workflows.options import Checked, File, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.workflows.say import Say, silent
+
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.model import RobotModel
+
+OF_DATASETS = ("episodes", "space", "sample_hz")
+"""Settings that only datasets take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings(Checked):
+    """What ``deal-hw calibrate`` and :func:`deal_hw.calibrate` can be told; both refuse the same."""
+
+    dataset: File | None = None
+    """Dataset folder, such as runs/first/dataset; left out with --model."""
+
+    recordings: Recordings = field(default_factory=Recordings)
+
+    episodes: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
+    """Episodes of the dataset to fit; by default all but the held-out ones."""
+
+    holdout: Annotated[tuple[int | Path, ...], Range(0, 1_000_000)] = ()
+    """What only judges the result: episodes of the dataset (by default those collected with --profile chirp),
+    or with --model recordings (by default the last part of each, --holdout-part)."""
+
+    heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
+    """Held-out predictions restart from the measured state this often [s]."""
+
+    method: str = DEFAULT
+    """How to search: default, output-error, eki, deal, deal-paper, ... (an unknown name lists all). The
+    default is eki and its refinement; of a walk it is gait; with --model, for a robot that servos hold on a
+    fixed base, it is output-error unless --residual-std or --no-refine say how to treat what no model
+    explains."""
+
+    policy: File | None = None
+    """The policy (.onnx) that moved the robot, for deal-paper and other methods that run it in every
+    simulator; by default the copy that the dataset keeps."""
+
+    space: str = ""
+    """Which parameters of a robot of ours, such as k9 or k11; the first by default. See
+    docs/reference/parameters.md."""
+
+    free: tuple[str, ...] = ()
+    """Search exactly these parameters instead; the others keep their nominal values."""
+
+    known: Annotated[tuple[tuple[str, float], ...], Range(-1e12, 1e12)] = ()
+    """Parameters measured by other means, as NAME VALUE pairs (SI)."""
+
+    range: Annotated[tuple[tuple[str, float, float], ...], Range(-1e12, 1e12)] = ()
+    """Other search ranges, as NAME LOW HIGH (SI)."""
+
+    range_ratio: Annotated[float | None, Ratio] = None
+    """Search each parameter within a factor RANGE-RATIO to either side of its nominal value. By default as
+    its parameter set says, mostly 5; with --model 20 for dry friction (docs/reference/parameters.md), and
+    with --parameters the ranges of that file."""
+
+    latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
+    """Total latency [s] if it is known; by default it is searched."""
+
+    latency_range: Annotated[tuple[float, float], Range(0, LONGEST_LATENCY_S, "s")] = LATENCY_RANGE_S
+    """Latencies that are searched, LOW HIGH [s]. An estimate at the end is an alarm: widen the range then."""
+
+    spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
+    """Leave out up to three samples in a row that jump away and come back, so many times farther than the
+    joint's fastest motion would take it (docs/explanation/calibration.md). A larger number leaves out
+    less."""
+
+    residual_std: float | Mapping[str, float] | tuple[str, ...] | None = ()
+    """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE
+    pairs of joints; by default the sensor noise, estimated. On real robots some milliradians often serve
+    better."""
+
+    sample_hz: Annotated[float | None, Range(1, 1e5, "Hz")] = None
+    """Fit to about so many states a second of a dataset; by default to four a control period. What was held
+    out is judged at the same rate."""
+
+    population: Annotated[int | None, Range(2, 100_000)] = None
+    """Members of the search; by default 100, for methods of the paper 200."""
+
+    generations: Annotated[int, Range(1, 100_000)] = 50
+    """Most generations of the search."""
+
+    refine: bool = True
+    """Follow the search by multiple shooting on prediction error."""
+
+    seed: Seed = 0
+    """Fixes everything random."""
+
+    threads: Threads = None
+    """Simulation threads; by default all CPUs."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self.latency_range
+        if not low < high:
+            raise ConfigurationError(f"--latency-range {low:g} {high:g}: give the lower one first")
+
+    def check(self, data: Sequence[Source] = ()) -> None:
+        """Check what goes together before anything is read.
+
+        Args:
+            data: Recordings to fit that are not among the settings.
+
+        Raises:
+            ConfigurationError: Something would have no effect, or lacks.
+            UnknownNameError: There is no such method.
+        """
+        check_source(dataset=self.dataset is not None, model=self.recordings.model is not None)
+        if self.recordings.model is None:
+            foreign = given(self.recordings, Recordings())
+            foreign += ["--data"] if data and "--data" not in foreign else []
+            refuse(foreign, "a dataset says it; that goes with --model and --data")
+        else:
+            refuse(
+                given(self, CalibrateSettings(), OF_DATASETS),
+                "only datasets take that; with --model use --data and --parameters",
+            )
+        if self.latency is not None:
+            refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency says the latency")
+        check_method(self.method)
+        check_policy(self.method, given=self.policy is not None, model=self.recordings.model is not None)
+
+    @property
+    def budget(self) -> Budget:
+        """How much the method may use."""
+        return usual_budget(self.method, self.population, self.generations, refine=self.refine)
+
+    def known_std(self, robot: RobotModel) -> FloatArray | None:
+        """Return what a prediction may be off, positions then velocities, (2 C,); None for sensor noise.
+
+        Raises:
+            ConfigurationError: A number is missing, or is not above 0.
+            UnknownNameError: A joint is not known.
+        """
+        std = self.residual_std
+        return residual_std(std, robot) if isinstance(std, tuple) else residual_std_of(std, robot)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What the result notes of the settings: plain JSON values."""
+        std = self.residual_std
+        noted = {
+            "seed": self.seed,
+            "range_ratio": self.range_ratio,
+            "heldout_window_s": self.heldout_window,
+            "latency_range_s": None if self.latency is not None else list(self.latency_range),
+        }
+        if std in ((), None):
+            return noted
+        given = list(std) if isinstance(std, tuple) else dict(std) if isinstance(std, Mapping) else std
+        return {**noted, "residual_std": given}
+
+    @property
+    def overrides(self) -> SpaceOverrides:
+        """What is changed about the parameters."""
+        return SpaceOverrides(
+            free=self.free, known=dict(self.known), ranges=self.range, range_ratio=self.range_ratio
+        )
+
+
+def check_source(*, dataset: bool, model: bool) -> None:
+    """Check that there is one source of recordings.
+
+    Raises:
+        ConfigurationError: There is none, or two.
+    """
+    if dataset == model:
+        raise ConfigurationError(
+            "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
+            "(deal-hw calibrate --model robot.xml --data rec.csv), not both; in Python dataset=..., or "
+            "model=... and data=[...]"
+        )
+
+
+def prepare(
+    settings: CalibrateSettings,
+    *,
+    data: Sequence[Source] = (),
+    holdout: Sequence[Any] | None = None,
+    say: Say = silent,
+) -> CalibrationInputs:
+    """Read and check what is to be calibrated.
+
+    Args:
+        settings: What was asked for.
+        data: More recordings to fit, also from memory.
+        holdout: What only judges the result, also from memory; by default what the settings say.
+        say: Called with sentences on what was guessed and what looks odd.
+
+    Raises:
+        DealHwError: A setting or a recording is unusable.
+    """
+    judges = settings.holdout if holdout is None else holdout
+    spikes = SpikeSettings(ratio=settings.spike_ratio)
+    if settings.recordings.model is not None:
+        return prepare_model(
+            settings.recordings,
+            [Path(str(one)) if isinstance(one, int) else one for one in judges],
+            settings.overrides,
+            std=settings.known_std,
+            data=data,
+            spikes=spikes,
+            threads=settings.threads,
+            say=say,
+        )
+    wrong = [str(one) for one in judges if not isinstance(one, int)]
+    if settings.dataset is None or wrong:
+        raise ConfigurationError(
+            f"--holdout {' '.join(wrong)}: of a dataset name episodes by number; files go with --model"
+            if wrong
+            else "no dataset was named"
+        )
+    source = DatasetRecordings(
+        folder=Path(settings.dataset),
+        episodes=settings.episodes,
+        holdout=[int(str(one)) for one in judges],
+        policy=None if settings.policy is None else Path(settings.policy),
+        sample_hz=settings.sample_hz,
+        spikes=spikes,
+    )
+    return prepare_dataset(source, settings.space, settings.overrides, settings.method, say)
+
+
+def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say = silent) -> str:
+    """Return the method, where none is named that which suits the recordings."""
+    if settings.method != DEFAULT:
+        return settings.method
+    told = settings.residual_std not in ((), None) or not settings.refine
+    method = method_for(work, told=told, real=settings.recordings.model is not None)
+    if work.walks and not told:
+        say(WALK_TELLS)
+    if method != DEFAULT:
+        say(f"method: {method} (--method eki to search and refine to the sensor noise)")
+    return method
+
+
+def calibrate_inputs(
+    settings: CalibrateSettings,
+    work: CalibrationInputs,
+    method: str,
+    *,
+    progress: ProgressCallback | None = None,
+    say: Say = silent,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    keep: Path | None = None,
+) -> CalibrationResult:
+    """Calibrate what was read, as the settings say; see :func:`calibrate_episodes`."""
+    return calibrate_episodes(
+        work.robot,
+        work.space,
+        work.episodes,
+        work.holdout,
+        method=method,
+        budget=settings.budget,
+        rng=np.random.default_rng(settings.seed),
+        latency_s=settings.latency,
+        latency_range_s=settings.latency_range,
+        threads=settings.threads,
+        progress=progress,
+        say=say,
+        checkpoint=checkpoint,
+        resume=resume,
+        keep=keep,
+        known_std=settings.known_std(work.robot),
+        heldout_window_s=settings.heldout_window,
+        policy=work.policy,
+        smoothing_s=work.smoothing_s,
+    )

@@ -1,0 +1,155 @@
+"""``deal_hw.collect``: record the robot while it moves in an informative way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from deal_hw.calibration import SHORTEST_S
+from deal_hw.control.excitation import RichConfig
+from deal_hw.control.excitation_level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
+from deal_hw.control.excitation_plan import FAMILIES, read_plan
+from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settings, given, refuse
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.settings import RunOptions, plan_options
+from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
+from deal_hw.workflows.running.view import RunView
+from deal_hw.workflows.shipped import shipped_policy
+
+EXCITATION_FILE = "excitation.json"
+"""Where the excitation of `--excite optimal` is kept, in the run folder."""
+SHORT_S = 1.5 * SHORTEST_S
+"""Recordings below this are told to be short: not every sample is usable [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectSettings(RunOptions):
+    """Settings of :func:`collect`."""
+
+    robot: str = field(kw_only=False)
+    """The robot, such as cartpole."""
+
+    profile: Literal["rich", "chirp", "balance", "hold"] = "rich"
+    """rich: balance, then random set-points; chirp: a sine sweep (for held-out data); balance: the policy all
+    the time; hold: the start pose."""
+
+    excite: str = ""
+    """Play this instead of a profile: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
+    file that `deal-hw design-excitation` wrote, which says how long it is."""
+
+    policy: File | None = None
+    """Policy that balances (.onnx); by default the one shipped for the robot."""
+
+    seconds: RunSeconds = 4.0
+    """Length of an episode [s]."""
+
+    episodes: Annotated[int, Range(1, 10_000)] = 1
+    """How many episodes."""
+
+    excitation_level: Annotated[float, Range(LOWEST_LEVEL, HIGHEST_LEVEL)] = 0.0
+    """Start profile rich stronger (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
+    the safety limits."""
+
+    attempts: Annotated[int, Range(1, 100)] = ATTEMPTS
+    """How often an episode of profile rich is recorded at most: one that hardly moves is repeated stronger.
+    After a trip nothing is repeated; look at the robot first."""
+
+    seed: Seed = 0
+    """Fixes the random set-points; episode k uses SEED + k."""
+
+    rich: RichConfig = field(default_factory=RichConfig)
+    """Settings of the profile `rich`; its length is SECONDS."""
+
+
+@from_settings(CollectSettings)
+def collect(settings: CollectSettings) -> RunReport:
+    """Record the robot while it moves in an informative way; what ``deal-hw collect`` does.
+
+    The arguments are those of :class:`CollectSettings`, which has a text under each, and ``deal-hw collect
+    --help`` shows them: ``collect("cartpole", port="/dev/ttyUSB0", out="runs/first")``.
+
+    Returns:
+        How the episodes went, with the paths of the recordings.
+
+    Raises:
+        DealHwError: A setting is unusable, or what made it fail; the robot is passive and what was recorded
+            is whole.
+        InterruptedRunError: Ctrl-C; the robot is passive.
+    """
+    return run(settings, RunView.of_python(settings.say))
+
+
+def run(config: CollectSettings, view: RunView) -> RunReport:
+    """Record episodes, as :func:`collect`, and show them."""
+    _refuse_ignored(config)
+    policy = config.policy or shipped_policy(config.robot)
+    excite, seconds = _excitation(config, view)
+    if seconds * config.episodes < SHORT_S:
+        view.note(
+            f"warning: {seconds * config.episodes:g} s in all is too short for `deal-hw calibrate`, which "
+            f"needs {SHORTEST_S:g} s of usable samples; 4 s are enough (--seconds 4)"
+        )
+    walks = config.profile == "balance" and not excite
+    plan = RunPlan(
+        **plan_options(config.robot, config.link, config.legs, walks=walks),
+        profile="excite" if excite else config.profile,
+        policy=str(policy or ""),
+        seconds=seconds,
+        seed=config.seed,
+        rich=config.rich,
+        excitation_level=config.excitation_level,
+        excite=excite,
+    )
+    return run_episodes(
+        plan,
+        port=config.port,
+        dataset=dataset_folder(config.out, config.dataset),
+        episodes=config.episodes,
+        purpose="collect",
+        view=view,
+        attempts=config.attempts,
+    )
+
+
+def _refuse_ignored(config: CollectSettings) -> None:
+    """Refuse options that the motion would ignore.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    default = CollectSettings(robot=config.robot, port=config.port)
+    if config.excite:
+        refuse(given(config, default, ["profile"]), "--excite plays its own motion; leave one of the two out")
+    if config.excite or config.profile != "rich":
+        refuse(
+            given(config, default, ["excitation_level", "attempts"]), "only --profile rich can be stronger"
+        )
+    if not config.excite and config.profile in ("chirp", "hold"):
+        refuse(given(config, default, ["policy"]), f"--profile {config.profile} runs no policy")
+
+
+def _excitation(config: CollectSettings, view: RunView) -> tuple[str, float]:
+    """Return what the control process is told to play, and for how long [s]; compute what is optimal."""
+    if not config.excite or config.excite in FAMILIES:
+        return config.excite, config.seconds
+    if config.excite != "optimal":
+        path = Path(config.excite)
+        plan = read_plan(path)
+        if config.seconds not in (plan.seconds, CollectSettings.seconds):
+            refuse(["--seconds"], f"{path} says that it is {plan.seconds:g} s long; leave it out")
+        return str(path), plan.seconds
+    # Only here: the rest of this verb runs on computers without the extras.
+    from deal_hw.workflows import design_excitation
+
+    folder = dataset_folder(config.out, config.dataset)
+    if folder is None:
+        raise RuntimeError("unreachable: dataset_folder() raises where neither folder was given")
+    path = folder.parent / EXCITATION_FILE
+    settings = design_excitation.ExcitationSettings(
+        config.robot, out=path, seconds=config.seconds, policy=config.policy, seed=config.seed
+    )
+    report = design_excitation.run(settings, view.notify)
+    view.designed(config.robot, report)
+    return str(path), report.plan.seconds

@@ -1,0 +1,86 @@
+"""``deal_hw.deploy``: run a policy on the robot behind the safety filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settings
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.settings import RunOptions, plan_options
+from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
+from deal_hw.workflows.running.view import RunView
+from deal_hw.workflows.shipped import shipped_policy
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeploySettings(RunOptions):
+    """Settings of :func:`deploy`."""
+
+    robot: str = field(kw_only=False)
+    """The robot, such as cartpole."""
+
+    policy: File | None = None
+    """The policy (.onnx); by default the one shipped for the robot."""
+
+    seconds: RunSeconds = 10.0
+    """Length of an episode [s]."""
+
+    episodes: Annotated[int, Range(1, 10_000)] = 1
+    """How many episodes."""
+
+    seed: Seed = 0
+    """Noted in the recording; the policy itself is not random."""
+
+    task: str = ""
+    """What the policy is to do, in words, for the recording."""
+
+    trust_calibration: bool = False
+    """Run a policy that was trained under a calibration whose verdict is red, without asking."""
+
+    dry_run: bool = False
+    """Compute everything and send nothing: the robot is neither homed nor armed."""
+
+
+@from_settings(DeploySettings)
+def deploy(settings: DeploySettings) -> RunReport:
+    """Run a policy on the robot behind the safety filter, and record it; what ``deal-hw deploy`` does.
+
+    The arguments are those of :class:`DeploySettings`, which has a text under each, and ``deal-hw deploy
+    --help`` shows them: ``deploy("cartpole", port="/dev/ttyUSB0", policy="policy.onnx", out="runs/first")``.
+
+    Returns:
+        How the episodes went, with the paths of the recordings.
+
+    Raises:
+        PolicyMismatchError: The policy was made for another robot; the message names what differs.
+        DealHwError: A setting is unusable, or what made it fail; the robot is passive and what was recorded
+            is whole.
+        InterruptedRunError: Ctrl-C; the robot is passive.
+    """
+    return run(settings, RunView.of_python(settings.say))
+
+
+def run(config: DeploySettings, view: RunView) -> RunReport:
+    """Run the policy, as :func:`deploy`, and show it."""
+    policy = config.policy or shipped_policy(config.robot)
+    plan = RunPlan(
+        **plan_options(config.robot, config.link, config.legs),
+        profile="balance",
+        policy=str(policy or ""),
+        seconds=config.seconds,
+        seed=config.seed,
+        dry_run=config.dry_run,
+        trust_calibration=config.trust_calibration,
+        home=not config.dry_run,
+    )
+    return run_episodes(
+        plan,
+        port=config.port,
+        dataset=dataset_folder(config.out, config.dataset, required=False),
+        episodes=config.episodes,
+        purpose="deploy",
+        task=config.task,
+        view=view,
+    )

@@ -1,0 +1,1 @@
+"""What `deal-hw doctor` looks at."""

@@ -1,0 +1,142 @@
+"""``deal_hw.doctor``: what is wrong with this computer, the link and the robot, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from deal_hw.clock import MonotonicClock
+from deal_hw.drivers import (
+    CAN_BUSES,
+    TOPIC_TRANSPORTS,
+    can_bus,
+    default_transport,
+    make_robot,
+    make_topic_transport,
+)
+from deal_hw.errors import ConfigurationError, DealHwError
+from deal_hw.findings import Finding, Level
+from deal_hw.transport import WireOptions
+from deal_hw.workflows.doctor.machine import examine_machine
+from deal_hw.workflows.doctor.robot import examine_robot
+from deal_hw.workflows.options import Checked, Range, from_settings
+from deal_hw.workflows.say import html_table
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorSettings(Checked):
+    """Settings of :func:`doctor`."""
+
+    robot: str = field(default="", kw_only=False)
+    """The robot to listen to, such as go2."""
+
+    port: str = ""
+    """Where it is: a network interface (dds), an endpoint (zenoh), a serial port or a CAN bus."""
+
+    transport: str = ""
+    """How it is reached; by default the robot's usual way."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """What the states of a Go2 must pass: strict, or length to leave head and checksum out."""
+
+    seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
+    """How long to listen to the robot [s]."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """More about a network."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if bool(self.robot) != bool(self.port):
+            raise ConfigurationError(
+                "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoctorReport:
+    """What was found.
+
+    Attributes:
+        findings: All findings, in the order of the examination.
+    """
+
+    findings: tuple[Finding, ...]
+
+    def _repr_html_(self) -> str:
+        rows = [(f.area, f.level.value, f.message, f.remedy) for f in self.findings]
+        return html_table(("area", "level", "what", "what to do"), rows)
+
+    @property
+    def exit_code(self) -> int:
+        """For the shell: 0, or 1 where something does not work."""
+        return int(any(finding.level is Level.FAIL for finding in self.findings))
+
+
+@from_settings(DoctorSettings)
+def doctor(settings: DoctorSettings) -> DoctorReport:
+    """Find out what is wrong with this computer, the link and the robot; what ``deal-hw doctor`` does.
+
+    The arguments are those of :class:`DoctorSettings`, which has a text under each: ``doctor("go2",
+    port="enp2s0")``; without a robot only this computer is examined. No command is sent to a motor.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: The robot is not reached that way.
+    """
+    return DoctorReport(findings=tuple(examine(settings)))
+
+
+def examine(config: DoctorSettings) -> Iterator[Finding]:
+    """Yield what is found, as it is found; see :func:`doctor`."""
+    from deal_hw.drivers.transports.can_transport import open_can
+    from deal_hw.workflows.doctor.can import list_adapters, listen_to_bus
+
+    yield from examine_machine()
+    yield from list_adapters()
+    yield from judge_interfaces(config.port)
+    if not config.robot:
+        return
+    name = config.transport or default_transport(config.robot)
+    clock = MonotonicClock()
+    try:
+        if name not in TOPIC_TRANSPORTS:
+            if name in CAN_BUSES:
+                bus, nodes = can_bus(name, config.port)
+                yield from listen_to_bus(open_can(bus, clock), clock, min(1.0, config.seconds), *nodes)
+            if name == "dynamixel":
+                from deal_hw.drivers.cartpole.dynamixel.doctor import examine_servos
+
+                yield from examine_servos(config.port, clock)
+            robot = make_robot(config.robot, name, config.port, clock, config.wire)
+            yield from examine_robot(config.robot, robot, clock, config.seconds)
+            return
+        from deal_hw.drivers.go2.doctor import Doctor
+
+        link = make_topic_transport(name, config.port, clock, config.wire)
+        yield from Doctor(link, clock, config.seconds, config.state_check).run()
+    except DealHwError as error:
+        yield Finding("link", Level.FAIL, str(error))
+
+
+def judge_interfaces(port: str) -> Iterator[Finding]:
+    """Yield this computer's network interfaces; the one of the port is to have a link."""
+    from deal_hw.drivers.transports.interfaces import list_interfaces
+
+    for interface in list_interfaces():
+        level, remedy = Level.OK, ""
+        if port in (interface.name, *interface.addresses) and not interface.carrier:
+            level, remedy = Level.FAIL, "is the cable in, and is the robot switched on?"
+        elif not interface.multicast and not interface.loopback and interface.up:
+            level = Level.WARN
+            remedy = f"DDS finds its peers by multicast: ip link set {interface.name} multicast on"
+        elif (
+            not interface.multicast and interface.loopback and port in (interface.name, *interface.addresses)
+        ):
+            level = Level.NOTE
+            remedy = (
+                "deal-hw's own programs meet here; programs on the vendor's SDK find nothing until "
+                f"`ip link set {interface.name} multicast on`"
+            )
+        yield Finding("interfaces", level, str(interface), remedy)

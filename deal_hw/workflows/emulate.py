@@ -1,0 +1,69 @@
+"""``deal_hw.emulate``: a robot on the wire without a robot."""
+
+from __future__ import annotations
+
+import json
+from types import TracebackType
+from typing import Any
+
+from deal_hw.workflows.emulation.process import EmulatorProcess, arguments
+from deal_hw.workflows.emulation.settings import EmulateSettings
+from deal_hw.workflows.options import from_settings, refuse
+
+
+class EmulatedRobot(EmulatorProcess):
+    """A robot that is emulated in a process of its own; a context manager.
+
+    Args:
+        settings: What to emulate.
+
+    Attributes:
+        robot: Its name.
+        port: Where it is, while it is emulated.
+        truth: Its hidden parameters and what happened, by name; empty until the end.
+    """
+
+    def __init__(self, settings: EmulateSettings) -> None:
+        default = EmulateSettings(settings.robot)
+        super().__init__(settings.robot, "--reveal", *arguments(settings, default))
+        self.robot = settings.robot
+        self.truth: dict[str, Any] = {}
+
+    def stop(self, timeout_s: float = 10.0) -> tuple[str, str]:
+        """Stop it; return what it printed since its first line, and its messages."""
+        out, errors = super().stop(timeout_s)
+        revealed = [line for line in out.splitlines() if line.startswith("{")]
+        if revealed:
+            self.truth = json.loads(revealed[-1])
+        return out, errors
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def __repr__(self) -> str:
+        return f"<emulated {self.robot}{f' on {self.port}' if self.port else ', not started'}>"
+
+
+@from_settings(EmulateSettings)
+def emulate(settings: EmulateSettings) -> EmulatedRobot:
+    """Emulate a robot in real time on a port of its own, with hidden physics; what ``deal-hw emulate`` does.
+
+    The arguments are those of :class:`EmulateSettings`, which has a text under each, and ``deal-hw emulate
+    --help`` shows them::
+
+        with deal_hw.emulate("cartpole", seed=1) as robot:
+            deal_hw.collect("cartpole", port=robot.port, out="runs/first")
+        print(robot.truth["parameters"])
+
+    Returns:
+        The robot; it starts with the block and ends with it.
+
+    Raises:
+        UnknownNameError: There is no such robot or wire.
+        ConfigurationError: A setting is unusable.
+    """
+    refuse(["--reveal"] if settings.reveal else [], "the robot's attribute truth has it at the end")
+    refuse(["--parent"] if settings.parent is not None else [], "this process is the parent")
+    return EmulatedRobot(settings)

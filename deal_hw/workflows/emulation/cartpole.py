@@ -1,0 +1,140 @@
+"""``deal-hw emulate cartpole``: how it runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from deal_hw.errors import MissingExtraError
+from deal_hw.workflows.emulation.common import (
+    happenings,
+    read_truth,
+    realtime_priority,
+    reveal,
+    run_until,
+)
+from deal_hw.workflows.emulation.settings import (
+    CARTPOLE_EMULATORS,
+    CARTPOLE_RANGE_RATIO,
+    ON_CAN,
+    EmulateSettings,
+)
+from deal_hw.workflows.say import Say, silent
+
+if TYPE_CHECKING:
+    from deal_hw.drivers.cartpole.emulator import Hazards
+    from deal_hw.drivers.cartpole.truth import Truth
+
+
+class CartpoleOnAWire(Protocol):
+    """What the verb needs of an emulated cart-pole, whatever its wire."""
+
+    slips: int
+    dropped: int
+    changes: list[tuple[int, int, str]]
+
+    def open(self) -> str:
+        """Make the port; return what a host gives as ``--port``."""
+        ...
+
+    def close(self) -> None:
+        """Remove the port."""
+        ...
+
+    def step(self) -> bool:
+        """Run until the next tick; return whether there is still a port."""
+        ...
+
+    def cut(self) -> None:
+        """Cut the wire from now on, for as long as the hazards say."""
+        ...
+
+    def report(self) -> dict[str, Any]:
+        """Return what happened, as plain JSON values."""
+        ...
+
+
+def emulate_cartpole(
+    config: EmulateSettings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
+) -> None:
+    """Run the emulator until it is stopped, the time given, or until its port vanished.
+
+    Args:
+        config: What to emulate.
+        stop: Ends it.
+        cut: Cuts the wire.
+        announce: Called with the port first, and with what was revealed at the end.
+        say: Called with what happened at the end.
+    """
+    module, _, function = CARTPOLE_EMULATORS[config.transport or "serial"].partition(":")
+    try:
+        make = getattr(importlib.import_module(module), function)
+    except ModuleNotFoundError as error:
+        if error.name in ("mujoco", "scipy"):
+            raise MissingExtraError(error.name, "sim") from error
+        raise
+    truth = _truth(config)
+    own = {"firmware": config.firmware} if config.firmware != "python" else {}
+    link = None if config.link is None else Path(config.link)
+    emulator: CartpoleOnAWire = make(truth, link=link, hazards=_hazards(config), **own)
+    try:
+        announce(f"port {emulator.open()}")
+        announce(f"profile {truth.profile}, seed {truth.seed}, {truth.refused} draws refused; Ctrl-C ends")
+        with realtime_priority(), happenings(config.events_to, emulator.changes) as tell:
+
+            def step() -> bool:
+                if cut.is_set():
+                    cut.clear()
+                    emulator.cut()
+                going_on = emulator.step()
+                tell()
+                return going_on
+
+            run_until(step, stop, config.duration_s, config.parent)
+    finally:
+        emulator.close()
+        report = {**truth.to_json(), **emulator.report()}
+        reveal(report, announce if config.reveal else silent, config.reveal_to)
+    say(f"emulator: {emulator.slips} stalls, {emulator.dropped} writes dropped")
+
+
+def _truth(config: EmulateSettings) -> Truth:
+    from deal_hw.drivers.cartpole.oracle import draw_truth
+    from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+
+    if config.nominal:
+        return nominal_truth(config.profile, config.seed)
+    if config.truth_from is not None:
+        return read_truth(Path(config.truth_from), Truth.from_json)
+    return draw_truth(
+        config.profile,
+        config.seed,
+        range_ratio=CARTPOLE_RANGE_RATIO if config.range_ratio is None else config.range_ratio,
+    )
+
+
+def _hazards(config: EmulateSettings) -> Hazards:
+    import numpy as np
+
+    from deal_hw.drivers.cartpole.emulator import CanFaults, Hazards, ServoFaults
+    from deal_hw.testing.faults import FaultRates, FrameFaults
+
+    # A frame of a serial CAN adapter is a line; servos send a packet at a time.
+    end = b"\r" if config.transport in ON_CAN else None if config.transport == "dynamixel" else b"\0"
+    servo = {name.removeprefix("servo_"): value for name, value in dataclasses.asdict(config.servo).items()}
+    rates = FaultRates(corrupt=config.corrupt, drop=config.drop, duplicate=config.duplicate)
+    return Hazards(
+        freeze_after_s=config.freeze_after_s,
+        cut_after_s=config.cut_after_s,
+        cut_s=config.cut_s,
+        vanish_after_s=config.vanish_after_s,
+        return_after_s=config.return_after_s,
+        faults=FrameFaults(rates, np.random.default_rng([config.seed, 0xFA]), end)
+        if rates != FaultRates()
+        else None,
+        can=CanFaults(**dataclasses.asdict(config.can)),
+        servo=ServoFaults(**servo),
+    )

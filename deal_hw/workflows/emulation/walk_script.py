@@ -1,0 +1,31 @@
+"""What demo and bench let a Go2 walk: velocities over time, and the file that ``--velocity`` reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+Script = tuple[tuple[float, tuple[float, float, float]], ...]
+PROFILE: Final = (
+    (0.0, (0.0, 0.0, 0.0)),
+    (2.0, (1.0, 0.0, 0.0)),
+    (7.0, (0.0, 0.5, 0.0)),
+    (12.0, (0.0, 0.0, 1.0)),
+)
+"""What every policy walks: time [s], velocity ahead and to the left [m/s], turn [rad/s]."""
+PROFILE_S: Final = 17.0
+HELDOUT: Final = (
+    (0.0, (0.0, 0.0, 0.0)),
+    (1.0, (0.5, 0.0, 0.0)),
+    (4.0, (0.3, 0.0, 0.3)),
+    (6.0, (0.0, -0.2, 0.0)),
+)
+"""What only judges the calibration; gentle, or every second robot falls (docs/how-to/training.md)."""
+HELDOUT_S: Final = 8.0
+
+
+def write_script(path: Path, script: Script) -> Path:
+    """Write velocities as ``deploy --velocity`` reads them; return the file."""
+    rows = [",".join(f"{value:g}" for value in (time_s, *velocity)) for time_s, velocity in script]
+    path.write_text("\n".join(("time_s,x,y,yaw", *rows)) + "\n", encoding="utf-8")
+    return path

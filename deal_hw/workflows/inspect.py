@@ -1,0 +1,216 @@
+"""``deal_hw.inspect``: the real, the nominal and the calibrated motion beside each other."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Protocol
+
+from deal_hw.calibration import CalibrationResult, read_result
+from deal_hw.data.recording.reader import Episode, read_episode
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import recorded_description
+from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
+from deal_hw.sim.recordings.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
+from deal_hw.workflows.options import Checked, File, Range, from_settings
+from deal_hw.workflows.say import html_table
+
+
+class HasResult(Protocol):
+    """What a calibration has to be shown; :class:`~deal_hw.workflows.calibrate.Calibration`."""
+
+    @property
+    def result(self) -> CalibrationResult:
+        """What was found."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectSettings(Checked):
+    """Settings of :func:`inspect`."""
+
+    episode: File = field(kw_only=False)
+    """The recording, such as runs/first/dataset/episodes/000000.mcap."""
+
+    calibration: File | CalibrationResult | HasResult | None = None
+    """Result of `deal-hw calibrate` to show beside it: the folder, or its result.json. From Python also what
+    :func:`deal_hw.calibrate` returned."""
+
+    window: Annotated[float, Range(1e-3, 600, "s")] = DEFAULT_WINDOW_S
+    """Predictions restart from the measured state after this time [s]."""
+
+    latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
+    """Total latency in the predictions [s]; by default the calibration's, or 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """A recording with predictions beside it.
+
+    Attributes:
+        path: The recording.
+        episode: What is in it.
+        description: The robot.
+        result: The calibration that is shown; None where none is.
+        overlay: The predictions; None where the recording allows none.
+        note: Why there is none; empty otherwise.
+    """
+
+    path: Path
+    episode: Episode
+    description: RobotDescription
+    result: CalibrationResult | None
+    overlay: Overlay | None
+    note: str
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """Return a row a model: its name, and each joint's RMSE of position over the signal's range."""
+        if self.overlay is None:
+            return []
+        return [
+            {
+                "model": name,
+                **dict(zip(self.overlay.joint_names, map(float, prediction.position_nrmse), strict=True)),
+            }
+            for name, prediction in self.overlay.predictions.items()
+        ]
+
+    def table(self) -> str:
+        """Return what the predictions are off, as text."""
+        if self.overlay is None:
+            return self.note
+        lines = []
+        for name, prediction in self.overlay.predictions.items():
+            shares = ", ".join(
+                f"{joint} {100 * share:.2g} %"
+                for joint, share in zip(self.overlay.joint_names, prediction.position_nrmse, strict=True)
+            )
+            window_s = self.overlay.window_s
+            lines.append(f"{name:>10}: position error over {window_s:.2f} s, of the range: {shares}")
+        return "\n".join(lines)
+
+    def save(self, path: File) -> Path:
+        """Write a rerun recording (.rrd) and return its path.
+
+        Raises:
+            ConfigurationError: The path is a folder.
+        """
+        from deal_hw.viz.episode_log import write_episode
+
+        path = Path(path)
+        if path.is_dir():
+            raise ConfigurationError(f"{path} is a folder; name a file, such as {path / 'episode.rrd'}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_episode(
+            path,
+            self.episode.trajectory,
+            self.description,
+            cycles=self.episode.cycles,
+            overlay=self.overlay,
+            result=self.result,
+            name=f"{self.path.parent.parent.name}/{self.path.stem}",
+            note=self.note,
+        )
+        return path
+
+    def screenshot(self, path: File, at_s: float | None = None, *, rrd: Path | None = None) -> Path:
+        """Write a picture (.png) and return its path; needs a Vulkan renderer, but no desktop.
+
+        Args:
+            path: The file.
+            at_s: Device time that it shows [s]; by default where the nominal model errs most.
+            rrd: What :meth:`save` wrote, where that was called.
+        """
+        from deal_hw.viz.screenshot import save_screenshot
+
+        if at_s is None and self.overlay is not None:
+            at_s = self.overlay.worst_moment_s("nominal")
+        with self.saved(rrd) as file:
+            save_screenshot(file, Path(path), at_s=at_s)
+        return Path(path)
+
+    def show(self) -> None:
+        """Open a window.
+
+        Raises:
+            ConfigurationError: This machine has no desktop.
+        """
+        from deal_hw.viz.serve import check_display, open_window
+
+        check_display()
+        with self.saved() as file:
+            open_window(file)
+
+    @contextmanager
+    def saved(self, rrd: Path | None = None) -> Iterator[Path]:
+        """Yield a rerun recording: the one given, or a temporary one."""
+        if rrd is not None:
+            yield rrd
+            return
+        with tempfile.TemporaryDirectory(prefix="deal-hw-") as folder:
+            yield self.save(Path(folder) / "episode.rrd")
+
+    def _repr_html_(self) -> str:
+        rows = self.rows()
+        cells = [[v if isinstance(v, str) else f"{100 * v:.2g} %" for v in row.values()] for row in rows]
+        return html_table(list(rows[0]), cells) if rows else html_table((self.note,), [])
+
+
+@from_settings(InspectSettings)
+def inspect(settings: InspectSettings) -> Inspection:
+    """Predict a recording with the nominal and the calibrated model; what ``deal-hw inspect`` does.
+
+    The arguments are those of :class:`InspectSettings`, which has a text under each: ``inspect(episode,
+    calibration="runs/first/calibration")``.
+
+    Returns:
+        The predictions; it shows, saves and pictures them.
+
+    Raises:
+        DatasetError: The recording cannot be read.
+        ConfigurationError: A setting cannot be used.
+    """
+    path = Path(settings.episode)
+    return predicted(settings, path, read_episode(path))
+
+
+def predicted(settings: InspectSettings, path: Path, episode: Episode) -> Inspection:
+    """Return a recording with predictions; see :func:`inspect`."""
+    description = recorded_description(str(episode.description["name"]))
+    result = _result(settings.calibration)
+    overlay, note = _overlay(settings, episode, description, result)
+    return Inspection(
+        path=path, episode=episode, description=description, result=result, overlay=overlay, note=note
+    )
+
+
+def _result(source: File | CalibrationResult | HasResult | None) -> CalibrationResult | None:
+    if isinstance(source, str | Path):
+        return read_result(Path(source))
+    return source if source is None or isinstance(source, CalibrationResult) else source.result
+
+
+def _overlay(
+    settings: InspectSettings,
+    episode: Episode,
+    description: RobotDescription,
+    result: CalibrationResult | None,
+) -> tuple[Overlay | None, str]:
+    space = ParameterSpace([]) if result is None else result.space
+    sets = {"nominal": space.nominal}
+    if result is not None:
+        sets["calibrated"] = result.estimate
+    latency_s = settings.latency
+    if latency_s is None:
+        latency_s = 0.0 if result is None else result.latency_s
+    try:
+        overlay = compute_overlay(
+            episode.trajectory, description, space, sets, latency_s=latency_s, window_s=settings.window
+        )
+    except InsufficientDataError as err:
+        return None, f"No predictions: {err}."
+    return overlay, ""

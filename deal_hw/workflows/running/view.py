@@ -1,0 +1,70 @@
+"""What a run tells and asks while it goes on; the command line shows it on a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+from deal_hw.control.process_channel import Beat
+from deal_hw.workflows.say import Say, aloud, silent
+
+if TYPE_CHECKING:
+    from deal_hw.workflows.design_excitation import ExcitationReport
+    from deal_hw.workflows.running.report import EpisodeReport
+
+OnBeat = Callable[[Beat], None]
+"""Called with each heartbeat of the control process, in the thread that waits for it."""
+
+
+def ignore(beat: Beat) -> None:
+    """Do nothing with a heartbeat."""
+
+
+class RunView:
+    """Tells sentences alone and asks nobody.
+
+    Args:
+        say: Called with each sentence.
+        warn: Called with what the operator must know, such as a robot that is to be switched off by hand;
+            ``say`` by default.
+    """
+
+    def __init__(self, say: Say = silent, warn: Say | None = None) -> None:
+        self._say, self._warn = say, warn or say
+
+    @classmethod
+    def of_python(cls, say: Say) -> RunView:
+        """Return the view of a program that named a ``say``; where it named none, warnings are told aloud."""
+        return cls(say, aloud if say is silent else say)
+
+    def warn(self, text: str) -> None:
+        """Tell what the operator must know."""
+        self._warn(text)
+
+    def note(self, text: str) -> None:
+        """Tell what is good to know."""
+        self._say(text)
+
+    def progress(self, title: str, seconds: float) -> AbstractContextManager[OnBeat]:
+        """Show how far an episode of so many seconds is [s]."""
+        return contextlib.nullcontext(ignore)
+
+    def notify(self, done: int, total: int, text: str) -> None:
+        """Show how far the search for a motion is."""
+
+    def designed(self, robot: str, report: ExcitationReport) -> None:
+        """Tell which motion was found for a robot."""
+        self._say(report.plan.words)
+
+    def ended(self, report: EpisodeReport) -> None:
+        """Tell how an episode ended."""
+        for line in report.lines():
+            self._say(line)
+        for warning in report.warnings:
+            self.warn(f"warning: {warning}")
+
+    def confirm(self, warning: str, question: str) -> bool | None:
+        """Ask the operator; None where nobody is there to answer."""
+        return None

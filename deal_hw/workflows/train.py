@@ -1,0 +1,390 @@
+"""``deal_hw.train``: train a policy under a parameter distribution."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterDistribution, ParameterSpace
+from deal_hw.policy import VERDICT
+from deal_hw.reading import read_json, reading
+from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
+from deal_hw.workflows.options import Checked, File, Range, Seed, from_settings
+from deal_hw.workflows.say import html_table, text_table
+
+if TYPE_CHECKING:
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+POLICY_FILE = Path("policies") / "policy.onnx"
+
+
+class Calibrated(Protocol):
+    """What a calibration has to train a policy under; :class:`~deal_hw.workflows.calibrate.Calibration`."""
+
+    @property
+    def distribution(self) -> ParameterDistribution:
+        """What is known of the parameters."""
+        ...
+
+    @property
+    def colour(self) -> str:
+        """Whether it can be used."""
+        ...
+
+
+def unseen(status: TrainingStatus) -> None:
+    """Show nothing of a training."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(Checked):
+    """Settings of :func:`train`."""
+
+    robot: str = field(default="cartpole", kw_only=False)
+    """The robot."""
+
+    distribution: File | ParameterDistribution | Calibrated | None = None
+    """distribution.json of a calibration: parameters, their uncertainty, latency. From Python also a
+    distribution or what :func:`deal_hw.calibrate` returned."""
+
+    udr: bool = False
+    """Train under uniform domain randomisation instead: every parameter within a factor of its nominal value
+    (5; for the Go2 1.75)."""
+
+    nominal: bool = False
+    """Train under the model's own values instead; latency as with --udr."""
+
+    trainer: str | None = None
+    """ppo or sac; by default what the robot's shipped policy was trained with."""
+
+    out: File = Path("runs") / "train"
+    """The .onnx file to write, or a run folder, which gets policies/policy.onnx. Checkpoint (.safetensors),
+    record (.json) and TensorBoard's files go beside it."""
+
+    start: File | None = None
+    """A checkpoint (.safetensors) to fine-tune: its networks are where training starts."""
+
+    resume: bool = False
+    """Go on where the training that wrote this --out was stopped."""
+
+    steps: Annotated[int | None, Range(1, 10**9)] = None
+    """Environment steps; by default what the shipped policy was trained with."""
+
+    members: Annotated[int | None, Range(1, 100_000)] = None
+    """Robots simulated at once; by default what the shipped policy was trained with."""
+
+    seed: Seed = 0
+    """Decides everything random."""
+
+    progress: TrainingProgress = unseen
+    """From Python: called with how far it is, after each update."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """What a training made.
+
+    Attributes:
+        policy: The policy, read back from its file.
+        path: The .onnx file.
+        record: The .json file of how it was made.
+        checkpoint: The .safetensors file that a training can go on from.
+        status: How far it came; None where it ended before the first update.
+    """
+
+    policy: OnnxPolicy
+    path: Path
+    record: Path
+    checkpoint: Path
+    status: TrainingStatus | None
+
+    def table(self) -> str:
+        """Return how far the training came and its files, as text."""
+        return text_table(("training", ""), self._cells())
+
+    def _repr_html_(self) -> str:
+        return html_table(("training", ""), self._cells())
+
+    def _cells(self) -> list[tuple[str, Any]]:
+        status = self.status
+        reached = (
+            {} if status is None else {"steps": status.steps, "mean return": f"{status.mean_return:.4g}"}
+        )
+        measures = {} if status is None else {n: f"{v:.4g}" for n, v in status.measures.items()}
+        files = {"policy": self.path, "record": self.record, "checkpoint": self.checkpoint}
+        return list({**reached, **measures, **files}.items())
+
+
+class InterruptedTrainingError(KeyboardInterrupt):
+    """Ctrl-C, or a request to end; what there is of the policy was written.
+
+    A ``KeyboardInterrupt``: who trains must not go on to deploy what is half trained.
+
+    Attributes:
+        training: What was written.
+    """
+
+    def __init__(self, training: Training) -> None:
+        super().__init__("stopped before the end")
+        self.training = training
+
+
+@from_settings(TrainSettings)
+def train(settings: TrainSettings) -> Training:
+    """Train a policy under a calibrated distribution; what ``deal-hw train`` does.
+
+    The arguments are those of :class:`TrainSettings`, which has a text under each, and ``deal-hw train
+    --help`` shows them: ``train("cartpole", distribution=deal_hw.calibrate(...), out="runs/first")``.
+
+    Returns:
+        The policy and its files.
+
+    Raises:
+        InterruptedTrainingError: Ctrl-C, or a request to end: what there is was written.
+        ConfigurationError: Not exactly one distribution was asked for, it cannot be read, or there is nothing
+            to go on from.
+        UnknownNameError: There is no such robot or trainer.
+        TrainingError: The training diverged, or a checkpoint does not fit.
+    """
+    return run(settings, settings.progress)
+
+
+def run(config: TrainSettings, progress: TrainingProgress) -> Training:
+    """Train a policy, as :func:`train`, and show how far it is."""
+    out = Path(config.out)
+    path = out if out.suffix == ".onnx" else out / POLICY_FILE
+    distribution, verdict = _distribution(config)
+    checkpoint = path.with_suffix(".safetensors")
+    if config.resume and config.start is not None:
+        raise ConfigurationError("--start and --resume exclude each other: leave one of them out")
+    if config.resume and not checkpoint.exists():
+        raise ConfigurationError(
+            f"nothing to resume: {checkpoint} does not exist; leave out --resume, or give the --out of the "
+            "training that was stopped"
+        )
+    reached: list[TrainingStatus] = []
+
+    def follow(status: TrainingStatus) -> None:
+        reached[:] = [status]
+        progress(status)
+
+    with _stopped_by_signal() as stopped:
+        files = TrainingFiles(
+            checkpoint=checkpoint,
+            start=None if config.start is None else Path(config.start),
+            resume=config.resume,
+            log=path.with_name(path.stem + "_tensorboard"),
+            stop=lambda: bool(stopped),
+        )
+        policy = train_policy(
+            config.robot,
+            distribution,
+            path,
+            trainer=config.trainer,
+            seed=config.seed,
+            steps=config.steps,
+            members=config.members,
+            progress=follow,
+            files=files,
+            verdict=verdict,
+        )
+    training = Training(
+        policy=policy,
+        path=path,
+        record=path.with_suffix(".json"),
+        checkpoint=checkpoint,
+        status=reached[0] if reached else None,
+    )
+    if stopped:
+        raise InterruptedTrainingError(training)
+    return training
+
+
+def train_policy(
+    robot: str,
+    distribution: ParameterDistribution,
+    path: Path,
+    *,
+    trainer: str | None = None,
+    seed: int = 0,
+    steps: int | None = None,
+    members: int | None = None,
+    progress: TrainingProgress | None = None,
+    files: TrainingFiles | None = None,
+    verdict: str = "",
+) -> OnnxPolicy:
+    """Train a policy and write it with its training record.
+
+    Args:
+        robot: The robot's name.
+        distribution: What parameters and latency are drawn from.
+        path: The .onnx file; the record goes beside it.
+        trainer: The trainer's name; None for the robot's usual one.
+        seed: Decides everything random.
+        steps: Environment steps; None for the default.
+        members: Robots simulated at once; None for the default.
+        progress: Called as the training goes on.
+        files: Checkpoint, TensorBoard files, and the word to stop.
+        verdict: Colour of the calibration that the distribution is of; "" where it is of none.
+
+    Returns:
+        The policy, read back from its file.
+    """
+    import dataclasses
+    import inspect
+
+    from deal_hw.drivers import recorded_description
+    from deal_hw.policies.onnx_export import export_network
+    from deal_hw.policies.tasks import training_task
+
+    task = training_task(robot)
+    teacher, config = task.trainer_and_config(trainer, steps)
+    env = task.make(recorded_description(robot), distribution, members or task.members[teacher.name])
+    # Where it cannot be written that is known now and not after the training.
+    path.parent.mkdir(parents=True, exist_ok=True)
+    started, cpu = time.monotonic(), time.process_time()
+    reached: list[TrainingStatus] = []
+
+    def follow(status: TrainingStatus) -> None:
+        reached[:] = [status]
+        if progress is not None:
+            progress(status)
+
+    spent = _spent(path.with_suffix(".json")) if files is not None and files.resume else {}
+    policy = teacher.train(env, config, np.random.default_rng(seed), follow, files)
+    record = {
+        "format": "deal_hw.training/1",
+        "robot": robot,
+        "seed": seed,
+        "training": dict(policy.spec.training),
+        "task": dataclasses.asdict(env.task),
+        "reward": inspect.cleandoc(type(env).__doc__ or "").partition("\n\nArgs:")[0],
+        "distribution": distribution.to_json(),
+        "distribution_digest": distribution.digest(),
+        "spec_digest": policy.spec.digest(),
+        "reached": dataclasses.asdict(reached[0]) if reached else {},
+        "started_from": str(files.start or "") if files is not None else "",
+        "seconds": spent.get("seconds", 0.0) + time.monotonic() - started,
+        "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
+        "resumed": bool(spent),
+    }
+    # Who deploys the policy is told what the calibration's verdict was.
+    training = {**policy.spec.training, **({VERDICT: verdict} if verdict else {})}
+    return export_network(policy.network, dataclasses.replace(policy.spec, training=training), path, record)
+
+
+def _spent(record: Path) -> dict[str, float]:
+    """Return what the training that is resumed had taken, by its record; nothing where there is none."""
+    if not record.exists():
+        return {}
+    values = read_json(
+        record, dict[str, Any], "a training record", "`deal-hw train` writes it", error=ConfigurationError
+    )
+    return {name: float(values[name]) for name in ("seconds", "cpu_seconds")}
+
+
+def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
+    """Return what to train under, and the colour of the calibration that it is of; "" where it is of none."""
+    wanted = {
+        "--distribution": config.distribution is not None,
+        "--udr": config.udr,
+        "--nominal": config.nominal,
+    }
+    given = [name for name, is_given in wanted.items() if is_given]
+    if len(given) > 1:
+        raise ConfigurationError(f"{' and '.join(given)} exclude each other: leave one of them")
+    if not given:
+        raise ConfigurationError(
+            "say under what to train: --distribution FILE (`deal-hw calibrate` writes it), --udr or --nominal"
+        )
+    source = config.distribution
+    if source is None:
+        return udr_distribution(config.robot) if config.udr else nominal_distribution(config.robot), ""
+    if isinstance(source, ParameterDistribution):
+        return source, ""
+    if isinstance(source, str | Path):
+        return read_distribution(Path(source)), _verdict(Path(source))
+    return source.distribution, source.colour
+
+
+def udr_distribution(robot: str) -> ParameterDistribution:
+    """Return the distribution of uniform domain randomisation.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    from deal_hw.policies.tasks import training_task
+
+    task = training_task(robot)
+    return ParameterDistribution.uniform(_space(robot).with_ratio(task.udr_ratio), task.udr_latency_s)
+
+
+def nominal_distribution(robot: str) -> ParameterDistribution:
+    """Return the distribution of the model's own values; only the latency is drawn.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+    """
+    from deal_hw.policies.tasks import training_task
+
+    task, space = training_task(robot), _space(robot)
+    K = len(space)
+    return ParameterDistribution(
+        space=space, mean=space.nominal, covariance=np.zeros((K, K)), latency_s=task.udr_latency_s
+    )
+
+
+def read_distribution(path: Path) -> ParameterDistribution:
+    """Read what a calibration wrote.
+
+    Raises:
+        ConfigurationError: There is no such file, or it holds no distribution.
+    """
+    what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
+    values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
+    with reading(path, what, advice, error=ConfigurationError):
+        return ParameterDistribution.from_json(values)
+
+
+def _verdict(path: Path) -> str:
+    """Return the colour that the calibration noted beside its distribution; "" where there is none."""
+    what, advice = "a parameter distribution", "`deal-hw calibrate` writes calibration/distribution.json"
+    values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
+    return str(values.get("verdict", ""))
+
+
+def _space(robot: str) -> ParameterSpace:
+    from deal_hw.drivers import parameter_spaces
+
+    return next(iter(parameter_spaces(robot).values()))()
+
+
+@contextlib.contextmanager
+def _stopped_by_signal() -> Iterator[list[int]]:
+    """Yield a list that the first SIGINT or SIGTERM goes into; a second one acts as usual."""
+    seen: list[int] = []
+    try:
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def note(number: int, frame: Any) -> None:
+            seen.append(number)
+            signal.signal(number, before[signal.Signals(number)])
+
+        for number in before:
+            signal.signal(number, note)
+    except ValueError:
+        # Not the main thread: signals are somebody else's.
+        before = {}
+    try:
+        yield seen
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

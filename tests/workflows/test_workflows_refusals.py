@@ -1,0 +1,225 @@
+"""Python and the command line refuse the same with the same words: one table for both."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import deal_hw
+from deal_hw.cli.main import EXIT_ERROR, main
+from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
+from deal_hw.workflows.emulation.process import arguments
+from deal_hw.workflows.options import option
+
+POSITIONAL = ("robot", "episode")
+CARTPOLE: dict[str, Any] = {"robot": "cartpole", "port": "no-port"}
+COLLECT = {**CARTPOLE, "out": "out"}
+SWEEP = {"robot": "cartpole", "out": "e.json"}
+WALK = deal_hw.LegOptions(velocity="0.3,0,0")
+
+TABLE: list[tuple[str, dict[str, Any], str]] = [
+    ("collect", {**COLLECT, "robot": "go3"}, "unknown robot 'go3'; known: "),
+    ("collect", {**COLLECT, "seconds": 0.0}, "--seconds 0.0 s: allowed are 0.02 to 3600 s"),
+    ("collect", {**COLLECT, "seconds": math.nan}, "--seconds nan s: allowed are"),
+    ("collect", {**COLLECT, "seed": -1}, "--seed -1: allowed are 0 to"),
+    ("collect", {**COLLECT, "profile": "jump"}, "unknown profile 'jump'; known: rich, chirp, balance, hold"),
+    ("collect", {**COLLECT, "excite": "sine"}, "sine"),
+    ("collect", {**COLLECT, "excite": "chirp", "profile": "hold"}, "--profile would have no effect"),
+    (
+        "collect",
+        {**COLLECT, "profile": "chirp", "excitation_level": 1.0},
+        "--excitation-level would have no effect",
+    ),
+    ("collect", {**COLLECT, "legs": WALK}, "--velocity would have no effect: only robots with legs"),
+    ("collect", {**COLLECT, "link": deal_hw.LinkOptions(transport="dds")}, "dds"),
+    ("collect", CARTPOLE, "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
+    ("collect", {**COLLECT, "dataset": "d"}, "give --out RUN or --dataset DIR, not both"),
+    ("collect", COLLECT, "no-port"),
+    ("deploy", {**CARTPOLE, "robot": "so101"}, "so101"),
+    ("deploy", {**CARTPOLE, "policy": "none.onnx"}, "none.onnx"),
+    ("deploy", {**CARTPOLE, "episodes": 0}, "--episodes 0: allowed are 1 to 10000"),
+    ("deploy", CARTPOLE, "no-port"),
+    ("replay", {"episode": "none.mcap", "port": "no-port"}, "none.mcap"),
+    ("train", {}, "say under what to train: --distribution FILE"),
+    ("train", {"udr": True, "nominal": True}, "--udr and --nominal exclude each other"),
+    ("train", {"robot": "go3", "udr": True}, "unknown robot with a training environment 'go3'; known: ant"),
+    ("train", {"udr": True, "trainer": "dqn"}, "dqn"),
+    ("train", {"udr": True, "steps": 0}, "--steps 0: allowed are 1 to"),
+    ("train", {"distribution": "none.json"}, "none.json cannot be read"),
+    (
+        "train",
+        {"udr": True, "resume": True, "out": "out"},
+        "nothing to resume: out/policies/policy.safetensors",
+    ),
+    ("excite", {**SWEEP, "family": "noise"}, "unknown family 'noise'; known: optimal, multisine"),
+    ("excite", {**SWEEP, "amplitude": 0.5}, "--amplitude would have no effect: --family optimal"),
+    ("excite", {**SWEEP, "family": "chirp", "low_hz": 5.0, "high_hz": 1.0}, "--low-hz 5 must be below"),
+    ("excite", {**SWEEP, "space": "k99"}, "unknown parameter set 'k99'; known: "),
+    ("inspect", {"episode": "none.mcap"}, "none.mcap cannot be read"),
+    ("inspect", {"episode": "none.mcap", "window": 0.0}, "--window 0.0 s: allowed are 0.001 to 600 s"),
+    (
+        "doctor",
+        {"robot": "cartpole"},
+        "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`",
+    ),
+    ("doctor", {"seconds": 0.0}, "--seconds 0.0 s: allowed are 0.5 to 600 s"),
+    ("emulate", {"robot": "so101"}, "unknown robot to emulate 'so101'; known: cartpole, go2"),
+    (
+        "emulate",
+        {"robot": "go2", "transport": "can"},
+        "unknown transport to emulate on 'can'; known: dds, zenoh",
+    ),
+    (
+        "emulate",
+        {"robot": "cartpole", "profile": "perfect"},
+        "unknown profile 'perfect'; known: ideal, sensor",
+    ),
+    ("emulate", {"robot": "cartpole", "range_ratio": 0.5}, "--range-ratio 0.5: allowed are 1.001 to 1000"),
+    ("emulate", {"robot": "cartpole", "port": "lo"}, "emulate cartpole on serial has no --port"),
+    ("emulate", {"robot": "cartpole", "nominal": True, "truth_from": "t.json"}, "--nominal and --truth-from"),
+]
+"""Verb, arguments, and words of the refusal."""
+
+MODEL = {"model": "m.xml", "data": ["r.csv"]}
+ON_MODEL = "--model m.xml --data r.csv"
+CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
+    ({}, "", "in Python dataset=..., or model=... and data=[...]"),
+    ({**MODEL, "dataset": "d"}, f"d {ON_MODEL}", "not both"),
+    ({"dataset": "d", "data": ["r.csv"]}, "d --data r.csv", "--data would have no effect: a dataset says it"),
+    ({"dataset": "d", "feet": ["FL"]}, "d --feet FL", "--feet would have no effect: a dataset says it"),
+    (
+        {"dataset": "d", "holdout": ["r.csv"]},
+        "d --holdout r.csv",
+        "--holdout r.csv: of a dataset name episodes",
+    ),
+    ({"dataset": "d", "method": "gradient"}, "d --method gradient", "gradient"),
+    (
+        {"dataset": "d", "method": "eki", "policy": "p.onnx"},
+        "d --method eki --policy p.onnx",
+        "runs no policy",
+    ),
+    ({"dataset": "d", "latency_s": 2.0}, "d --latency 2", "--latency 2.0 s: allowed are 0 to"),
+    (
+        {"dataset": "d", "latency_s": 0.01, "latency_range_s": (0.0, 0.01)},
+        "d --latency 0.01 --latency-range 0 0.01",
+        "--latency-range would have no effect: --latency says the latency",
+    ),
+    (
+        {"dataset": "d", "latency_range_s": (0.02, 0.01)},
+        "d --latency-range 0.02 0.01",
+        "give the lower one first",
+    ),
+    (
+        {"dataset": "d", "range_ratio": 0.5},
+        "d --range-ratio 0.5",
+        "--range-ratio 0.5: allowed are 1.001 to 1000",
+    ),
+    ({"dataset": "d", "population": 1}, "d --population 1", "--population 1: allowed are 2 to"),
+    ({"dataset": "d", "seed": -1}, "d --seed -1", "--seed -1: allowed are 0 to"),
+    ({"dataset": "d"}, "d", "d "),
+    (
+        {**MODEL, "episodes": [0]},
+        f"{ON_MODEL} --episodes 0",
+        "--episodes would have no effect: only datasets",
+    ),
+    (
+        {**MODEL, "sample_hz": 50.0},
+        f"{ON_MODEL} --sample-hz 50",
+        "--sample-hz would have no effect: only data",
+    ),
+    ({"dataset": "d", "force": True}, "d --force", "--force would have no effect: a dataset says it"),
+    ({**MODEL, "window_s": 0.0}, f"{ON_MODEL} --window 0", "--window 0.0 s: allowed are 0.001 to 60 s"),
+    ({**MODEL, "physics_step_s": 1.0}, f"{ON_MODEL} --physics-step 1", "--physics-step 1.0 s: allowed are"),
+    ({**MODEL, "space": "k9"}, f"{ON_MODEL} --space k9", "--space would have no effect: only datasets"),
+    (
+        {**MODEL, "method": "deal-paper"},
+        f"{ON_MODEL} --method deal-paper",
+        "which recordings of --model do not",
+    ),
+    ({"model": "m.xml"}, "--model m.xml", "--model needs recordings to fit: --data rec.csv"),
+    (
+        {**MODEL, "holdout": ["o.csv"], "holdout_part": 0.5},
+        f"{ON_MODEL} --holdout o.csv --holdout-part 0.5",
+        "give --holdout or --holdout-part, not both",
+    ),
+    (
+        {**MODEL, "holdout_part": 1.0},
+        f"{ON_MODEL} --holdout-part 1",
+        "--holdout-part 1.0: allowed are 0 to 0.95",
+    ),
+    ({**MODEL, "holdout": ["r.csv"]}, f"{ON_MODEL} --holdout r.csv", "is to be fitted and held out"),
+    (MODEL, ON_MODEL, "m.xml"),
+]
+"""Arguments in Python, on the command line, and words of the refusal."""
+
+
+def as_words(verb: str, given: dict[str, Any]) -> list[str]:
+    """Return the command line that says the same as arguments in Python."""
+    words = [verb]
+    for name, value in given.items():
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            words += arguments(value, type(value)())
+        elif name in POSITIONAL:
+            words.append(value)
+        else:
+            words += [option(name)] if value is True else [option(name), str(value)]
+    return words
+
+
+ROWS = [
+    *((verb, given, as_words(verb, given), words) for verb, given, words in TABLE),
+    *(("calibrate", given, ["calibrate", *line.split()], words) for given, line, words in CALIBRATE),
+]
+
+
+@pytest.mark.parametrize(
+    ("verb", "given", "line", "words"), ROWS, ids=[f"{verb} {words[:40]}" for verb, *_, words in ROWS]
+)
+def test_both_refuse_with_the_same_words(
+    verb: str,
+    given: dict[str, Any],
+    line: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One line on standard error is what Python raises, word by word; nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DealHwError) as raised:
+        getattr(deal_hw, verb)(**given)
+    assert words in str(raised.value)
+    assert main(line) == EXIT_ERROR
+    told = capsys.readouterr()
+    assert told.err == f"deal-hw: error: {raised.value}\n"
+    assert not told.out and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", sorted({verb for verb, _, _ in TABLE}))
+def test_a_function_takes_the_options_of_its_verb(verb: str) -> None:
+    """Its signature is that of the settings; an unknown name is answered with the known ones."""
+    function = getattr(deal_hw, verb)
+    names = set(inspect.signature(function).parameters)
+    assert names >= {name for row, given, _ in TABLE if row == verb for name in given}
+    assert f"deal-hw {verb}" in function.__doc__
+    with pytest.raises(UnknownNameError, match=f"unknown argument of {verb} 'nosuch'; known: "):
+        function(nosuch=1)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"seconds": "long"}, "--seconds 'long' is no number: allowed are 0.02 to 3600 s"),
+        ({"seconds": None}, "--seconds None is no number: allowed are"),
+        ({"episodes": 1.5}, "--episodes 1.5 is no whole number: allowed are 1 to 10000"),
+    ],
+)
+def test_what_only_python_can_say_is_refused(given: dict[str, Any], words: str) -> None:
+    """Text, nothing and halves where a number is asked for."""
+    with pytest.raises(ConfigurationError, match=words):
+        deal_hw.collect(**COLLECT, **given)

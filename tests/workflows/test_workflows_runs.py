@@ -1,0 +1,174 @@
+"""Runs of a robot from Python: what comes back, what is told, and that nothing is printed."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import deal_hw
+from deal_hw.control.loop import Outcome
+from deal_hw.drivers.cartpole.description import k9_space
+from deal_hw.errors import ConfigurationError, PolicyMismatchError, TransportError
+from deal_hw.parameters import ParameterDistribution
+from deal_hw.policy import VERDICT
+from deal_hw.workflows.emulation.process import arguments
+from deal_hw.workflows.emulation.settings import CanOptions, EmulateSettings, Go2Options
+from deal_hw.workflows.running.report import EpisodeReport
+from deal_hw.workflows.running.view import RunView
+from deal_hw.workflows.say import silent
+from deal_hw.workflows.shipped import required_policy
+
+ROOT = Path(__file__).resolve().parents[2]
+SECONDS = 0.6
+
+
+def test_a_robot_is_emulated_recorded_and_replayed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Paths, outcome and truth come back; sentences go to `say` alone; a path may be a string."""
+    said: list[str] = []
+    with deal_hw.emulate("cartpole", nominal=True, profile="sensor", seed=3) as robot:
+        port = robot.port
+        assert port in repr(robot) and not robot.truth
+        run = deal_hw.collect(
+            "cartpole", port=port, out=str(tmp_path), profile="hold", seconds=SECONDS, say=said.append
+        )
+        again = deal_hw.replay(run.paths[0], port=port, dataset=str(tmp_path / "again"))
+        dry = deal_hw.deploy("cartpole", port=port, seconds=SECONDS, dry_run=True)
+    assert run.outcome is again.outcome is dry.outcome is Outcome.FINISHED
+    assert run.dataset == tmp_path / "dataset" and run.paths[0].is_file()
+    assert again.paths[0].parent == tmp_path / "again" / "episodes" and dry.paths == ()
+    assert any("too short for `deal-hw calibrate`" in text for text in said)
+    assert "finished: the run is over" in said
+    for shown in (run._repr_html_(), run.table()):
+        assert str(run.paths[0]) in shown and "finished" in shown
+    assert robot.truth["seed"] == 3 and robot.truth["parameters"]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureFixture[str]) -> None:
+    """What the operator must know goes to standard error, unless the program takes sentences itself."""
+    lost = EpisodeReport(
+        path=None,
+        outcome=Outcome.TRIPPED,
+        reason="the link is gone",
+        passive_confirmed=False,
+        loop_timing=None,
+        clipped={},
+        cycles_sent=0,
+        states_recorded=0,
+        warnings=("switch it off by hand",),
+    )
+    said: list[str] = []
+    for view in (RunView.of_python(silent), RunView.of_python(said.append), RunView()):
+        view.ended(lost)
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", "warning: switch it off by hand\n")
+    assert said == ["tripped: the link is gone", "warning: switch it off by hand"]
+
+
+def test_a_policy_for_another_robot_is_refused_before_the_port(tmp_path: Path) -> None:
+    """As on the command line: the error is that of the policy, not of a port that is not there."""
+    with pytest.raises(PolicyMismatchError):
+        deal_hw.deploy("cartpole", port=str(tmp_path / "none"), policy=required_policy("go2"))
+
+
+def test_an_emulator_that_does_not_start_says_why(tmp_path: Path) -> None:
+    """Its own words come with the error."""
+    missing = tmp_path / "truth.json"
+    with pytest.raises(TransportError, match=r"did not start: .*truth\.json cannot be read"):
+        deal_hw.emulate("cartpole", truth_from=missing).start()
+    with pytest.raises(
+        ConfigurationError, match="--reveal would have no effect: the robot's attribute truth"
+    ):
+        deal_hw.emulate("cartpole", reveal=True)
+    with pytest.raises(ConfigurationError, match="--parent would have no effect"):
+        deal_hw.emulate("cartpole", parent=1)
+
+
+def test_settings_become_options_of_the_command_line() -> None:
+    """What differs from the defaults, switches that are off among it, and groups inside."""
+    settings = EmulateSettings(
+        "cartpole", transport="can", seed=2, nominal=True, can=CanOptions(node=3, no_acknowledge=True)
+    )
+    assert arguments(settings, EmulateSettings("cartpole")) == [
+        "--transport",
+        "can",
+        "--seed",
+        "2",
+        "--nominal",
+        "--node",
+        "3",
+        "--no-acknowledge",
+    ]
+    go2 = EmulateSettings("go2", go2=Go2Options(remote_script=Path("r.json")))
+    assert arguments(go2, EmulateSettings("go2")) == ["--remote-script", "r.json"]
+    link = deal_hw.LinkOptions(record_wire=False)
+    assert arguments(link, deal_hw.LinkOptions()) == ["--no-record-wire"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """As much of a calibration as training asks for."""
+
+    distribution: ParameterDistribution
+    colour: str
+
+
+def test_a_policy_is_trained_under_what_a_calibration_found(tmp_path: Path) -> None:
+    """The result itself instead of its file: the policy carries digest and verdict."""
+    space = k9_space()
+    distribution = ParameterDistribution(
+        space=space, mean=space.nominal, covariance=0.01 * np.eye(len(space)), latency_s=(0.01, 0.012)
+    )
+    reached: list[int] = []
+    training = deal_hw.train(
+        "cartpole",
+        distribution=Found(distribution, "amber"),
+        out=str(tmp_path),
+        steps=1_200,
+        members=8,
+        progress=lambda status: reached.append(status.steps),
+    )
+    spec = training.policy.spec
+    assert spec.trained_under == distribution.digest() and spec.training[VERDICT] == "amber"
+    assert training.path == tmp_path / "policies" / "policy.onnx" and training.checkpoint.is_file()
+    assert json.loads(training.record.read_text(encoding="utf-8"))["robot"] == "cartpole"
+    assert training.status is not None and training.status.steps == reached[-1] == 1_200
+    assert str(training.path) in training._repr_html_() and "mean return" in training.table()
+
+
+def test_functions_for_a_robot_load_neither_torch_nor_mujoco() -> None:
+    """The robot's own computer has neither."""
+    code = (
+        "import sys, deal_hw\n"
+        "for name in ('collect', 'deploy', 'replay', 'emulate', 'excite', 'train', 'LinkOptions'):\n"
+        "    getattr(deal_hw, name)\n"
+        "print([n for n in ('mujoco', 'torch', 'scipy', 'rich', 'tyro') if n in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told == "[]\n"
+
+
+def test_no_workflow_prints_asks_or_ends_the_program() -> None:
+    """It tells through `say`, and leaves the rest to who called it; the control process is a program."""
+    found = []
+    for path in sorted((ROOT / "deal_hw" / "workflows").rglob("*.py")):
+        if path.name in ("say.py", "control_process.py"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "print",
+                "input",
+                "exit",
+                "sys.exit",
+                "sys.stdout.write",
+                "sys.stderr.write",
+            ):
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node.func)}")
+    assert not found
