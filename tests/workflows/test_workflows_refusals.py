@@ -56,10 +56,14 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
         {"udr": True, "resume": True, "out": "out"},
         "nothing to resume: out/policies/policy.safetensors",
     ),
-    ("excite", {**SWEEP, "family": "noise"}, "unknown family 'noise'; known: optimal, multisine"),
-    ("excite", {**SWEEP, "amplitude": 0.5}, "--amplitude would have no effect: --family optimal"),
-    ("excite", {**SWEEP, "family": "chirp", "low_hz": 5.0, "high_hz": 1.0}, "--low-hz 5 must be below"),
-    ("excite", {**SWEEP, "space": "k99"}, "unknown parameter set 'k99'; known: "),
+    ("design_excitation", {**SWEEP, "family": "noise"}, "unknown family 'noise'; known: optimal, multisine"),
+    ("design_excitation", {**SWEEP, "amplitude": 0.5}, "--amplitude would have no effect: --family optimal"),
+    (
+        "design_excitation",
+        {**SWEEP, "family": "chirp", "low_hz": 5.0, "high_hz": 1.0},
+        "--low-hz 5 must be below",
+    ),
+    ("design_excitation", {**SWEEP, "space": "k99"}, "unknown parameter set 'k99'; known: "),
     ("inspect", {"episode": "none.mcap"}, "none.mcap cannot be read"),
     ("inspect", {"episode": "none.mcap", "window": 0.0}, "--window 0.0 s: allowed are 0.001 to 600 s"),
     (
@@ -160,7 +164,7 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
 
 def as_words(verb: str, given: dict[str, Any]) -> list[str]:
     """Return the command line that says the same as arguments in Python."""
-    words = [verb]
+    words = [verb.replace("_", "-")]
     for name, value in given.items():
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             words += arguments(value, type(value)())
@@ -206,7 +210,7 @@ def test_a_function_takes_the_options_of_its_verb(verb: str) -> None:
     function = getattr(deal_hw, verb)
     names = set(inspect.signature(function).parameters)
     assert names >= {name for row, given, _ in TABLE if row == verb for name in given}
-    assert f"deal-hw {verb}" in function.__doc__
+    assert f"deal-hw {verb.replace('_', '-')}" in function.__doc__
     with pytest.raises(UnknownNameError, match=f"unknown argument of {verb} 'nosuch'; known: "):
         function(nosuch=1)
 
