@@ -4,6 +4,7 @@
 - ``reference/api.md``: every public name of ``deal_hw``, then the contracts, for mkdocstrings;
 - ``reference/alarms.md``: every alarm of a calibration, from the calls that make one;
 - ``reference/errors.md``: every refusal, from tests/house/refusals.txt;
+- ``how-to/examples.md``: the files of examples/;
 - ``contributing.md`` and ``changelog.md``: CONTRIBUTING.md and CHANGELOG.md with links that hold in the site.
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
+import json
 import re
 import sys
 import warnings
@@ -301,6 +303,22 @@ def moved(name: str) -> str:
     return text.replace("](docs/", "](").replace("](CHANGELOG.md)", "](changelog.md)")
 
 
+def examples_page() -> str:
+    """Return the page of examples: each script and the notebook's cells, as they are run by the tests."""
+    lines = ["# Examples", "", "The files of `examples/`. The tests run all of them.", ""]
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        lines += [f"## {path.name}", "", "```python", path.read_text(encoding="utf-8").rstrip(), "```", ""]
+    for path in sorted((ROOT / "examples").glob("*.ipynb")):
+        lines += [f"## {path.name}", ""]
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            text = "".join(cell["source"]).rstrip()
+            if cell["cell_type"] == "code":
+                text = f"```python\n{text}\n```"
+            # A heading of the notebook stands below the file's own.
+            lines += [re.sub(r"^(#+) ", r"##\1 ", text) if text.startswith("#") else text, ""]
+    return "\n".join(lines)
+
+
 def pages() -> dict[str, str]:
     """Return every page that is made: its place in the site and its Markdown."""
     return {
@@ -308,6 +326,7 @@ def pages() -> dict[str, str]:
         "reference/api.md": api_page(),
         "reference/alarms.md": alarms_page(),
         "reference/errors.md": errors_page(REFUSALS.read_text(encoding="utf-8")),
+        "how-to/examples.md": examples_page(),
         "contributing.md": moved("CONTRIBUTING.md"),
         "changelog.md": moved("CHANGELOG.md"),
     }

@@ -58,7 +58,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     from deal_hw.calib.validation.verdict import trust
 
     table = Table(title=f"calibration by {result.method}: {result.seconds:.0f} s, chi2 {result.chi2:.3g}")
-    for name, align in (
+    for heading, align in (
         ("parameter", "left"),
         ("unit", "left"),
         ("nominal", "right"),
@@ -66,7 +66,7 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
         ("90 % interval", "left"),
         ("verdict", "left"),
     ):
-        table.add_column(name, justify="right" if align == "right" else "left")
+        table.add_column(heading, justify="right" if align == "right" else "left")
     for k, p in enumerate(result.space):
         low, high = result.interval[k]
         verdict = result.verdicts[k] if result.verdicts else "-"

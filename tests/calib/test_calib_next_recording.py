@@ -12,6 +12,7 @@ from deal_hw.calib.design.advice import menu_designs, next_recordings, next_step
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.page import render
 from deal_hw.calibration import CalibrationResult
+from deal_hw.cli.calibrate_output import print_result
 from deal_hw.cli.main import main
 from deal_hw.control.excitation_plan import read_plan
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -111,3 +112,12 @@ def test_the_command_makes_the_recording_that_was_reckoned_with(tmp_path: Path) 
             == 0
         )
         assert read_plan(out).words == name
+
+
+def test_what_is_printed_names_the_robot(capsys: pytest.CaptureFixture[str]) -> None:
+    """The command that follows a calibration is to be copied; it named the table's last column once."""
+    found = dataclasses.replace(result(k9_space(), "weak"), advice=(row("a", 0.3, "steps"),))
+    print_result(found, "record another motion", "cartpole")
+    said = capsys.readouterr().out
+    assert "deal-hw collect cartpole --excite next.json" in said
+    assert "collect verdict" not in said
