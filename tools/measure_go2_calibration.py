@@ -30,7 +30,7 @@ import numpy as np
 
 from deal_hw.bench.rows import describe_call
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
-from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
 PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
@@ -79,7 +79,7 @@ def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
                 *options.calibrate.split(),
             )
             result = json.loads((run / "calibration" / "result.json").read_text(encoding="utf-8"))
-            truth = Truth.from_json(json.loads((run / "truth.json").read_text(encoding="utf-8")))
+            truth = Go2Truth.from_json(json.loads((run / "truth.json").read_text(encoding="utf-8")))
             row |= judge(result, truth)
         except RuntimeError as error:
             row["error"] = str(error)
@@ -168,7 +168,7 @@ def verb(*words: str) -> str:
     return done.stdout.strip()
 
 
-def judge(result: dict[str, Any], truth: Truth) -> dict[str, Any]:
+def judge(result: dict[str, Any], truth: Go2Truth) -> dict[str, Any]:
     """Return how far a calibration's result is from the truth."""
     true = truth.parameters(DESCRIPTION.stiffness[0], DESCRIPTION.damping[0])
     rows: dict[str, dict[str, Any]] = {}

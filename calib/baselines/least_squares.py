@@ -50,7 +50,7 @@ class LeastSquaresSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FittedStart:
     """What a one-shot optimiser found.
 
     Attributes:
@@ -85,7 +85,7 @@ class OneShot(Stepper):
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: OneShotSearch) -> None:
         super().__init__(log, rng, search)
         self._solve = search.solve
-        self._found: Found | None = None
+        self._found: FittedStart | None = None
 
     @property
     def finished(self) -> bool:
@@ -98,7 +98,7 @@ class OneShot(Stepper):
         words = f"{found.iterations} iterations: {found.message}"
         self.log.note(words, self._members(found), {"iterations": float(found.iterations)})
 
-    def _members(self, found: Found) -> Members:
+    def _members(self, found: FittedStart) -> Members:
         return Members(found.theta[None], np.array([self.coordinates.clip_latency(found.latency_s)]))
 
     def result(self) -> CalibrationResult:
@@ -135,7 +135,9 @@ class OneShot(Stepper):
         """Continue from a saved state."""
         saved = state["found"]
         if saved is not None:
-            self._found = Found(**{**saved, "alarms": tuple(Alarm(**alarm) for alarm in saved["alarms"])})
+            self._found = FittedStart(
+                **{**saved, "alarms": tuple(Alarm(**alarm) for alarm in saved["alarms"])}
+            )
 
 
 class OneShotSearch(Search, abc.ABC):
@@ -148,7 +150,7 @@ class OneShotSearch(Search, abc.ABC):
     stepper = OneShot
 
     @abc.abstractmethod
-    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """Run the optimiser to its end."""
 
 
@@ -159,7 +161,7 @@ class LeastSquaresBaseline(OneShotSearch):
     name = "least-squares"
     settings: LeastSquaresSettings = field(default_factory=LeastSquaresSettings)
 
-    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """See :meth:`OneShotSearch.solve`."""
         latency_s = log.coordinates.clip_latency(0.0)
         return _solve(log.problem, latency_s, log.budget.generations, self.settings)
@@ -181,7 +183,9 @@ def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: F
     return np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
 
 
-def _solve(problem: Problem, latency_s: float, iterations: int, settings: LeastSquaresSettings) -> Found:
+def _solve(
+    problem: Problem, latency_s: float, iterations: int, settings: LeastSquaresSettings
+) -> FittedStart:
     space = problem.space
     error = OneStep(problem, latency_s, settings.diverged)
     ends = dict.fromkeys(("ftol", "xtol", "gtol"), settings.tolerance) | {"max_nfev": max(iterations, 1)}
@@ -192,7 +196,7 @@ def _solve(problem: Problem, latency_s: float, iterations: int, settings: LeastS
         spread = float(np.sqrt(solution.fun @ solution.fun / max(count - len(space), 1)))
         solution = _minimise(error, max(spread, np.finfo(float).tiny), solution.x, ends)
     theta = np.clip(space.from_scale(solution.x), space.low, space.high)
-    return Found(
+    return FittedStart(
         theta=theta,
         covariance=textbook_covariance(space, np.asarray(solution.jac)[:count], solution.fun[:count]),
         latency_s=latency_s,
@@ -309,7 +313,7 @@ class MultiStartLeastSquares(OneShotSearch):
     name = "least-squares-multistart"
     settings: MultiStartSettings = field(default_factory=MultiStartSettings)
 
-    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """See :meth:`OneShotSearch.solve`."""
         drawn = log.coordinates.members(log.coordinates.sample(rng, self.settings.starts - 1))
         nominal = log.problem.space.nominal, log.coordinates.clip_latency(0.0)
@@ -322,7 +326,7 @@ def _solve_starts(
     starts: Sequence[tuple[FloatArray, float]],
     settings: MultiStartSettings,
     iterations: int,
-) -> Found:
+) -> FittedStart:
     recipe = Recipe(seconds=settings.window_s, prior_std=np.inf)
     parts = [p for e in problem.episodes for p in stretches(e, settings.part_s)]
     part = dataclasses.replace(problem, episodes=spread(parts, settings.first_s))
@@ -338,7 +342,7 @@ def _solve_starts(
     variance = float(residual @ residual) / max(len(residual) - K, 1)
     # The range as a flat prior keeps what the data cannot see finite.
     flat = np.diag(12.0 / problem.space.width**2)
-    return Found(
+    return FittedStart(
         theta=best.theta,
         covariance=np.asarray(np.linalg.inv(best.normal.hessian[:K, :K] / variance + flat)),
         latency_s=best.latency_s,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from deal_hw.calib.baselines.least_squares import Found, OneShotSearch, textbook_covariance
+from deal_hw.calib.baselines.least_squares import FittedStart, OneShotSearch, textbook_covariance
 from deal_hw.calib.data.innovations import cut
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.search.base import SearchLog
@@ -45,7 +45,7 @@ class MujocoSysid(OneShotSearch):
     name = "mujoco-sysid"
     settings: SysidSettings = field(default_factory=SysidSettings)
 
-    def solve(self, log: SearchLog, rng: np.random.Generator) -> Found:
+    def solve(self, log: SearchLog, rng: np.random.Generator) -> FittedStart:
         """See :meth:`OneShotSearch.solve`.
 
         Raises:
@@ -84,7 +84,7 @@ def _check_channels(problem: Problem) -> None:
         )
 
 
-def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: str) -> Found:
+def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: str) -> FittedStart:
     problem, ticks = log.problem, settings.ticks
     if settings.window_s is not None:
         ticks = max(round(settings.window_s * problem.robot.description.control_rate_hz), 1)
@@ -105,7 +105,7 @@ def _solve(log: SearchLog, settings: SysidSettings, latency_s: float, source: st
     # From derivatives by the value to those by its logarithm, where that is the scale.
     chain = np.where(space.log_scale, found.theta, 1.0)
     interval = np.stack([found.theta - found.half_width, found.theta + found.half_width], axis=1)
-    return Found(
+    return FittedStart(
         theta=found.theta,
         covariance=textbook_covariance(space, found.jacobian * chain, found.residual),
         latency_s=found.latency_s,

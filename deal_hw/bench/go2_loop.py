@@ -23,7 +23,7 @@ from deal_hw.control.velocity_error import velocity_error
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import walk_space
-from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth
+from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth
 from deal_hw.errors import DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
@@ -85,7 +85,7 @@ def loop_row(profile: str, seed: int, steps: int, *, train: bool, folder: Path, 
     return row
 
 
-def recorded(truth: Truth, out: Path) -> Path:
+def recorded(truth: Go2Truth, out: Path) -> Path:
     """Let the shipped policy walk the profile and another one, and record both; return the dataset."""
     folder, policy = out / "dataset", OnnxPolicy(required_policy("go2"))
     with Dataset.create_or_open(folder, DRIVER) as store:
@@ -99,7 +99,7 @@ def recorded(truth: Truth, out: Path) -> Path:
     return folder
 
 
-def calibration_part(result: CalibrationResult, truth: Truth) -> Row:
+def calibration_part(result: CalibrationResult, truth: Go2Truth) -> Row:
     """Return the row's part that concerns calibration."""
     true = truth.walk_parameters()
     names = result.space.names
@@ -129,7 +129,7 @@ def calibration_part(result: CalibrationResult, truth: Truth) -> Row:
     return row
 
 
-def policies_part(result: CalibrationResult, truth: Truth, steps: int, out: Path, *, train: bool) -> Row:
+def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: Path, *, train: bool) -> Row:
     """Fine-tune the shipped policy in three ways, and let all four walk."""
     space = walk_space()
     values = np.array([truth.walk_parameters()[name] for name in space.names])
@@ -152,7 +152,7 @@ def policies_part(result: CalibrationResult, truth: Truth, steps: int, out: Path
     return row
 
 
-def score(truth: Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
+def score(truth: Go2Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
     """Let a policy walk the profile some times, with other noise each; return its errors by the truth.
 
     Mean errors [m/s, rad/s] of the walks that lasted long enough to be judged, and how often it fell.

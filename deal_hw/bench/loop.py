@@ -20,7 +20,7 @@ from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.control.behaviours import PolicyBehaviour
 from deal_hw.drivers.cartpole.description import DESCRIPTION
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
@@ -109,7 +109,7 @@ def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tu
     return score.coverage90, score.width90
 
 
-def task_score(truth: Truth, policy: Policy, episodes: int = TASK_EPISODES) -> tuple[float, float]:
+def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISODES) -> tuple[float, float]:
     """Run the frozen task on the emulated robot; return mean |pole angle| [rad] and mean |cart speed| [m/s].
 
     A run that the safety filter ended early counts as fallen over the rest: pi rad, and a cart at rest.

@@ -16,12 +16,12 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.oracle import draw_truth
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
-from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import CalibrationError, ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps
-from deal_hw.sim.recordings.target import Behaviour, Sensing, TargetRecording, record_target
+from deal_hw.sim.recordings.target import Behaviour, TargetRecording, TargetSensing, record_target
 from deal_hw.types import FloatArray
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, demonstrate
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
@@ -75,7 +75,7 @@ class Case:
     heldout_truth: FloatArray
     channel_std: FloatArray | None
     refused: int
-    truth: Truth | None = None
+    truth: CartpoleTruth | None = None
     policy: PopulationPolicy | None = None
     excitation_levels: tuple[float, ...] = (0.0,)
 
@@ -197,7 +197,7 @@ def _go2(ask: _Ask) -> Case:
     if ask.profile == "realistic":
         raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
     robot = load_model(floor.DESCRIPTION)
-    sensing = Sensing(
+    sensing = TargetSensing(
         joint_std=floor.DESCRIPTION.sensor.noise,
         joint_resolution=floor.DESCRIPTION.sensor.resolution,
         orientation_std=floor.ORIENTATION_NOISE_RAD,
@@ -240,7 +240,7 @@ def _target(
     space: ParameterSpace,
     ask: _Ask,
     motions: Callable[[np.random.Generator], tuple[Behaviour, Behaviour]],
-    sensing: Sensing | None,
+    sensing: TargetSensing | None,
 ) -> Case:
     seed = ask.seed
     rng = np.random.default_rng([seed, sum(task.encode())])
@@ -302,7 +302,7 @@ def _stands(task: str, recording: TargetRecording) -> bool:
     return bool(np.all(recording.position[:, 2] > LOWEST_M[task]))
 
 
-def _channel_std(robot: RobotModel, sensing: Sensing) -> FloatArray:
+def _channel_std(robot: RobotModel, sensing: TargetSensing) -> FloatArray:
     joints = np.array(sensing.joint_std)
     if sensing.joint_resolution:
         joints = np.sqrt(joints**2 + np.square(sensing.joint_resolution) / 12)

@@ -30,7 +30,7 @@ _COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Info:
+class InfoSettings:
     """Tell what is in a dataset or an episode."""
 
     path: tyro.conf.Positional[Path]
@@ -74,7 +74,7 @@ class Export(ExportSettings):
 
 
 Data = (
-    Annotated[Info, tyro.conf.subcommand("info")]
+    Annotated[InfoSettings, tyro.conf.subcommand("info")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Import, tyro.conf.subcommand("import")]
@@ -82,7 +82,7 @@ Data = (
 )
 
 
-def data(config: Info | Verify | Repair | Import | Export) -> int:
+def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
     """Run the verb.
 
     Returns:
@@ -91,7 +91,7 @@ def data(config: Info | Verify | Repair | Import | Export) -> int:
     Raises:
         DatasetError: The path is neither a dataset nor an episode, or cannot be read or written.
     """
-    if isinstance(config, Info):
+    if isinstance(config, InfoSettings):
         return _info(config)
     if isinstance(config, Import):
         dataset = import_recordings(config, aloud)
@@ -144,7 +144,7 @@ def _episode_files(path: Path) -> list[Path]:
     return files
 
 
-def _info(config: Info) -> int:
+def _info(config: InfoSettings) -> int:
     from rich.console import Console
 
     console = Console()

@@ -15,7 +15,7 @@ from deal_hw.drivers.cartpole.device import EmulatedDevice
 from deal_hw.drivers.cartpole.host_firmware import Settings, settings_of
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError, ProtocolError
 from deal_hw.types import Status
 
@@ -183,7 +183,9 @@ class AvrDevice(EmulatedDevice):
         ConfigurationError: avr-gcc, a C compiler or simavr is missing, or the image cannot be read.
     """
 
-    def __init__(self, truth: Truth, *, start_angle_rad: float | None = None, build: Rig = Rig()) -> None:
+    def __init__(
+        self, truth: CartpoleTruth, *, start_angle_rad: float | None = None, build: Rig = Rig()
+    ) -> None:
         super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad))
         self._build = build
         profile = find_profile(truth.profile)

@@ -9,7 +9,7 @@ from typing import Final
 from deal_hw.drivers.cartpole.can_link import FRAME, NODE, CanLink
 from deal_hw.drivers.cartpole.device import CartpoleDevice, EmulatedDevice, python_firmware
 from deal_hw.drivers.cartpole.emulator import CanFaults, CartpoleEmulator, Hazards
-from deal_hw.drivers.cartpole.truth import Truth, unique_id
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
 from deal_hw.drivers.transports.slcan_transport import (
     BITRATES,
     BUS_ERROR,
@@ -175,7 +175,7 @@ class SlcanAdapter:
         return after_s < (self.device_ns - self._armed_ns) / 1e9 <= after_s + length_s
 
 
-def can_device(truth: Truth, node: int = NODE, version: int = 1, identity: int = 0) -> CartpoleDevice:
+def can_device(truth: CartpoleTruth, node: int = NODE, version: int = 1, identity: int = 0) -> CartpoleDevice:
     """Return an emulated cart-pole whose bytes are CAN frames.
 
     Args:
@@ -191,7 +191,7 @@ def can_device(truth: Truth, node: int = NODE, version: int = 1, identity: int =
     )
 
 
-def can_devices(truth: Truth, faults: CanFaults) -> list[EmulatedDevice]:
+def can_devices(truth: CartpoleTruth, faults: CanFaults) -> list[EmulatedDevice]:
     """Return the cart-pole on a bus, and what else is there by its faults."""
     identities = (0, _SECOND_DEVICE) if faults.duplicate_node else (0,)
     return [can_device(truth, faults.node, faults.dbc_version, identity) for identity in identities]
@@ -217,7 +217,7 @@ def adapter_emulator(
     )
 
 
-def can_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
+def can_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
     """Return an emulated cart-pole on a CAN bus behind a serial adapter."""
     faults = hazards.can
     settings = [f"bitrate={faults.bitrate}"] if faults.bitrate != CanFaults().bitrate else []

@@ -13,7 +13,7 @@ from deal_hw.drivers.cartpole.controller import Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.link import Link
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import Truth, unique_id
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
 from deal_hw.types import FloatArray
 
 TICK_NS = 1_000_000
@@ -38,7 +38,7 @@ class TrueTrajectory:
     setpoint: FloatArray
 
 
-def python_firmware(truth: Truth, mechanics: Mechanics, link: Link | None = None) -> Firmware:
+def python_firmware(truth: CartpoleTruth, mechanics: Mechanics, link: Link | None = None) -> Firmware:
     """Return the firmware in Python, whose servo is what the truth says; on serial frames by default."""
     servo = Servo(truth.parameters, mechanics.timestep_s)
     return Controller(servo, unique_id(truth), mechanics.command_delay, link)
@@ -144,11 +144,11 @@ class CartpoleDevice(EmulatedDevice):
 
     def __init__(
         self,
-        truth: Truth,
+        truth: CartpoleTruth,
         *,
         keep_truth: bool = False,
         start_angle_rad: float | None = None,
-        firmware: Callable[[Truth, Mechanics], Firmware] = python_firmware,
+        firmware: Callable[[CartpoleTruth, Mechanics], Firmware] = python_firmware,
     ) -> None:
         super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad), keep_truth=keep_truth)
         self._firmware = firmware(truth, self._mechanics)

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.drivers.cartpole.firmwares import device_of
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.faults import FrameFaults
 
@@ -330,7 +330,7 @@ class CartpoleEmulator:
 
 
 def serial_emulator(
-    truth: Truth, *, link: Path | None, hazards: Hazards, firmware: str = "python"
+    truth: CartpoleTruth, *, link: Path | None, hazards: Hazards, firmware: str = "python"
 ) -> CartpoleEmulator:
     """Return an emulated cart-pole with a serial port.
 

@@ -16,7 +16,7 @@ from deal_hw.drivers.cartpole.description import (
 )
 from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.truth import Truth, unique_id
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
 
 _I32 = 0x7FFF_FFFF
 _MODES = (Mode.IDLE, Mode.HOMING, Mode.ARMED)
@@ -38,7 +38,7 @@ class Settings(ctypes.Structure):
     ]
 
 
-def settings_of(truth: Truth, delay_ticks: int) -> Settings:
+def settings_of(truth: CartpoleTruth, delay_ticks: int) -> Settings:
     """Return the settings of a device with this truth: its trims are what nobody told the host."""
     nominal = {
         "stiffness": STIFFNESS_N_M,
@@ -95,7 +95,7 @@ class HostFirmware:
         self._look()
 
     @classmethod
-    def of(cls, truth: Truth, mechanics: Mechanics) -> HostFirmware:
+    def of(cls, truth: CartpoleTruth, mechanics: Mechanics) -> HostFirmware:
         """Return the firmware of an emulated device."""
         return cls(settings_of(truth, 0), mechanics.command_delay)
 

@@ -11,7 +11,7 @@ import numpy as np
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.sensor import Motor, Reading, Sample, Sensor
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.sim.engine.single import SingleSimulation
 
 HOMING_TICKS: Final = 500
@@ -54,7 +54,7 @@ class Mechanics:
 
     def __init__(
         self,
-        truth: Truth,
+        truth: CartpoleTruth,
         *,
         start_angle_rad: float | None = None,
         read_rate_hz: float = DESCRIPTION.state_rate_hz,

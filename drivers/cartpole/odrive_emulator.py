@@ -28,7 +28,7 @@ from deal_hw.drivers.cartpole.odrive_frames import (
 )
 from deal_hw.drivers.cartpole.odrive_link import ENCODER_KIND, OdriveSettings
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
-from deal_hw.drivers.cartpole.truth import Truth, unique_id
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, unique_id
 from deal_hw.types import Status
 
 ENABLE_WATCHDOG, WATCHDOG_TIMEOUT = 437, 438
@@ -67,7 +67,7 @@ class OdriveFirmware:
 
     def __init__(
         self,
-        truth: Truth,
+        truth: CartpoleTruth,
         parts: OdriveSettings,
         identity: int,
         command_delay: Callable[[], int],
@@ -255,7 +255,9 @@ class OdriveFirmware:
         return b""
 
 
-def odrive_device(truth: Truth, parts: OdriveSettings, version: int = 1, identity: int = 0) -> CartpoleDevice:
+def odrive_device(
+    truth: CartpoleTruth, parts: OdriveSettings, version: int = 1, identity: int = 0
+) -> CartpoleDevice:
     """Return an emulated ODrive with a pole encoder; its bytes are CAN frames.
 
     Args:
@@ -273,7 +275,7 @@ def odrive_device(truth: Truth, parts: OdriveSettings, version: int = 1, identit
     )
 
 
-def odrive_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
+def odrive_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Hazards) -> CartpoleEmulator:
     """Return an emulated ODrive and pole encoder behind a serial CAN adapter; node is the drive's."""
     faults = hazards.can
     parts = OdriveSettings(drive=faults.node)

@@ -11,7 +11,7 @@ from deal_hw.drivers.cartpole.lqr import TARGET_LIMIT_M, LqrController, design_l
 from deal_hw.drivers.cartpole.mechanics import START_ANGLE_RAD
 from deal_hw.drivers.cartpole.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import Truth, candidate_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, TransportTimeoutError
 from deal_hw.types import JointCommand
@@ -21,7 +21,7 @@ FALLEN_RAD = 0.3
 MAX_DRAWS = 200
 
 
-def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> Truth:
+def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> CartpoleTruth:
     """Return the hidden truth of a seed: the first draw that the oracle balances.
 
     Args:
@@ -47,7 +47,7 @@ def draw_truth(profile: str, seed: int, *, range_ratio: float = 5.0) -> Truth:
     )
 
 
-def oracle_balances(truth: Truth) -> bool:
+def oracle_balances(truth: CartpoleTruth) -> bool:
     """Return whether the balancer that knows the truth holds the pole for 6 s from either side."""
     profile = find_profile(truth.profile)
     # It plans for the mean of the jitter: that is all that anybody could.
@@ -58,7 +58,7 @@ def oracle_balances(truth: Truth) -> bool:
 
 
 def balances(
-    truth: Truth, controller: LqrController, start_angle_rad: float, duration_s: float = BALANCE_S
+    truth: CartpoleTruth, controller: LqrController, start_angle_rad: float, duration_s: float = BALANCE_S
 ) -> bool:
     """Return whether |angle| stays below 0.3 rad and the cart in the target range, over the real wire."""
     clock = VirtualClock()

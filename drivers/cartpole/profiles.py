@@ -11,7 +11,7 @@ from deal_hw.errors import UnknownNameError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Profile:
+class CartpoleProfile:
     """How an emulated device differs from its equations.
 
     Attributes:
@@ -38,13 +38,13 @@ class Profile:
 
 
 PROFILES: Final = {
-    "ideal": Profile(
+    "ideal": CartpoleProfile(
         name="ideal",
         sensor=SensorModel(noise=(0.0, 0.0), resolution=(0.0, 0.0), velocity_window_s=0.0),
         latency_ticks=(0, 0),
     ),
-    "sensor": Profile(name="sensor", sensor=DESCRIPTION.sensor, latency_ticks=(5, 25)),
-    "realistic": Profile(
+    "sensor": CartpoleProfile(name="sensor", sensor=DESCRIPTION.sensor, latency_ticks=(5, 25)),
+    "realistic": CartpoleProfile(
         name="realistic",
         sensor=DESCRIPTION.sensor,
         latency_ticks=(5, 25),
@@ -57,7 +57,7 @@ PROFILES: Final = {
 }
 
 
-def profile(name: str) -> Profile:
+def profile(name: str) -> CartpoleProfile:
     """Return a profile by name.
 
     Raises:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deal_hw.drivers.cartpole.profiles import Profile
+from deal_hw.drivers.cartpole.profiles import CartpoleProfile
 
 _I32 = 0x7FFF_FFFF
 
@@ -51,7 +51,7 @@ class Sensor:
     """
 
     def __init__(
-        self, profile: Profile, delay_ticks: int, state_rate_hz: int, rng: np.random.Generator
+        self, profile: CartpoleProfile, delay_ticks: int, state_rate_hz: int, rng: np.random.Generator
     ) -> None:
         self._noise = profile.sensor.noise
         self._resolution = profile.sensor.resolution

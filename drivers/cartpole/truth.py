@@ -18,7 +18,7 @@ MOST_TICKS = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Truth:
+class CartpoleTruth:
     """What a calibrator has to find out.
 
     Attributes:
@@ -55,7 +55,7 @@ class Truth:
         }
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Truth:
+    def from_json(cls, values: Mapping[str, Any]) -> CartpoleTruth:
         """Return the truth that :meth:`to_json` wrote.
 
         Raises:
@@ -80,27 +80,27 @@ class Truth:
             )
 
 
-def unique_id(truth: Truth) -> int:
+def unique_id(truth: CartpoleTruth) -> int:
     """Return the serial number of the device with this truth."""
     return 0xE000_0000 + truth.seed % 2**28
 
 
-def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:
+def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> CartpoleTruth:
     """Return a truth that equals the description, without latency unless given among the changes."""
     parameters = {p.name: p.nominal for p in parameter_space().parameters}
-    return Truth(profile=profile, seed=seed, parameters=parameters, **changes)
+    return CartpoleTruth(profile=profile, seed=seed, parameters=parameters, **changes)
 
 
 def candidate_truth(
     profile: str, rng: np.random.Generator, *, seed: int, range_ratio: float, refused: int
-) -> Truth:
+) -> CartpoleTruth:
     """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency."""
     space = k9_space().with_ratio(range_ratio).with_known(k9_space().known)
     values = space.unnormalize(rng.uniform(0.1, 0.9, len(space)))
     low, high = find_profile(profile).latency_ticks
     total = int(rng.integers(low, high + 1))
     sensing = int(rng.integers(0, total + 1))
-    return Truth(
+    return CartpoleTruth(
         profile=profile,
         seed=seed,
         parameters={**space.known, **dict(zip(space.names, map(float, values), strict=True))},

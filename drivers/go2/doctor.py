@@ -19,7 +19,7 @@ from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import ANOTHER_ROBOT, OTHER_RULE, Refusals, StateCheck
 from deal_hw.drivers.go2.messages.remote import decode_remote
-from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, Services
+from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, ServiceClient
 from deal_hw.drivers.go2.state_stream import PERIOD_MS
 from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
 from deal_hw.findings import Finding, Level
@@ -44,7 +44,7 @@ class _Heard:
     commands: int = 0
 
 
-class Doctor:
+class Go2Doctor:
     """Listens to a Go2 and asks its motion switcher.
 
     Args:
@@ -125,7 +125,7 @@ class Doctor:
 
     def _ask_mode(self) -> Generator[Finding, None, str | None]:
         """Yield what the motion switcher tells; return the active mode's name, None without an answer."""
-        services = Services(
+        services = ServiceClient(
             self._send, lambda timeout_s: services.take(self._link.receive(timeout_s)), self._clock
         )
         times: list[float] = []

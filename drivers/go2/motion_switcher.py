@@ -68,7 +68,7 @@ class RefusedError(SafetyError):
         super().__init__(f"go2: {what} was refused: {ERRORS.get(code, 'an unknown error')} (code {code})")
 
 
-class Services:
+class ServiceClient:
     """Sends requests and waits for their responses.
 
     Args:
@@ -138,7 +138,7 @@ class MotionSwitcher:
         clock: For waiting.
     """
 
-    def __init__(self, services: Services, clock: Clock) -> None:
+    def __init__(self, services: ServiceClient, clock: Clock) -> None:
         self.released = ""
         self.old = False
         self._services, self._clock = services, clock

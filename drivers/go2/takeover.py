@@ -10,7 +10,7 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.go2.messages import topics
-from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, Services
+from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, ServiceClient
 from deal_hw.errors import SafetyError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import FloatArray
@@ -51,7 +51,7 @@ class Takeover:
     ) -> None:
         self._transport, self._clock, self._pump = transport, clock, pump
         self._motion, self._rest = motion, rest
-        self._services = Services(send, pump, clock)
+        self._services = ServiceClient(send, pump, clock)
         self._switcher = MotionSwitcher(self._services, clock)
         self._foreign, self._foreign_ns = 0, -1
 

@@ -19,7 +19,7 @@ from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode
-from deal_hw.sim.recordings.target import Sensing, record_target
+from deal_hw.sim.recordings.target import TargetSensing, record_target
 from deal_hw.types import FloatArray
 
 Beginning = Callable[[SampledEpisode, float], SampledEpisode]
@@ -67,7 +67,7 @@ def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Know
     robot, real = load_model(DESCRIPTION), load_model(DESCRIPTION)
     real.model.dof_frictionloss[list(real.qvel)[2::3]] += 0.5
     whole = parameter_space().with_ratio(3.0)
-    sensing = Sensing(
+    sensing = TargetSensing(
         joint_std=DESCRIPTION.sensor.noise,
         joint_resolution=DESCRIPTION.sensor.resolution,
         orientation_std=4e-3,

@@ -14,7 +14,7 @@ from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion
-from deal_hw.sim.recordings.target import Sensing, record_target
+from deal_hw.sim.recordings.target import TargetSensing, record_target
 
 COLUMNS = """
 time: time
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     actuators = DESCRIPTION.joint_names
     space = ParameterSpace([Parameter.around("k", "servo_stiffness", actuators, "N·m/rad", 40.0)])
     rng = np.random.default_rng(5)
-    sensing = Sensing(joint_std=(1e-3,) * 12, orientation_std=4e-3, gyro_std=0.02, feet=FEET)
+    sensing = TargetSensing(joint_std=(1e-3,) * 12, orientation_std=4e-3, gyro_std=0.02, feet=FEET)
     made = record_target(
         robot, space, np.array([48.0]), sway(robot, rng, 4.0), seconds=4.0, sensing=sensing, rng=rng
     )

@@ -20,7 +20,7 @@ from deal_hw.control.loop import Outcome
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
@@ -32,7 +32,7 @@ from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.shipped import shipped_policy
 
 
-def shown(truth: Truth) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
+def shown(truth: CartpoleTruth) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
     """Return the demonstration of an emulated robot."""
     policy = str(shipped_policy("cartpole"))
     plan = RunPlan(robot="cartpole", profile="rich", policy=policy, seed=truth.seed)

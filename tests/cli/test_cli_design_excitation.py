@@ -17,7 +17,7 @@ from deal_hw.control.excitation_plan import ExcitationBehaviour, read_plan
 from deal_hw.control.loop import Outcome
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.oracle import draw_truth
-from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 from deal_hw.drivers.so101.description import DESCRIPTION as ARM
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.workflows.collect import _excitation
@@ -63,7 +63,9 @@ def test_optimal_is_written_with_what_it_will_tell(optimal: Path) -> None:
 
 @pytest.mark.parametrize("truth", TRUTHS, ids=["nominal", "drawn"])
 @pytest.mark.parametrize("kind", ["multisine", "chirp", "steps", "optimal"])
-def test_each_excitation_keeps_the_limits(kind: str, truth: Truth, optimal: Path, tmp_path: Path) -> None:
+def test_each_excitation_keeps_the_limits(
+    kind: str, truth: CartpoleTruth, optimal: Path, tmp_path: Path
+) -> None:
     """Recorded through driver, bytes and safety module: the run ends by itself, no command was clipped."""
     name = kind
     if kind == "optimal":

@@ -28,7 +28,7 @@ from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as SIMULATED
 from deal_hw.drivers.go2.descriptions.floor import LEGS
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION
 from deal_hw.drivers.go2.emulator.device import Go2Device
-from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth
+from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth
 from deal_hw.drivers.go2.robot import Go2OnStandRobot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import ConfigurationError
@@ -62,7 +62,7 @@ def record(device: Go2Device, dataset: Dataset, plan: RunPlan) -> None:
 
 
 @pytest.fixture(scope="module")
-def truth() -> Truth:
+def truth() -> Go2Truth:
     """Return hidden parameters whose hips alone differ from the model."""
     drawn = draw_truth("sensor", 5)
     hip = np.arange(12) % 3 == 0
@@ -79,7 +79,7 @@ def truth() -> Truth:
 
 
 @pytest.fixture(scope="module")
-def dataset(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(truth: Go2Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a dataset with a multisine and a chirp of the suspended robot."""
     folder = tmp_path_factory.mktemp("run") / "dataset"
     with Dataset.create_or_open(folder, DESCRIPTION.to_json()) as store:
@@ -117,7 +117,9 @@ def test_the_recording_has_states_at_500_hz_and_commands_at_50(dataset: Path) ->
     assert (np.diff(numbers) == 1).all()
 
 
-def test_hidden_gains_and_latency_are_found_over_the_wire(calibrated: CalibrateReport, truth: Truth) -> None:
+def test_hidden_gains_and_latency_are_found_over_the_wire(
+    calibrated: CalibrateReport, truth: Go2Truth
+) -> None:
     """Gains to 3 %; the latency is the emulator's 6 ms plus the millisecond in which a message waits."""
     result = calibrated.result
     true = truth.parameters(DESCRIPTION.stiffness[0], DESCRIPTION.damping[0])

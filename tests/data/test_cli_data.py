@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.data import Info, Repair, Verify, data
+from deal_hw.cli.data import InfoSettings, Repair, Verify, data
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
@@ -33,7 +33,7 @@ def test_info_of_a_dataset(
 ) -> None:
     """The table names robot, episode and counts."""
     monkeypatch.setenv("COLUMNS", "200")
-    assert data(Info(path=dataset)) == 0
+    assert data(InfoSettings(path=dataset)) == 0
     printed = capsys.readouterr().out
     for words in ("cartpole", DESCRIPTION.digest(), "episodes/000000.mcap", "600", "150"):
         assert words in printed
@@ -41,10 +41,10 @@ def test_info_of_a_dataset(
 
 def test_info_as_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """JSON of a dataset and of an episode hold the same episode."""
-    assert data(Info(path=dataset, json=True)) == 0
+    assert data(InfoSettings(path=dataset, json=True)) == 0
     whole = json.loads(capsys.readouterr().out)
     assert whole["robot"] == "cartpole"
-    assert data(Info(path=dataset / "episodes" / "000000.mcap", json=True)) == 0
+    assert data(InfoSettings(path=dataset / "episodes" / "000000.mcap", json=True)) == 0
     assert json.loads(capsys.readouterr().out) == whole["episodes"][0]
 
 
@@ -53,7 +53,7 @@ def test_info_of_an_episode_shows_checks(
 ) -> None:
     """Each check has its row, and the clocks theirs."""
     monkeypatch.setenv("COLUMNS", "200")
-    assert data(Info(path=dataset / "episodes" / "000000.mcap")) == 0
+    assert data(InfoSettings(path=dataset / "episodes" / "000000.mcap")) == 0
     printed = capsys.readouterr().out
     for words in ("clamped_by_us", "host minus device", "excitation: position_range"):
         assert words in printed
@@ -87,9 +87,9 @@ def test_wrong_path_is_said(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="neither a dataset"):
         data(Verify(path=tmp_path))
     with pytest.raises(DatasetError, match=r"it has no dataset\.json"):
-        data(Info(path=tmp_path))
+        data(InfoSettings(path=tmp_path))
     with pytest.raises(DatasetError, match="cannot be read"):
-        data(Info(path=tmp_path / "absent.mcap"))
+        data(InfoSettings(path=tmp_path / "absent.mcap"))
 
 
 def test_command_line_reaches_the_verbs(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

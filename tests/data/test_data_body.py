@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording import recorder as recorder_module
-from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_trajectory
 from deal_hw.data.recording.record import CycleRecord, decode, encode
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -176,7 +176,7 @@ def test_recordings_from_before_the_channel_still_read(
     monkeypatch.setattr(recorder_module, "CHANNELS", older)
     path = write(nowhere, torn=True)
     monkeypatch.undo()
-    found = [item for item in scan(path.read_bytes()) if isinstance(item, Found)]
+    found = [item for item in scan(path.read_bytes()) if isinstance(item, FoundRecord)]
     topics = {r.topic for item in found for r in item.contents if isinstance(r, Channel)}
     assert topics == set(older)
     assert repair(path).repaired
@@ -236,7 +236,7 @@ def test_a_torn_file_keeps_its_bodies(write: Callable[..., Path], damaged: bool)
 def damage_first_chunk(path: Path) -> None:
     """Flip a bit in the chunk that names the channels."""
     data = bytearray(path.read_bytes())
-    chunks = [i for i in scan(bytes(data)) if isinstance(i, Found) and isinstance(i.record, Chunk)]
+    chunks = [i for i in scan(bytes(data)) if isinstance(i, FoundRecord) and isinstance(i.record, Chunk)]
     assert any(isinstance(record, Channel) for record in chunks[0].contents)
     assert sum(1 for _ in messages(chunks[0])) >= 1
     data[chunks[0].offset + 80] ^= 0x10

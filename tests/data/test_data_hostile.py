@@ -20,7 +20,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from deal_hw.data import files
 from deal_hw.data.recording import mcap_scan
 from deal_hw.data.recording.dataset import Dataset, digest_of
-from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
 from deal_hw.data.recording.repair import repair, verify
@@ -141,7 +141,7 @@ def test_zeros_are_one_place(write_episode: WriteEpisode) -> None:
     path = write_episode()
     data = path.read_bytes()
     total = verify(path).messages
-    offsets = [item.offset for item in scan(data) if isinstance(item, Found) and item.contents]
+    offsets = [item.offset for item in scan(data) if isinstance(item, FoundRecord) and item.contents]
     at = offsets[20]
     path.write_bytes(data[:at] + bytes(4096) + data[at:])
     report = verify(path)
@@ -159,7 +159,7 @@ def test_many_places_are_counted(write_episode: WriteEpisode) -> None:
     """Of damage in every second chunk three places are named and the others counted, holes likewise."""
     path = write_episode()
     data = bytearray(path.read_bytes())
-    offsets = [item.offset for item in scan(bytes(data)) if isinstance(item, Found) and item.contents]
+    offsets = [item.offset for item in scan(bytes(data)) if isinstance(item, FoundRecord) and item.contents]
     for offset in offsets[1::2]:
         data[offset + 80] ^= 1
     path.write_bytes(data)
@@ -191,13 +191,13 @@ def test_bombs_are_not_unpacked(bad: bytes, words: str, monkeypatch: pytest.Monk
 def test_many_small_bombs_are_bounded() -> None:
     """Chunks that each hold 261 kB in a hundred bytes are read until the file has grown 256-fold."""
     data = MCAP0_MAGIC + chunk(bytes(9 * 29_000)) * 500
-    found = [item for item in scan(data) if isinstance(item, Found)]
+    found = [item for item in scan(data) if isinstance(item, FoundRecord)]
     assert len(found) == (256 * len(data) + (2 << 20)) // (9 * 29_000) < 60
 
 
 def contents(data: bytes) -> set[tuple[int, bytes]]:
     """Return every message of a file."""
-    found = [item for item in scan(data) if isinstance(item, Found)]
+    found = [item for item in scan(data) if isinstance(item, FoundRecord)]
     return {(message.log_time, message.data) for item in found for message in messages(item)}
 
 

@@ -21,10 +21,10 @@ from deal_hw.data.importing.load import is_episode, load_tables, read_channels
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.table import build_table
-from deal_hw.data.recording.schemas import MessageType
+from deal_hw.data.recording.schemas import RosMessageType
 from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
 
-JOINT_STATE = MessageType(
+JOINT_STATE = RosMessageType(
     "sensor_msgs/msg/JointState",
     (("int64", "tick"), ("string[]", "name"), ("float64[]", "position"), ("float64[]", "velocity")),
 )

@@ -16,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording import recorder as recorder_module
-from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_trajectory, read_wire
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -153,7 +153,7 @@ def test_dry_run_has_asked_but_no_sent(tmp_path: Path, make_cycle: MakeCycle) ->
 def test_chunks_close_every_50_ms(write_episode: WriteEpisode) -> None:
     """At 50 Hz no chunk holds more than four cycles (60 ms), even if the recorder is never idle."""
     data = write_episode(cycles=CYCLES).read_bytes()
-    chunks = [list(messages(item)) for item in scan(data) if isinstance(item, Found) and item.contents]
+    chunks = [list(messages(item)) for item in scan(data) if isinstance(item, FoundRecord) and item.contents]
     assert len(chunks) >= CYCLES / 4
     assert max(len(chunk) for chunk in chunks) <= 4 * 9 + 1
 

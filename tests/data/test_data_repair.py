@@ -17,7 +17,7 @@ from mcap.records import Chunk
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 
-from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_trajectory
 from deal_hw.data.recording.repair import repair, verify
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
@@ -27,7 +27,7 @@ WriteEpisode = Callable[..., Path]
 
 def chunk_offsets(path: Path) -> list[int]:
     """Return where the chunks of a file start."""
-    found = [item for item in scan(path.read_bytes()) if isinstance(item, Found)]
+    found = [item for item in scan(path.read_bytes()) if isinstance(item, FoundRecord)]
     return [item.offset for item in found if isinstance(item.record, Chunk)]
 
 
@@ -70,7 +70,7 @@ def test_cut_anywhere_loses_only_the_last_chunk(write_episode: WriteEpisode, sha
     """Whatever byte a file ends at, every whole chunk before it is restored."""
     whole = write_episode(f"{share.hex()}.mcap")
     offsets, data = chunk_offsets(whole), whole.read_bytes()
-    expected = sum(1 for item in scan(data) if isinstance(item, Found) for _ in messages(item))
+    expected = sum(1 for item in scan(data) if isinstance(item, FoundRecord) for _ in messages(item))
     cut = round(share * (len(data) - 1))
     whole.write_bytes(data[:cut])
     report = repair(whole)
@@ -102,7 +102,7 @@ def test_flipped_byte_costs_one_chunk(write_episode: WriteEpisode) -> None:
 def damage_one_chunk(path: Path, offset: int) -> int:
     """Flip a bit inside a chunk; return how many messages it held."""
     data = bytearray(path.read_bytes())
-    chunks = [item for item in scan(bytes(data)) if isinstance(item, Found) and item.contents]
+    chunks = [item for item in scan(bytes(data)) if isinstance(item, FoundRecord) and item.contents]
     hit = max((item for item in chunks if item.offset <= offset), key=lambda item: item.offset)
     data[offset] ^= 0x10
     path.write_bytes(data)
@@ -115,7 +115,7 @@ def test_any_flipped_bit_costs_at_most_one_chunk(write_episode: WriteEpisode, sh
     """Wherever a bit flips after the preamble, verify notices and repair loses one chunk at most."""
     path = write_episode(f"{share.hex()}.{bit}.mcap", cycles=40)
     data = bytearray(path.read_bytes())
-    sizes = [sum(1 for _ in messages(item)) for item in scan(bytes(data)) if isinstance(item, Found)]
+    sizes = [sum(1 for _ in messages(item)) for item in scan(bytes(data)) if isinstance(item, FoundRecord)]
     total = sum(sizes)
     first = chunk_offsets(path)[0]
     data[first + round(share * (len(data) - first - 1))] ^= 1 << bit

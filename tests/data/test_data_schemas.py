@@ -18,7 +18,7 @@ from deal_hw.data.recording.schemas import (
     ROBOT,
     STATE,
     WIRE,
-    MessageType,
+    RosMessageType,
     message_type,
 )
 from deal_hw.errors import ProtocolError, UnknownNameError
@@ -37,7 +37,7 @@ TYPES = (ROBOT, STATE, COMMAND, CYCLE, EVENT, WIRE)
 
 
 @st.composite
-def messages(draw: st.DrawFn) -> tuple[MessageType, list[Any]]:
+def messages(draw: st.DrawFn) -> tuple[RosMessageType, list[Any]]:
     kind = draw(st.sampled_from(TYPES))
     return kind, [draw(VALUES[field]) for field, _ in kind.fields]
 
@@ -49,7 +49,7 @@ def plain(value: object) -> object:
 @settings(max_examples=150, deadline=None)
 @given(messages())
 def test_mcap_ros2_reads_what_we_write_and_we_read_what_it_writes(
-    message: tuple[MessageType, list[Any]],
+    message: tuple[RosMessageType, list[Any]],
 ) -> None:
     """Both implementations give the same bytes and the same values."""
     kind, values = message

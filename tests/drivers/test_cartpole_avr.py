@@ -15,7 +15,7 @@ from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.host_firmware import Settings
 from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.robot_suite import default_command
@@ -287,7 +287,7 @@ def test_without_the_tools_they_are_named(monkeypatch: pytest.MonkeyPatch) -> No
 class Bench:
     """A chip on an emulated cart-pole, and the driver."""
 
-    def __init__(self, truth: Truth) -> None:
+    def __init__(self, truth: CartpoleTruth) -> None:
         """Start the chip: it does not hear what comes before."""
         self.clock = VirtualClock()
         self.device = AvrDevice(truth, start_angle_rad=0.02)

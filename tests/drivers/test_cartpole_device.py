@@ -15,7 +15,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.mechanics import HOMING_TICKS, Mechanics
 from deal_hw.drivers.cartpole.protocol import Ack, Info, Result, State, Target
-from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.types import Status
 
 MS = 1_000_000
@@ -60,7 +60,7 @@ def target(
     return Target(sequence, position_um, 80_000, 8_000, effort_mn, speed_um_s)
 
 
-def armed_device(truth: Truth, **options: object) -> CartpoleDevice:
+def armed_device(truth: CartpoleTruth, **options: object) -> CartpoleDevice:
     """Return a device that was homed and armed; the next tick is 510."""
     device = CartpoleDevice(truth, **options)  # type: ignore[arg-type]
     device.receive(protocol.encode(protocol.Home(1)))

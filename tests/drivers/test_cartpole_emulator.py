@@ -15,7 +15,7 @@ from deal_hw.drivers.cartpole import protocol
 from deal_hw.drivers.cartpole.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import (
     ConfigurationError,
@@ -240,7 +240,7 @@ def test_the_verb_runs_from_python_and_reveals(tmp_path: Path, capsys: pytest.Ca
     assert (told["changes"], told["last_mode"], told["received_bytes"]) == ([], "idle", 0)
     assert emulate(Emulate(truth_from=revealed, duration_s=0.0, reveal=True)) == 0
     again = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert Truth.from_json(again) == Truth.from_json(told)
+    assert CartpoleTruth.from_json(again) == CartpoleTruth.from_json(told)
 
 
 def test_a_process_end_to_end(tmp_path: Path) -> None:

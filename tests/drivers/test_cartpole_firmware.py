@@ -29,7 +29,7 @@ from deal_hw.drivers.cartpole.host_firmware import HostFirmware, Settings, setti
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.sensor import Motor, Reading
 from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.errors import ConfigurationError
 
 needs_compiler = pytest.mark.skipif(
@@ -168,7 +168,7 @@ class IntegerServo(Servo):
         return gains[0] * error_nm - gains[1] * cut(velocity_um_s, 2**25 - 1)
 
 
-def pair(truth: Truth, seed: int, delays: tuple[int, int]) -> tuple[Controller, HostFirmware]:
+def pair(truth: CartpoleTruth, seed: int, delays: tuple[int, int]) -> tuple[Controller, HostFirmware]:
     """Return both firmwares, whose commands are late by the same draws."""
     first, second = random.Random(seed), random.Random(seed)
     trims = settings_of(truth, 0)

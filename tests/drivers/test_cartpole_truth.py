@@ -9,7 +9,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.lqr import design_lqr, linearise
 from deal_hw.drivers.cartpole.oracle import balances, draw_truth, oracle_balances
 from deal_hw.drivers.cartpole.profiles import PROFILES
-from deal_hw.drivers.cartpole.truth import Truth, candidate_truth, nominal_truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth, candidate_truth, nominal_truth
 from deal_hw.errors import ConfigurationError, UnknownNameError
 
 
@@ -44,15 +44,15 @@ def test_the_ideal_profile_has_no_latency() -> None:
 def test_the_truth_survives_json() -> None:
     """What --reveal-to writes can be read again."""
     truth = draw_truth("sensor", 1)
-    assert Truth.from_json(json.loads(json.dumps(truth.to_json()))) == truth
+    assert CartpoleTruth.from_json(json.loads(json.dumps(truth.to_json()))) == truth
     with pytest.raises(ConfigurationError, match="reveal-to"):
-        Truth.from_json({"profile": "ideal"})
+        CartpoleTruth.from_json({"profile": "ideal"})
 
 
 def test_an_impossible_truth_is_refused() -> None:
     """A motor of 0.1 N under 0.5 N of dry friction balances nothing; the nominal one does."""
     nominal = nominal_truth("sensor", actuation_ticks=4, sensing_ticks=4)
-    weak = Truth(
+    weak = CartpoleTruth(
         profile="sensor",
         seed=0,
         parameters={**nominal.parameters, "servo.effort_limit": 0.1, "cart.frictionloss": 0.5},

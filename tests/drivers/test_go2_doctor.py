@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
-from deal_hw.drivers.go2.doctor import Doctor
+from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
@@ -67,7 +67,7 @@ def examine(
     device = Go2Device(nominal_truth(), **{"sport": "", "remote": (), **options})
     wire = Wire(Air(device, tamper, said or {}), clock)
     wire.known = others
-    return list(Doctor(wire, clock, 1.0, state_check).run())
+    return list(Go2Doctor(wire, clock, 1.0, state_check).run())
 
 
 def only(findings: Iterable[Finding], area: str, word: str) -> Finding:
@@ -90,9 +90,9 @@ def test_it_sends_no_motor_command() -> None:
     """The emulated robot's log has no command, and its mode stays what it was."""
     clock = VirtualClock()
     device = Go2Device(nominal_truth(), sport="normal", remote=())
-    list(Doctor(VirtualTopics(device, clock), clock, 1.0).run())
+    list(Go2Doctor(VirtualTopics(device, clock), clock, 1.0).run())
     assert (device.log.accepted, device.log.refused) == (0, 0)
-    again = list(Doctor(VirtualTopics(device, clock), clock, 1.0).run())
+    again = list(Go2Doctor(VirtualTopics(device, clock), clock, 1.0).run())
     assert only(again, "services", "'normal' is active").level is Level.NOTE
 
 
@@ -227,7 +227,7 @@ def test_a_transport_without_topics_is_refused() -> None:
         def open(self) -> None: ...
 
     with pytest.raises(TransportError, match="carries no topics"):
-        list(Doctor(Stream(), VirtualClock(), 1.0).run())  # type: ignore[arg-type]
+        list(Go2Doctor(Stream(), VirtualClock(), 1.0).run())  # type: ignore[arg-type]
 
 
 def test_other_answers_are_passed_over() -> None:

@@ -12,7 +12,7 @@ from deal_hw.drivers.go2.descriptions.floor import JOINTS, TRUNK_KG, walk_space
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.drivers.go2.descriptions.on_stand_recording import parameter_space
 from deal_hw.drivers.go2.emulator.device import Go2Device
-from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth, nominal_truth
+from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth, nominal_truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.workflows.emulation.go2 import read_track, tracking
@@ -20,7 +20,7 @@ from deal_hw.workflows.emulation.go2 import read_track, tracking
 GRAVITY = 9.81
 
 
-def standing_force(truth: Truth) -> float:
+def standing_force(truth: Go2Truth) -> float:
     """Return what the floor bears of a standing robot, by the foot sensors of its simulation [N]."""
     device = Go2Device(truth, start="standing")
     forces = []
@@ -48,9 +48,9 @@ def test_only_the_realistic_profile_hides_payload_and_floor() -> None:
 def test_a_truth_comes_back_from_its_file() -> None:
     """With payload and floor; a payload below nothing is refused."""
     truth = draw_truth("realistic", 4)
-    assert Truth.from_json(truth.to_json()) == truth
+    assert Go2Truth.from_json(truth.to_json()) == truth
     with pytest.raises(ConfigurationError, match="payload_kg"):
-        Truth.from_json({**truth.to_json(), "payload_kg": -1.0})
+        Go2Truth.from_json({**truth.to_json(), "payload_kg": -1.0})
 
 
 def test_the_truth_has_the_names_of_what_a_walk_tells() -> None:

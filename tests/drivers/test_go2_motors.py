@@ -17,7 +17,7 @@ from deal_hw.drivers.go2.emulator.faults import SHARES, FaultPlan, StateFaults
 from deal_hw.drivers.go2.emulator.motors import AMBIENT_C, Motors
 from deal_hw.drivers.go2.emulator.profiles import profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment, read_remote_script
-from deal_hw.drivers.go2.emulator.truth import Truth, draw_truth, nominal_truth
+from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.protocol import LowCommand
 from deal_hw.drivers.go2.messages.remote import Remote, button_mask
 from deal_hw.errors import ConfigurationError, UnknownNameError
@@ -91,13 +91,13 @@ def test_kinds_of_commands() -> None:
 def test_a_truth_survives_json() -> None:
     """What --reveal-to writes is what --truth-from reads."""
     truth = draw_truth("realistic", 5)
-    assert Truth.from_json(truth.to_json()) == truth
+    assert Go2Truth.from_json(truth.to_json()) == truth
     values = truth.to_json()
     del values["armature"]
     with pytest.raises(
         ConfigurationError, match="cannot be read as the truth of a Go2: 'armature' is missing"
     ):
-        Truth.from_json(values)
+        Go2Truth.from_json(values)
 
 
 def test_a_truth_speaks_the_names_of_the_parameter_sets() -> None:

@@ -42,7 +42,7 @@ from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
 from deal_hw.data.recording.repair import verify
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.on_stand import DESCRIPTION as ON_STAND
-from deal_hw.drivers.go2.doctor import Doctor
+from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.drivers.go2.emulator.command_log import DAMPING, STIFF
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
@@ -324,14 +324,14 @@ def test_a_go2_whose_link_stays_away_is_not_told_of_a_watchdog(go2: Callable[...
     assert "watchdog" not in said
 
 
-# Doctor and states that are not as expected.
+# The doctor, and states that are not as expected.
 
 
 def examined(change: Callable[[bytes], bytes]) -> list[Finding]:
     """Return what doctor finds about states that are changed on their way."""
     bench = FakeBench(mode="")
     bench.topics.tamper = lambda topic, p: (change(p),) if topic == topics.LOW_STATE else (p,)
-    return [found for found in Doctor(bench.topics, bench.clock, 1.0).run() if found.area == "states"]
+    return [found for found in Go2Doctor(bench.topics, bench.clock, 1.0).run() if found.area == "states"]
 
 
 def test_another_checksum_rule_is_one_finding() -> None:

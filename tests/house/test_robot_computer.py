@@ -54,7 +54,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.loop import ControlLoop, LoopConfig
 from deal_hw.control.safety import Safety
 from deal_hw.drivers import make_robot, make_transport
-from deal_hw.drivers.go2.doctor import Doctor
+from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.errors import DealHwError
 from deal_hw.transport import WireOptions
 
@@ -69,7 +69,7 @@ plan = RunPlan(robot="go2", transport=transport, port=port, profile="hold", stan
 robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire)
 behaviour = make_behaviour(plan, robot.description)
 ControlLoop(robot, behaviour, Safety(robot.description), clock, bool, LoopConfig(duration_s=plan.total_s))
-Doctor(make_transport(transport, port, clock, options), clock, 0.5)
+Go2Doctor(make_transport(transport, port, clock, options), clock, 0.5)
 made = loaded()
 link = make_transport(transport, port, clock, options)
 link.declare(publish=["rt/lowcmd"], subscribe=["rt/lowstate"])

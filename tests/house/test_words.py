@@ -83,3 +83,13 @@ def test_a_word_that_is_gone_stays_gone(pattern: str, instead: str) -> None:
             if (match := re.search(pattern, line)) and not (kept and re.search(kept, match[0])):
                 found.append(f"{name}:{number}: {line.strip()[:100]}")
     assert not found, f"say {instead!r}:\n" + "\n".join(found)
+
+
+def test_one_name_is_one_type() -> None:
+    """No two public classes of the product share a name."""
+    where: dict[str, list[str]] = {}
+    for folder in ("deal_hw", "calib", "drivers", "policies"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            for name in re.findall(r"^class ([A-Za-z]\w*)", path.read_text(encoding="utf-8"), flags=re.M):
+                where.setdefault(name, []).append(str(path.relative_to(ROOT)))
+    assert {name: paths for name, paths in where.items() if len(paths) > 1} == {}

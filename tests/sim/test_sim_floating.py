@@ -21,12 +21,12 @@ from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.legged.kinematics import standing_targets
 from deal_hw.sim.legged.leg_odometry import leg_odometry, smooth_orientation
-from deal_hw.sim.recordings.target import Sensing, TargetRecording, record_target
+from deal_hw.sim.recordings.target import TargetRecording, TargetSensing, record_target
 from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.types import FloatArray
 
 VECTORS = hnp.arrays(np.float64, (5, 3), elements=st.floats(-1.7, 1.7))
-SENSING = Sensing(
+SENSING = TargetSensing(
     joint_std=DESCRIPTION.sensor.noise,
     joint_resolution=DESCRIPTION.sensor.resolution,
     orientation_std=ORIENTATION_NOISE_RAD,
@@ -54,7 +54,7 @@ def theta(space: ParameterSpace) -> FloatArray:
 
 
 def record(
-    robot: RobotModel, space: ParameterSpace, theta: FloatArray, sensing: Sensing | None
+    robot: RobotModel, space: ParameterSpace, theta: FloatArray, sensing: TargetSensing | None
 ) -> TargetRecording:
     """Record two seconds of swaying."""
     rng = np.random.default_rng(8)

@@ -20,7 +20,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control.excitation_plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.data.recording.dataset import INDEX_NAME, Dataset, digest_of
 from deal_hw.data.recording.episode_info import summarize
-from deal_hw.data.recording.mcap_scan import Found, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_wire
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -116,7 +116,7 @@ def _known_samples() -> frozenset[tuple[int, bytes]]:
             (message.log_time, message.data)
             for data in make_episodes(Path(folder))
             for item in scan(data)
-            if isinstance(item, Found)
+            if isinstance(item, FoundRecord)
             for message in messages(item)
         )
 
@@ -130,7 +130,7 @@ def read_damaged(path: Path) -> None:
     found = {
         (message.log_time, message.data)
         for item in scan(path.read_bytes())
-        if isinstance(item, Found)
+        if isinstance(item, FoundRecord)
         for message in messages(item)
     }
     if invented := found - _known_samples():
@@ -226,11 +226,11 @@ def _mend_digest(data: bytes) -> bytes:
 
 def read_index(path: Path) -> None:
     """Open a dataset for reading and for collecting, and tell about it as `deal-hw data info` does."""
-    from deal_hw.cli.data import Info, data
+    from deal_hw.cli.data import InfoSettings, data
 
     with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), encoding="utf-8")):
-        data(Info(path=path.parent, json=True))
-        data(Info(path=path.parent))
+        data(InfoSettings(path=path.parent, json=True))
+        data(InfoSettings(path=path.parent))
     with Dataset.create_or_open(path.parent, DESCRIPTION, _one_line):
         pass
 

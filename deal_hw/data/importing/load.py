@@ -18,7 +18,7 @@ from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.table import Table, build_table
 from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
-from deal_hw.data.recording.mcap_scan import Found, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, scan
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder import METADATA_NAME
 from deal_hw.data.recording.spikes import position_units
@@ -153,7 +153,7 @@ def is_episode(path: Path) -> bool:
     with open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
     for item in scan(head):
-        if not isinstance(item, Found) or isinstance(item.record, Chunk):
+        if not isinstance(item, FoundRecord) or isinstance(item.record, Chunk):
             return False
         if isinstance(item.record, Metadata):
             return item.record.name == METADATA_NAME

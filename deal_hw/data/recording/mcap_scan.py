@@ -70,7 +70,7 @@ _TYPES: dict[int, type[McapRecord]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundRecord:
     """One readable record; a chunk comes with what is in it.
 
     Attributes:
@@ -101,7 +101,7 @@ class Lost:
     torn: bool
 
 
-def scan(data: bytes) -> Iterator[Found | Lost]:
+def scan(data: bytes) -> Iterator[FoundRecord | Lost]:
     """Yield the records of a file in order, and what lies between them unreadable: one :class:`Lost` a place.
 
     Ends after the footer; a file without one ends with a torn :class:`Lost` (of size 0 if it was cut between
@@ -109,7 +109,7 @@ def scan(data: bytes) -> Iterator[Found | Lost]:
     """
     lost: Lost | None = None
     for item in _Scanner(data).items():
-        if isinstance(item, Found):
+        if isinstance(item, FoundRecord):
             if lost is not None:
                 yield lost
             lost = None
@@ -132,10 +132,10 @@ class _Scanner:
         self._view = memoryview(data)
         self._left = _TRIES * len(data) + MAX_CHUNK_BYTES
         self._room = MAX_RATIO * len(data) + _FREE_BYTES
-        self._chunk: Found | None = None
+        self._chunk: FoundRecord | None = None
         self._searched = 0
 
-    def items(self) -> Iterator[Found | Lost]:
+    def items(self) -> Iterator[FoundRecord | Lost]:
         """Yield what is found and lost; what is lost may come in pieces."""
         data, offset, in_data_section = self._data, len(MCAP0_MAGIC), True
         while True:
@@ -159,7 +159,7 @@ class _Scanner:
                     return
                 offset += lost.size
                 continue
-            if isinstance(result, Found):
+            if isinstance(result, FoundRecord):
                 yield result
                 in_data_section = in_data_section and not isinstance(result.record, DataEnd)
                 if isinstance(result.record, Footer):
@@ -182,7 +182,7 @@ class _Scanner:
         stop = min(stops, default=len(self._data))
         return Lost(offset, stop - offset, reason, torn=not stops)
 
-    def _parse(self, offset: int, end: int) -> Found | str | bool:
+    def _parse(self, offset: int, end: int) -> FoundRecord | str | bool:
         """Return the record, why it is unusable, or True for a kind that is passed over."""
         if self._chunk is not None and self._chunk.offset == offset:
             return self._chunk
@@ -234,7 +234,7 @@ class _Scanner:
             end = offset + _PREFIX.size + size
             if opcode == Opcode.CHUNK and end <= len(self._data):
                 found = self._parse(offset, end)
-                if isinstance(found, Found):
+                if isinstance(found, FoundRecord):
                     self._chunk = found
                     return offset
             mark = self._data.find(_CHUNK_MARK, mark + 1)
@@ -242,7 +242,7 @@ class _Scanner:
         return None
 
 
-def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> Found | str:
+def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> FoundRecord | str:
     try:
         record: McapRecord = kind.read(ReadDataStream(io.BytesIO(body)))  # type: ignore[attr-defined]
         builder = RecordBuilder()
@@ -251,10 +251,10 @@ def _read_record(kind: type[McapRecord], body: memoryview, offset: int) -> Found
         same = builder.end()[_PREFIX.size :] == body
     except _PARSE_ERRORS as error:
         return _damaged(kind, error)
-    return Found(offset, record) if same else _damaged(kind)
+    return FoundRecord(offset, record) if same else _damaged(kind)
 
 
-def _read_chunk(body: memoryview, offset: int) -> Found | str:
+def _read_chunk(body: memoryview, offset: int) -> FoundRecord | str:
     start_ns, end_ns, size, crc, *_ = _CHUNK_HEAD.unpack_from(body)
     packed = body[_CHUNK_HEAD.size :]
     try:
@@ -270,7 +270,7 @@ def _read_chunk(body: memoryview, offset: int) -> Found | str:
             uncompressed_size=size,
         )
         unpacked = dataclasses.replace(record, compression="", data=plain)
-        return Found(offset, record, tuple(breakup_chunk(unpacked, validate_crc=True)))
+        return FoundRecord(offset, record, tuple(breakup_chunk(unpacked, validate_crc=True)))
     except _PARSE_ERRORS as error:
         return _damaged(Chunk, error)
 
@@ -284,6 +284,6 @@ def _is_message_index(body: memoryview) -> bool:
     return len(body) >= 6 and len(body) == 6 + int.from_bytes(body[2:6], "little")
 
 
-def messages(found: Found) -> Iterator[Message]:
+def messages(found: FoundRecord) -> Iterator[Message]:
     """Yield the messages of a chunk."""
     return (record for record in found.contents if isinstance(record, Message))

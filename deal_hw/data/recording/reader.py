@@ -13,7 +13,7 @@ from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
 
 from deal_hw.data.files import read_episode_bytes
-from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
 from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS, message_type
 from deal_hw.errors import (
@@ -147,7 +147,7 @@ def _unreadable(path: Path, error: Exception) -> DatasetError:
     return DatasetError(f"{path} is not an episode that this version reads: {what}")
 
 
-def _records(path: Path) -> Iterator[Found]:
+def _records(path: Path) -> Iterator[FoundRecord]:
     for item in scan(read_episode_bytes(path)):
         if isinstance(item, Lost):
             state = "is torn" if item.torn else "is damaged"

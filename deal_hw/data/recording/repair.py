@@ -17,7 +17,7 @@ from mcap.records import Channel, DataEnd, Footer, Header, Message, Metadata, Sc
 from mcap.writer import CompressionType, Writer
 
 from deal_hw.data.files import read_episode_bytes
-from deal_hw.data.recording.mcap_scan import Found, Lost, messages, scan
+from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import LIBRARY
 from deal_hw.data.recording.schemas import CHANNELS
 from deal_hw.errors import DatasetError
@@ -252,7 +252,7 @@ def _rewrite(data: bytes, findings: _Findings, file: IO[bytes]) -> None:
         for number, channel in sorted(findings.channels.items())
     }
     for item in scan(data):
-        if not isinstance(item, Found):
+        if not isinstance(item, FoundRecord):
             continue
         if isinstance(item.record, Metadata):
             writer.add_metadata(item.record.name, item.record.metadata)

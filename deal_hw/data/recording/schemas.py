@@ -28,7 +28,7 @@ _LENGTH = _SCALARS["uint32"]
 
 
 @dataclass(frozen=True, slots=True)
-class MessageType:
+class RosMessageType:
     """One message type.
 
     Attributes:
@@ -139,11 +139,11 @@ def _put_floats(out: bytearray, values: Any) -> None:
         out += np.asarray(values, dtype="<f8").tobytes()
 
 
-ROBOT = MessageType(
+ROBOT = RosMessageType(
     "deal_hw_msgs/msg/Robot",
     (("string", "description_json"), ("string[]", "joint_names"), ("string[]", "actuated")),
 )
-STATE = MessageType(
+STATE = RosMessageType(
     "deal_hw_msgs/msg/State",
     (
         ("int64", "receive_ns"),
@@ -157,7 +157,7 @@ STATE = MessageType(
         ("float64[]", "effort"),
     ),
 )
-COMMAND = MessageType(
+COMMAND = RosMessageType(
     "deal_hw_msgs/msg/Command",
     (
         ("int64", "stamp_ns"),
@@ -172,7 +172,7 @@ COMMAND = MessageType(
         ("float64[]", "speed_limit"),
     ),
 )
-CYCLE = MessageType(
+CYCLE = RosMessageType(
     "deal_hw_msgs/msg/Cycle",
     (
         ("int64", "cycle"),
@@ -186,11 +186,11 @@ CYCLE = MessageType(
         ("string", "safety_state"),
     ),
 )
-EVENT = MessageType(
+EVENT = RosMessageType(
     "deal_hw_msgs/msg/Event",
     (("int64", "stamp_ns"), ("string", "kind"), ("string", "message"), ("string", "data_json")),
 )
-BODY = MessageType(
+BODY = RosMessageType(
     "deal_hw_msgs/msg/Body",
     (
         ("int64", "receive_ns"),
@@ -208,9 +208,9 @@ BODY = MessageType(
         ("int64", "buttons"),
     ),
 )
-WIRE = MessageType("deal_hw_msgs/msg/Wire", (("int64", "stamp_ns"), ("uint8[]", "payload")))
+WIRE = RosMessageType("deal_hw_msgs/msg/Wire", (("int64", "stamp_ns"), ("uint8[]", "payload")))
 
-CHANNELS: Mapping[str, MessageType] = {
+CHANNELS: Mapping[str, RosMessageType] = {
     "/robot": ROBOT,
     "/state": STATE,
     "/command": COMMAND,
@@ -231,7 +231,7 @@ OLD_TOPICS: Mapping[str, str] = {"/command/asked": "/command/requested"}
 """Topics by the names that recordings of November 2026 have."""
 
 
-def message_type(topic: str) -> MessageType:
+def message_type(topic: str) -> RosMessageType:
     """Return the type of the messages on a topic.
 
     Raises:

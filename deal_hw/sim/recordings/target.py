@@ -28,7 +28,7 @@ Behaviour = Callable[[FloatArray, FloatArray, float], FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sensing:
+class TargetSensing:
     """How a target is observed.
 
     Attributes:
@@ -69,7 +69,7 @@ def record_target(
     *,
     seconds: float,
     latency_s: float = 0.0,
-    sensing: Sensing | None = None,
+    sensing: TargetSensing | None = None,
     rng: np.random.Generator,
     start: FloatArray | None = None,
     settle_s: float = 1.0,
@@ -103,7 +103,7 @@ def record_target(
     batch.set_parameters(np.asarray(theta, dtype=float)[None])
     rest = _settle(robot, batch, start, settle_s)
     ticks = math.ceil(seconds * description.control_rate_hz)
-    sensor = _Sensor(robot, sensing or Sensing(), rng)
+    sensor = _Sensor(robot, sensing or TargetSensing(), rng)
     samples = [batch.position[0]], [batch.velocity[0]]
     loop = ClosedLoop(batch, period, whole=True)
     loop.restart(rest[None], np.array([latency_s]))
@@ -136,7 +136,7 @@ def _settle(robot: RobotModel, batch: ServoBatch, start: FloatArray | None, seco
 
 
 class _Sensor:
-    def __init__(self, robot: RobotModel, sensing: Sensing, rng: np.random.Generator) -> None:
+    def __init__(self, robot: RobotModel, sensing: TargetSensing, rng: np.random.Generator) -> None:
         self._robot, self._sensing, self._rng = robot, sensing, rng
 
     def joints(self, position: FloatArray) -> FloatArray:

@@ -112,10 +112,10 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
             robot = make_robot(config.robot, name, config.port, clock, config.wire)
             yield from examine_robot(config.robot, robot, clock, config.seconds)
             return
-        from deal_hw.drivers.go2.doctor import Doctor
+        from deal_hw.drivers.go2.doctor import Go2Doctor
 
         link = make_topic_transport(name, config.port, clock, config.wire)
-        yield from Doctor(link, clock, config.seconds, config.state_check).run()
+        yield from Go2Doctor(link, clock, config.seconds, config.state_check).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
 

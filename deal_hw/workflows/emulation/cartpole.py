@@ -26,7 +26,7 @@ from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.drivers.cartpole.emulator import Hazards
-    from deal_hw.drivers.cartpole.truth import Truth
+    from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
 
 class CartpoleOnAWire(Protocol):
@@ -101,14 +101,14 @@ def emulate_cartpole(
     say(f"emulator: {emulator.slips} stalls, {emulator.dropped} writes dropped")
 
 
-def _truth(config: EmulateSettings) -> Truth:
+def _truth(config: EmulateSettings) -> CartpoleTruth:
     from deal_hw.drivers.cartpole.oracle import draw_truth
-    from deal_hw.drivers.cartpole.truth import Truth, nominal_truth
+    from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return read_truth(Path(config.truth_from), Truth.from_json)
+        return read_truth(Path(config.truth_from), CartpoleTruth.from_json)
     return draw_truth(
         config.profile,
         config.seed,

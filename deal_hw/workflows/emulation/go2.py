@@ -31,7 +31,7 @@ from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
-    from deal_hw.drivers.go2.emulator.truth import Truth
+    from deal_hw.drivers.go2.emulator.truth import Go2Truth
 
 TRACK_COLUMNS = ("time_s", "x", "y", "heading")
 TRACK_NS = 10_000_000
@@ -183,13 +183,13 @@ def free_port(port: str) -> str:
         return f"{found['host']}:{probe.getsockname()[1]}"
 
 
-def _truth(config: EmulateSettings) -> Truth:
-    from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Truth, draw_truth, nominal_truth
+def _truth(config: EmulateSettings) -> Go2Truth:
+    from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Go2Truth, draw_truth, nominal_truth
 
     if config.nominal:
         return nominal_truth(config.profile, config.seed)
     if config.truth_from is not None:
-        return read_truth(Path(config.truth_from), Truth.from_json)
+        return read_truth(Path(config.truth_from), Go2Truth.from_json)
     return draw_truth(
         config.profile,
         config.seed,
@@ -197,7 +197,7 @@ def _truth(config: EmulateSettings) -> Truth:
     )
 
 
-def _device(config: EmulateSettings, truth: Truth) -> Go2Device:
+def _device(config: EmulateSettings, truth: Go2Truth) -> Go2Device:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
 

@@ -23,7 +23,7 @@ from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.device import CartpoleDevice, TrueTrajectory
 from deal_hw.drivers.cartpole.robot import CartpoleRobot
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, Trajectory
@@ -62,7 +62,7 @@ class VirtualCartpole:
         truth: Its hidden parameters, profile and seed.
     """
 
-    def __init__(self, truth: Truth) -> None:
+    def __init__(self, truth: CartpoleTruth) -> None:
         self.truth = truth
         self.clock = VirtualClock(_START_NS)
         self.device = CartpoleDevice(truth, keep_truth=True)

@@ -23,7 +23,7 @@ from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.emulator.device import Go2Device
-from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.policy import Policy
@@ -74,7 +74,7 @@ class VirtualWalk:
 
 
 def walk(
-    truth: Truth,
+    truth: Go2Truth,
     policy: Policy,
     source: VelocitySource,
     seconds: float,

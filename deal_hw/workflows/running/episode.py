@@ -41,7 +41,7 @@ _IN_VAIN = PassiveConfig(timeout_s=1.0)
 """Where the control process tried for its whole time, the supervisor's own path gets this chance."""
 
 
-class Episode:
+class EpisodeRun:
     """One episode: a recorder, a control process and the account of both."""
 
     def __init__(

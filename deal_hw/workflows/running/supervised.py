@@ -18,7 +18,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers import make_robot
 from deal_hw.workflows.options import File
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, suspend
-from deal_hw.workflows.running.episode import Episode
+from deal_hw.workflows.running.episode import EpisodeRun
 from deal_hw.workflows.running.keyboard import check_terminal
 from deal_hw.workflows.running.plan import RunPlan, check_plan
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
@@ -137,7 +137,7 @@ def run_episodes(
             again = True
             while again:
                 episode = dataclasses.replace(episode, excitation_level=search.level)
-                run = Episode(
+                run = EpisodeRun(
                     episode, robot, port, store, purpose, task, len(search.attempts), claim, view.warn
                 )
                 with view.progress(title, plan.total_s) as show:

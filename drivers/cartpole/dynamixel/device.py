@@ -42,7 +42,7 @@ from deal_hw.drivers.cartpole.mechanics import Mechanics
 from deal_hw.drivers.cartpole.protocol import Target
 from deal_hw.drivers.cartpole.sensor import Motor
 from deal_hw.drivers.cartpole.servo import Servo
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
 OVERLOAD = 1 << 5
 _BITS_PER_BYTE = 10
@@ -76,7 +76,7 @@ class DynamixelDevice(EmulatedDevice):
 
     def __init__(
         self,
-        truth: Truth,
+        truth: CartpoleTruth,
         settings: DynamixelSettings | None = None,
         faults: ServoFaults | None = None,
         *,

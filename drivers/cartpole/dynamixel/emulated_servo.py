@@ -39,7 +39,7 @@ from deal_hw.drivers.cartpole.dynamixel.registers import (
     WATCHDOG_TRIPPED,
     WATCHDOG_UNIT_S,
     Block,
-    Mode,
+    OperatingMode,
     Register,
 )
 
@@ -91,7 +91,12 @@ class EmulatedServo:
     """
 
     def __init__(
-        self, servo: int, baud_rate: int, *, mode: int = Mode.EXTENDED_POSITION, model: int = XL330_M077
+        self,
+        servo: int,
+        baud_rate: int,
+        *,
+        mode: int = OperatingMode.EXTENDED_POSITION,
+        model: int = XL330_M077,
     ) -> None:
         self.present, self.protocol = True, 2
         self._table = bytearray(TABLE_BYTES)

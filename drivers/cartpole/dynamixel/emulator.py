@@ -10,7 +10,7 @@ from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.dynamixel.registers import BAUD_RATES
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
 from deal_hw.drivers.cartpole.emulator import CartpoleEmulator, Hazards
-from deal_hw.drivers.cartpole.truth import Truth
+from deal_hw.drivers.cartpole.truth import CartpoleTruth
 
 _SPEEDS: Final = {
     code: rate for rate in BAUD_RATES if (code := getattr(termios, f"B{rate}", None)) is not None
@@ -41,7 +41,7 @@ class ServoEmulator(CartpoleEmulator):
         return data
 
 
-def dynamixel_emulator(truth: Truth, *, link: Path | None, hazards: Hazards) -> ServoEmulator:
+def dynamixel_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Hazards) -> ServoEmulator:
     """Return an emulated cart-pole on two servos."""
     settings = DynamixelSettings(baud_rate=hazards.servo.baud_rate)
     device = DynamixelDevice(truth, settings, hazards.servo)

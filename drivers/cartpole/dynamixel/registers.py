@@ -84,7 +84,7 @@ NEEDED: Final = (
 """A model without one of these, at these addresses, is none that the driver can use."""
 
 
-class Mode(enum.IntEnum):
+class OperatingMode(enum.IntEnum):
     """Values of Operating Mode that turn more than once round."""
 
     EXTENDED_POSITION = 4

@@ -9,7 +9,13 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from deal_hw.drivers.cartpole.dynamixel.registers import BAUD_RATES, PULSES, RAD_S_PER_COUNT, Block, Mode
+from deal_hw.drivers.cartpole.dynamixel.registers import (
+    BAUD_RATES,
+    PULSES,
+    RAD_S_PER_COUNT,
+    Block,
+    OperatingMode,
+)
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.schema import STRICT
 from deal_hw.types import FloatArray, JointCommand
@@ -121,9 +127,13 @@ class DynamixelSettings:
             raise ConfigurationError(f"pole_zero is {self.pole_zero}; a position is 0 to {PULSES - 1}")
 
     @property
-    def operating_mode(self) -> Mode:
+    def operating_mode(self) -> OperatingMode:
         """What Operating Mode of the belt servo must be."""
-        return Mode.CURRENT_BASED_POSITION if self.mode == "current" else Mode.EXTENDED_POSITION
+        return (
+            OperatingMode.CURRENT_BASED_POSITION
+            if self.mode == "current"
+            else OperatingMode.EXTENDED_POSITION
+        )
 
     @property
     def metres_per_pulse(self) -> float:

@@ -21,7 +21,7 @@ from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.protocol import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.refusals import StateCheck
-from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, Services
+from deal_hw.drivers.go2.motion_switcher import MotionSwitcher, ServiceClient
 from deal_hw.drivers.transports.zenoh_stamps import Stamp
 from deal_hw.errors import DealHwError, FrameError, TransportError, TransportTimeoutError
 from deal_hw.transport import Message, TopicTransport
@@ -89,7 +89,7 @@ class Go2Bridge:
         self._encoder = LowCommandEncoder()
         self._damping = np.array(DESCRIPTION.passive_damping)
         self._frame: LowStateFrame | None = None
-        self._services: Services | None = None
+        self._services: ServiceClient | None = None
         self._foreign = 0
         self._told = self.admission.control
         self._status_ns = self._due_ns = 0
@@ -240,7 +240,7 @@ class Go2Bridge:
         A robot whose own controller is released holds its last command for ever. Where that controller has
         it, or somebody else commands it, the bridge keeps quiet.
         """
-        self._services = Services(self._to_robot, self._pump, self._clock)
+        self._services = ServiceClient(self._to_robot, self._pump, self._clock)
         switcher = MotionSwitcher(self._services, self._clock)
         try:
             # A request that goes out before discovery has ended is lost, and repeated half a second later.

@@ -18,8 +18,8 @@ from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
 from deal_hw.drivers.go2.emulator.sensing import Sensing
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, PERIOD_MS, STANDING, Posture
-from deal_hw.drivers.go2.emulator.sport_service import Services, SportMode
-from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
+from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.protocol import (
     LowCommand,
@@ -74,7 +74,7 @@ class Go2Device:
 
     def __init__(
         self,
-        truth: Truth,
+        truth: Go2Truth,
         *,
         on_stand: bool = False,
         start: Literal["lying", "standing"] = "lying",
@@ -102,7 +102,7 @@ class Go2Device:
         self._motors = Motors(truth, profile)
         self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng)
         self._sport = SportMode(sport)
-        self._services = Services(self._sport)
+        self._services = ServiceServer(self._sport)
         self._service_of = {topics.request(name): name for name in topics.SERVICES}
         self.sport_on_wire, self._sport_waits = sport_on_wire, False
         self._encoder = LowCommandEncoder()

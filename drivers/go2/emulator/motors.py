@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 
 from deal_hw.drivers.go2.descriptions.floor import EFFORT_LIMIT_NM, VELOCITY_LIMIT_RAD_S, per_joint
-from deal_hw.drivers.go2.emulator.profiles import Profile
-from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.emulator.profiles import Go2Profile
+from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.protocol import MODE_SERVO, POSITION_STOP, VELOCITY_STOP, LowCommand
 from deal_hw.types import FloatArray, IntArray
 
@@ -36,7 +36,7 @@ class Motors:
         profile: Torque-speed limit.
     """
 
-    def __init__(self, truth: Truth, profile: Profile) -> None:
+    def __init__(self, truth: Go2Truth, profile: Go2Profile) -> None:
         self._stiffness_factor, self._damping_factor = np.array(truth.stiffness), np.array(truth.damping)
         self._bias = np.array(truth.encoder_bias)
         self._limit = np.array(per_joint(EFFORT_LIMIT_NM))

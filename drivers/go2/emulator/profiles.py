@@ -12,7 +12,7 @@ from deal_hw.errors import UnknownNameError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Profile:
+class Go2Profile:
     """How an emulated robot differs from its equations. Noise is white, given as standard deviations.
 
     Attributes:
@@ -68,9 +68,9 @@ _SENSOR: Final[Mapping[str, Any]] = {
     "specific_force_noise": 0.05,
 }
 PROFILES: Final = {
-    "ideal": Profile(name="ideal"),
-    "sensor": Profile(name="sensor", latency_ms=(2, 10), **_SENSOR),
-    "realistic": Profile(
+    "ideal": Go2Profile(name="ideal"),
+    "sensor": Go2Profile(name="sensor", latency_ms=(2, 10), **_SENSOR),
+    "realistic": Go2Profile(
         name="realistic",
         latency_ms=(2, 10),
         jitter_ms=2,
@@ -86,7 +86,7 @@ PROFILES: Final = {
 """No figures of a real Go2's sensors are published that we know of: these are assumptions."""
 
 
-def profile(name: str) -> Profile:
+def profile(name: str) -> Go2Profile:
     """Return a profile by name.
 
     Raises:

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 
 from deal_hw.drivers.go2.emulator.motors import Motors
-from deal_hw.drivers.go2.emulator.profiles import Profile
-from deal_hw.drivers.go2.emulator.truth import Truth
+from deal_hw.drivers.go2.emulator.profiles import Go2Profile
+from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.protocol import LowState
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
@@ -71,7 +71,12 @@ class Sensing:
     """
 
     def __init__(
-        self, sim: LeggedSimulation, motors: Motors, truth: Truth, profile: Profile, rng: np.random.Generator
+        self,
+        sim: LeggedSimulation,
+        motors: Motors,
+        truth: Go2Truth,
+        profile: Go2Profile,
+        rng: np.random.Generator,
     ) -> None:
         self.battery = Battery()
         self.hot: int | None = None

@@ -71,7 +71,7 @@ class SportMode:
             self.name, self._release_ms = "", None
 
 
-class Services:
+class ServiceServer:
     """Answers requests.
 
     Attributes:

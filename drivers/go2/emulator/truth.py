@@ -29,7 +29,7 @@ DEFAULT_RANGE_RATIO: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Truth:
+class Go2Truth:
     """What a calibrator has to find out; tuples follow the 12 joints in model order.
 
     Attributes:
@@ -115,7 +115,7 @@ class Truth:
         return values
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Truth:
+    def from_json(cls, values: Mapping[str, Any]) -> Go2Truth:
         """Return the truth that :meth:`to_json` wrote; other keys are ignored.
 
         Raises:
@@ -139,12 +139,12 @@ class Truth:
 _PER_JOINT: Final = ("stiffness", "damping", "joint_damping", "frictionloss", "armature", "encoder_bias")
 
 
-def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Truth:
+def nominal_truth(profile: str = "ideal", seed: int = 0, **changes: Any) -> Go2Truth:
     """Return a truth that equals the description, without latency unless given among the changes."""
-    return Truth(profile=find_profile(profile).name, seed=seed, **changes)
+    return Go2Truth(profile=find_profile(profile).name, seed=seed, **changes)
 
 
-def draw_truth(profile: str, seed: int, *, range_ratio: float = DEFAULT_RANGE_RATIO) -> Truth:
+def draw_truth(profile: str, seed: int, *, range_ratio: float = DEFAULT_RANGE_RATIO) -> Go2Truth:
     """Draw a hidden truth: each quantity log-uniformly in the middle 80 % of its range.
 
     Args:
@@ -169,7 +169,7 @@ def draw_truth(profile: str, seed: int, *, range_ratio: float = DEFAULT_RANGE_RA
 
     low, high = found.latency_ms
     bias = found.encoder_bias_rad
-    return Truth(
+    return Go2Truth(
         profile=profile,
         seed=seed,
         stiffness=around(1.0),
