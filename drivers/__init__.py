@@ -20,6 +20,7 @@ from deal_hw.transport import TopicTransport, Transport, WireOptions
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.control.balance import BalanceResult
     from deal_hw.control.velocity_error import Track
     from deal_hw.drivers.go2.claim import WireClaim
 
@@ -46,6 +47,8 @@ SPACES: Final = {
 """Tables of parameter sets, name -> function; the first of each is the default."""
 ODOMETRY: Final = {"go2": "deal_hw.drivers.go2.odometry:walked"}
 """Robots that tell where they walked: a function of a recording."""
+BALANCE: Final = {"cartpole": "deal_hw.control.balance:recorded_balance"}
+"""Robots whose policies hold a pole up, and what judges a recording of it."""
 TRANSPORTS: Final = {
     "serial": "deal_hw.drivers.transports.serial_transport:SerialTransport",
     "dds": "deal_hw.drivers.transports.dds_transport:DdsTransport",
@@ -76,6 +79,7 @@ REACHED_BY: Final[Mapping[str, tuple[str, ...]]] = {
 """Transports that reach each robot; the first is the default."""
 
 __all__ = [
+    "BALANCE",
     "CAN_BUSES",
     "DESCRIPTIONS",
     "MAKERS",
@@ -86,6 +90,7 @@ __all__ = [
     "TOPIC_TRANSPORTS",
     "TRANSPORTS",
     "adopt_robot",
+    "balanced",
     "can_bus",
     "claim_name",
     "default_transport",
@@ -166,6 +171,14 @@ def walked(name: str, trajectory: Trajectory) -> Track | None:
     if name not in ODOMETRY:
         return None
     found: Track | None = _find("odometry", ODOMETRY, name)(trajectory)
+    return found
+
+
+def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
+    """Return how well a robot's pole was held up; None where it has none, or the recording no duration."""
+    if name not in BALANCE:
+        return None
+    found: BalanceResult | None = _find("balance", BALANCE, name)(trajectory)
     return found
 
 

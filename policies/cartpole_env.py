@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.control.balance import CART, POLE
 from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterDistribution
@@ -16,7 +17,6 @@ from deal_hw.policies.vector_env import ServoVectorEnv, check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
 from deal_hw.types import FloatArray
 
-CART, POLE = 0, 1
 VELOCITIES, ACTIONS = 8, 14
 """How many velocities and former actions the policy observes."""
 

@@ -114,7 +114,7 @@ def task_score(truth: CartpoleTruth, policy: Policy, episodes: int = TASK_EPISOD
 
     A run that the safety filter ended early counts as fallen over the rest: pi rad, and a cart at rest.
     """
-    from deal_hw.policies.evaluate import TASK_SECONDS, balance_result
+    from deal_hw.control.balance import TASK_SECONDS, balance_result
 
     virtual = VirtualCartpole(truth)
     angles, speeds = [], []

@@ -122,8 +122,8 @@ def task_scores(dataset: Path, episodes: int) -> FloatArray:
 
     What is missing of a run that the safety filter ended early counts as fallen: pi rad, and a cart at rest.
     """
+    from deal_hw.control.balance import TASK_SECONDS, balance_result
     from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.policies.evaluate import TASK_SECONDS, balance_result
 
     store = Dataset.open(dataset)
     scores = []

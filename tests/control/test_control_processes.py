@@ -454,6 +454,9 @@ def test_deploy_balances_with_a_policy_file(emulator: Emulator, tmp_path: Path) 
     assert report.outcome is Outcome.FINISHED
     episode = Dataset.open(tmp_path / "dataset").read(0)
     assert (episode.metadata["purpose"], episode.metadata["task"]) == ("deploy", "stand")
+    said = report.episodes[-1]
+    assert said.balance is not None and not said.balance.fell and said.balance.angle_error_rad < 0.1
+    assert any(line.startswith("  pole upright (within 0.5 rad) for 1.") for line in said.lines())
     assert abs(episode.trajectory.position[:, 1]).max() < 0.3
 
 

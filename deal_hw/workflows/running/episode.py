@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw.clock import MonotonicClock
+from deal_hw.control.balance import BalanceResult
 from deal_hw.control.passive import PassiveConfig, make_passive
 from deal_hw.control.process_channel import (
     CONNECTING,
@@ -24,7 +25,7 @@ from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
-from deal_hw.drivers import ODOMETRY, walked
+from deal_hw.drivers import BALANCE, ODOMETRY, balanced, walked
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
 from deal_hw.version import __version__
@@ -116,7 +117,9 @@ class EpisodeRun:
                 moved = self._store.note_episode(self._path, facts).excitation
                 if moved is not None:
                     report = dataclasses.replace(report, motion=Excitation(**moved))
-                report = dataclasses.replace(report, walk=self._walk(self._path))
+                report = dataclasses.replace(
+                    report, walk=self._walk(self._path), balance=self._balance(self._path)
+                )
             except (DealHwError, OSError) as err:
                 # As on a full disk. The report matters more, and the next open takes the recording in.
                 report = dataclasses.replace(report, warnings=(*report.warnings, str(err)))
@@ -129,6 +132,12 @@ class EpisodeRun:
         trajectory = read_trajectory(path)
         wanted, track = wanted_velocity(trajectory), walked(self._plan.robot, trajectory)
         return None if wanted is None or track is None else velocity_error(track, wanted)
+
+    def _balance(self, path: Path) -> BalanceResult | None:
+        """Return how well a policy held the pole up."""
+        if self._plan.robot not in BALANCE or self._plan.profile != "balance":
+            return None
+        return balanced(self._plan.robot, read_trajectory(path))
 
     def _make_passive(
         self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw import errors
+from deal_hw.control.balance import FALLEN_RAD, BalanceResult
 from deal_hw.control.loop import Outcome
 from deal_hw.control.loop_timing import LoopTimingReport
 from deal_hw.control.velocity_error import VelocityError
@@ -35,6 +36,7 @@ class EpisodeReport:
         motion: How much the recording moves; None where nothing was recorded.
         walk: How well a walking robot followed what it was told, by its own sensors; None where it did not
             walk or nothing was recorded.
+        balance: How well a policy held the cart-pole's pole up, as the robot reported; None where none did.
     """
 
     path: Path | None
@@ -49,6 +51,7 @@ class EpisodeReport:
     error: str = ""
     motion: Excitation | None = None
     walk: VelocityError | None = None
+    balance: BalanceResult | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -77,6 +80,12 @@ class EpisodeReport:
             lines.append(
                 f"  velocity error, by leg odometry and IMU: {self.walk.velocity_m_s:.2f} m/s, "
                 f"{self.walk.yaw_rad_s:.2f} rad/s over {self.walk.seconds:.0f} s of walking"
+            )
+        if self.balance is not None:
+            lines.append(
+                f"  pole upright (within {FALLEN_RAD} rad) for {self.balance.upright_s:.1f} of "
+                f"{self.balance.duration_s:.1f} s; mean |angle| {self.balance.angle_error_rad:.3f} rad, "
+                f"mean |cart speed| {self.balance.cart_speed_m_s:.3f} m/s"
             )
         return lines
 
