@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -182,25 +183,43 @@ def _dataset_table(dataset: Dataset) -> Table:
     # Words from a file are no markup, hence Text.
     title = Text(f"{dataset.folder}: {dataset.description['name']}, description {dataset.digest}")
     table = Table(title=title, title_justify="left")
-    for name in ("episode", "purpose", "recorded (UTC)"):
+    table.add_column("no.", justify="right", no_wrap=True)
+    for name in ("motion", "recorded (UTC)"):
         table.add_column(name)
-    for name in ("seconds", "states", "commands", "clock offset", "drift"):
-        table.add_column(name, justify="right")
-    table.add_column("checks")
+    for name in ("s", "states", "commands"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in ("moves by", "checks"):
+        table.add_column(name)
     for episode in dataset.episodes:
-        offset, drift = _clock_texts(episode)
         table.add_row(
-            Text(episode.file),
-            Text(episode.purpose),
-            Text(episode.wall_utc[:19]),
-            f"{episode.duration_s:.2f}",
+            str(int(Path(episode.file).stem)),
+            Text(_motion(episode)),
+            Text(episode.wall_utc[2:16].replace("T", " ")),
+            f"{episode.duration_s:.1f}",
             str(episode.states),
             str(episode.commands),
-            offset,
-            drift,
+            Text(_moved_by(episode, dataset.description)),
             _worst(episode),
         )
     return table
+
+
+def _motion(episode: EpisodeInfo) -> str:
+    """Return why an episode was recorded and what was played, with its level where that was changed."""
+    level = float(episode.facts.get("excitation_level") or 0.0)
+    words = [episode.purpose, str(episode.facts.get("profile") or ""), f"level {level:+g}" if level else ""]
+    return " ".join(word for word in words if word)
+
+
+def _moved_by(episode: EpisodeInfo, description: Mapping[str, Any]) -> str:
+    """Return the range of each joint's positions, of more than two joints the widest alone."""
+    ranges = (episode.excitation or {}).get("position_range") or ()
+    units, names = description.get("position_units") or (), description.get("joint_names") or ()
+    parts = [f"{value:.2f} {unit}" for value, unit in zip(ranges, units, strict=False)]
+    if len(parts) <= 2:
+        return ", ".join(parts)
+    widest = max(range(len(parts)), key=lambda index: ranges[index])
+    return f"{parts[widest]} ({names[widest]})"
 
 
 def _clock_texts(episode: EpisodeInfo) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -9,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.data import InfoSettings, Repair, Verify, data
+from deal_hw.cli.data import InfoSettings, Repair, Verify, _moved_by, data
 from deal_hw.data.recording.dataset import Dataset
+from deal_hw.data.recording.episode_info import EpisodeInfo
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError
 
@@ -24,19 +26,45 @@ def dataset(tmp_path: Path, write_episode: WriteEpisode) -> Path:
     with Dataset.create_or_open(folder, DESCRIPTION) as collection:
         path = collection.next_episode_path()
         shutil.copy(write_episode("source.mcap"), path)
-        collection.note_episode(path)
+        collection.note_episode(path, {"profile": "rich", "excitation_level": 1.5})
     return folder
 
 
 def test_info_of_a_dataset(
     dataset: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The table names robot, episode and counts."""
-    monkeypatch.setenv("COLUMNS", "200")
+    """On 80 columns the table has every head and value in one line: motion, level, counts, what moved."""
+    monkeypatch.setenv("COLUMNS", "80")
     assert data(InfoSettings(path=dataset)) == 0
     printed = capsys.readouterr().out
-    for words in ("cartpole", DESCRIPTION.digest(), "episodes/000000.mcap", "600", "150"):
-        assert words in printed
+    lines = printed.splitlines()
+    (heads,) = (line for line in lines if "checks" in line)
+    assert all(words in heads for words in ("no.", "motion", "states", "commands", "moves by"))
+    (row,) = (line for line in lines if "rich" in line)
+    assert "test rich" in row and "level +1.5" in printed
+    # 600 samples of 1 mm each, and a pole that goes to and fro by 0.49 rad.
+    assert all(words in printed for words in ("600", "150", "0.60 m", "0.49 rad", "cartpole"))
+    assert max(map(len, lines)) <= 80
+
+
+def test_of_many_joints_the_widest_is_shown() -> None:
+    """Twelve ranges would not fit."""
+    episode = EpisodeInfo(
+        file="episodes/000000.mcap",
+        purpose="collect",
+        policy_digest="",
+        wall_utc="",
+        duration_s=1.0,
+        states=1,
+        commands=1,
+        cycles=1,
+        verdicts=(),
+        excitation={"position_range": [0.1, 0.9, 0.3]},
+        clock=None,
+    )
+    facts = {"joint_names": ["a", "b", "c"], "position_units": ["rad"] * 3}
+    assert _moved_by(episode, facts) == "0.90 rad (b)"
+    assert _moved_by(dataclasses.replace(episode, excitation=None), facts) == ""
 
 
 def test_info_as_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,7 +73,8 @@ def test_info_as_json(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None
     whole = json.loads(capsys.readouterr().out)
     assert whole["robot"] == "cartpole"
     assert data(InfoSettings(path=dataset / "episodes" / "000000.mcap", json=True)) == 0
-    assert json.loads(capsys.readouterr().out) == whole["episodes"][0]
+    # What the collector knew is in the index alone.
+    assert json.loads(capsys.readouterr().out) == whole["episodes"][0] | {"facts": {}}
 
 
 def test_info_of_an_episode_shows_checks(

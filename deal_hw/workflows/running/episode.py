@@ -113,7 +113,8 @@ class EpisodeRun:
         report = account(end, self._path, self._robot.watchdog_s)
         if self._store is not None and self._path is not None:
             try:
-                facts = {"task": self._metadata["task"], **report.to_json()}
+                kept = {name: self._metadata[name] for name in ("task", "profile", "excitation_level")}
+                facts = {**kept, **report.to_json()}
                 moved = self._store.note_episode(self._path, facts).excitation
                 if moved is not None:
                     report = dataclasses.replace(report, motion=Excitation(**moved))
