@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from types import TracebackType
 from typing import Any
 
 from deal_hw.workflows.emulation.process import EmulatorProcess, arguments
@@ -36,11 +35,6 @@ class EmulatedRobot(EmulatorProcess):
         if revealed:
             self.truth = json.loads(revealed[-1])
         return out, errors
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         return f"<emulated {self.robot}{f' on {self.port}' if self.port else ', not started'}>"

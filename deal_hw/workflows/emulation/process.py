@@ -101,7 +101,18 @@ class VerbProcess:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.stop()
+        """Stop it; where it had ended by itself, that is why the robot could not be reached any more.
+
+        Raises:
+            TransportError: It had ended, and the block ended in an error of a transport.
+        """
+        status = self._process.poll() if self._process is not None else None
+        _, errors = self.stop()
+        if status is not None and isinstance(error, TransportError):
+            raise TransportError(
+                f"{self._what} ended by itself with status {status}, and its port with it; its last words: "
+                f"{errors.strip()[-500:] or 'none'}"
+            ) from error
 
 
 class EmulatorProcess(VerbProcess):
