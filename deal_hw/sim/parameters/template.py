@@ -61,7 +61,8 @@ def _section(model: Any, kind: Kind, *, active: bool) -> list[str]:
     for element, value, unit in rows:
         searchable = active and (kind.scale == "linear" or value > 0) and not _doubled(model, kind, element)
         text = f"- {{kind: {kind.name}, elements: {_quoted(element)}}}"
-        lines.append(f"  {'' if searchable else '# '}{text}  # {value:.6g} {unit}\n")
+        # A sum with 0, so that a value of -0.0 is written as 0.
+        lines.append(f"  {'' if searchable else '# '}{text}  # {value + 0.0:.6g} {unit}\n")
     return lines
 
 
