@@ -122,12 +122,8 @@ def interrupts_deferred() -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, before)
         if pressed:
-            # To who waited for it before, perhaps a block of this kind around ours. Called, not raised as a
-            # signal: Python 3.10 would run the handler some lines later, outside of the block.
-            if callable(before):
-                before(signal.SIGINT, None)
-            else:
-                signal.raise_signal(signal.SIGINT)
+            # To who waited for it before: that may be a block of this kind around ours.
+            signal.raise_signal(signal.SIGINT)
 
 
 def _sync(file: Path) -> None:
