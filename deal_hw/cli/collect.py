@@ -14,7 +14,7 @@ from deal_hw.workflows.running.report import RunReport
 
 @dataclass(frozen=True, kw_only=True)
 class Collect(CollectSettings):
-    """Record the robot while it moves with an informative motion."""
+    """Record the robot during an informative motion."""
 
     robot: tyro.conf.Positional[str]
 

@@ -12,7 +12,7 @@ from deal_hw.workflows.design_excitation import ExcitationReport, ExcitationSett
 
 @dataclass(frozen=True, kw_only=True)
 class DesignExcitation(ExcitationSettings):
-    """Compute what to play on a robot so that a recording of it tells most."""
+    """Compute the most informative motion to play on a robot."""
 
     robot: tyro.conf.Positional[str]
 

@@ -72,7 +72,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
     {
         "collect": _verb(
             "collect",
-            help="record the robot while it moves with an informative motion",
+            help="record the robot during an informative motion",
             example="collect cartpole --port /dev/ttyUSB0 --out runs/first",
         ),
         "calibrate": _verb(
@@ -114,7 +114,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         ),
         "design-excitation": _verb(
             "design-excitation",
-            help="compute what to play on a robot so that a recording tells most",
+            help="compute the most informative motion to play on a robot",
             example="design-excitation cartpole --out runs/first/excitation.json",
             extra="calib",
         ),
@@ -175,7 +175,7 @@ def help_text() -> str:
     for title, verbs in (("the five jobs, in order", JOBS), ("beside them", TOOLS)):
         lines += ["", f"{title}:"]
         for name, verb in verbs.items():
-            lines += [f"  {name:<10} {verb.help}", f"  {'':<10}   deal-hw {verb.example}"]
+            lines += [f"  {name:<17} {verb.help}", f"  {'':<17}   deal-hw {verb.example}"]
     lines += [
         "",
         "No robot at hand? `deal-hw demo` needs none; `deal-hw emulate cartpole` prints a port to use.",
