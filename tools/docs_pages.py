@@ -202,6 +202,18 @@ def api_page() -> str:
             f"      toc_label: {heading}",
             "",
         ]
+        settings = getattr(getattr(deal_hw, heading.rpartition(".")[2]), "settings", None)
+        if isinstance(settings, type):
+            title = f"Arguments of {heading}"
+            lines += [
+                f"::: {settings.__module__}.{settings.__qualname__}",
+                "    options:",
+                f"      heading: {title}",
+                f"      toc_label: {title}",
+                "      members_order: source",
+                "      inherited_members: true",
+                "",
+            ]
     for title, modules in CONTRACTS.items():
         lines += [f"## {title}", ""]
         for module in modules:
@@ -336,6 +348,11 @@ def on_env(env: Any, config: Any, files: Any) -> Any:
     """Let the search of pages on disk run by our own script: the plugin names one of another host."""
     config.extra["polyfills"] = ["assets/search_worker.js"]
     return env
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Show names in docstrings as names: mkdocstrings does not know Sphinx's roles."""
+    return re.sub(r":(?:class|func|meth|mod|attr|data|exc):(<code>)~?", r"\1", html)
 
 
 def on_files(files: Any, config: Any) -> Any:

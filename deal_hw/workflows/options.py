@@ -164,7 +164,7 @@ def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Call
 
     Args:
         settings: The settings' class; the function gets its signature, and refuses unknown names by
-            :class:`UnknownNameError`.
+            :class:`UnknownNameError`. The function's attribute ``settings`` is the class, for the reference.
     """
     signature = inspect.signature(settings)
 
@@ -178,6 +178,7 @@ def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Call
 
         del call.__wrapped__
         call.__signature__ = signature  # type: ignore[attr-defined]
+        call.settings = settings  # type: ignore[attr-defined]
         return call
 
     return with_arguments

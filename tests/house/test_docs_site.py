@@ -130,3 +130,19 @@ def test_a_style_sheet_loads_nothing_foreign(site: Path) -> None:
 def test_no_site_is_a_complaint(tmp_path: Path) -> None:
     """An empty folder does not pass for a site."""
     assert "make docs" in check_site.complaints(tmp_path)[0]
+
+
+def test_the_reference_has_the_arguments_of_each_function() -> None:
+    """A function of settings shows in a signature that it takes settings; its arguments are the class's."""
+    page = docs_pages.api_page()
+    for name in ("collect", "deploy", "train", "emulate", "inspect", "replay", "design_excitation"):
+        assert f"heading: Arguments of deal_hw.{name}\n" in page
+    assert "::: deal_hw.workflows.collect.CollectSettings\n" in page
+
+
+def test_names_in_docstrings_are_names() -> None:
+    """Sphinx's roles of the docstrings are not shown."""
+    shown = docs_pages.on_page_content(
+        "of :class:<code>~deal_hw.robot.Robot</code> and :meth:<code>x</code>", None, None, None
+    )
+    assert shown == "of <code>deal_hw.robot.Robot</code> and <code>x</code>"
