@@ -204,7 +204,9 @@ def test_k11_names_its_null_directions_on_real_information(noisy: Case) -> None:
     space = parameter_space().with_ratio(5.0)
     problem = Problem(noisy.robot, space, [noisy.fit], threads=1)
     shooting = Shooting(problem, 80)
-    start = shooting.start(noisy.theta, noisy.latency_s, [noisy.fit_truth])
+    assert noisy.truth is not None
+    theta = np.array([noisy.truth.parameters[name] for name in space.names])
+    start = shooting.start(theta, noisy.latency_s, [noisy.fit_truth])
     hessian = shooting.normal(start, stretch=SETTINGS.near, central=True).hessian
     words = _unseen(space, hessian[:-1, :-1])
     assert len(words) == 2

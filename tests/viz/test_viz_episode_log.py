@@ -116,7 +116,7 @@ def test_commands_stand_where_the_device_received_them(rrd: Rrd, shown: Any) -> 
     np.testing.assert_allclose(device, 0.02 * np.arange(len(sent)) + 0.4e-3, atol=1e-9)
     np.testing.assert_allclose(host, t.sent_s, atol=1e-9)
     np.testing.assert_array_equal(sent, t.position_target[:, 0])
-    np.testing.assert_array_equal(rrd.scalars("/commands/cart/asked")[2], t.requested_position[:, 0])
+    np.testing.assert_array_equal(rrd.scalars("/commands/cart/requested")[2], t.requested_position[:, 0])
 
 
 def test_loop_timing_is_in_milliseconds(rrd: Rrd) -> None:
