@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from deal_hw.errors import MissingExtraError
 from deal_hw.workflows.emulation.common import (
+    choose_truth,
     happenings,
-    read_truth,
     realtime_priority,
     reveal,
     run_until,
@@ -105,14 +105,12 @@ def _truth(config: EmulateSettings) -> CartpoleTruth:
     from deal_hw.drivers.cartpole.oracle import draw_truth
     from deal_hw.drivers.cartpole.truth import CartpoleTruth, nominal_truth
 
-    if config.nominal:
-        return nominal_truth(config.profile, config.seed)
-    if config.truth_from is not None:
-        return read_truth(Path(config.truth_from), CartpoleTruth.from_json)
-    return draw_truth(
-        config.profile,
-        config.seed,
-        range_ratio=CARTPOLE_RANGE_RATIO if config.range_ratio is None else config.range_ratio,
+    return choose_truth(
+        config,
+        nominal_truth,
+        lambda profile, seed, ratio: draw_truth(profile, seed, range_ratio=ratio),
+        CartpoleTruth.from_json,
+        CARTPOLE_RANGE_RATIO,
     )
 
 

@@ -16,6 +16,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
+from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.options import File
 from deal_hw.workflows.say import Say
 
@@ -87,6 +88,34 @@ def run_until(
             return
         if parent is not None and count % _PARENT_CHECK_STEPS == 0 and os.getppid() != parent:
             return
+
+
+def choose_truth(
+    config: EmulateSettings,
+    nominal: Callable[[str, int], T],
+    draw: Callable[[str, int, float], T],
+    parse: Callable[[Mapping[str, Any]], T],
+    range_ratio: float,
+) -> T:
+    """Return what an emulated robot hides: the nominal values, those of a file, or drawn ones.
+
+    Args:
+        config: Says which.
+        nominal: Returns the nominal truth of a profile and a seed.
+        draw: Returns a truth of a profile, a seed and a range ratio.
+        parse: Makes a truth of a file's values.
+        range_ratio: The ratio where the settings name none.
+
+    Raises:
+        ConfigurationError: The file holds no truth, or none can be drawn.
+    """
+    if config.nominal:
+        return nominal(config.profile, config.seed)
+    if config.truth_from is not None:
+        return read_truth(Path(config.truth_from), parse)
+    return draw(
+        config.profile, config.seed, range_ratio if config.range_ratio is None else config.range_ratio
+    )
 
 
 def read_truth(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:

@@ -20,8 +20,8 @@ from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameErr
 from deal_hw.reading import reading
 from deal_hw.transport import TopicTransport, WireOptions
 from deal_hw.workflows.emulation.common import (
+    choose_truth,
     happenings,
-    read_truth,
     realtime_priority,
     reveal,
     run_until,
@@ -186,14 +186,12 @@ def free_port(port: str) -> str:
 def _truth(config: EmulateSettings) -> Go2Truth:
     from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Go2Truth, draw_truth, nominal_truth
 
-    if config.nominal:
-        return nominal_truth(config.profile, config.seed)
-    if config.truth_from is not None:
-        return read_truth(Path(config.truth_from), Go2Truth.from_json)
-    return draw_truth(
-        config.profile,
-        config.seed,
-        range_ratio=DEFAULT_RANGE_RATIO if config.range_ratio is None else config.range_ratio,
+    return choose_truth(
+        config,
+        nominal_truth,
+        lambda profile, seed, ratio: draw_truth(profile, seed, range_ratio=ratio),
+        Go2Truth.from_json,
+        DEFAULT_RANGE_RATIO,
     )
 
 
