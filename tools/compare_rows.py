@@ -47,7 +47,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-FIELDS: Mapping[str, str] = {"polish": "refined", "xi": "range_ratio"}
+from deal_hw.bench.rows import FORMER_BENCHES, FORMER_FIELDS
+
+FIELDS: Mapping[str, str] = {"polish": "refined", **FORMER_FIELDS}
 """Old name of a row's field -> new name."""
 
 METHODS = {
@@ -57,9 +59,6 @@ METHODS = {
     "centre": "midpoint",
 }
 """Old name of a method -> new name; others keep theirs."""
-
-BENCHES = {"honest": "fixed-range"}
-"""Old name of a bench -> new name; others keep theirs."""
 
 WHOLE = frozenset({"default", "local", "output-error"})
 """Methods, by their new names, that decide themselves what follows their search."""
@@ -233,7 +232,7 @@ def cell_key(row: Row, methods: Mapping[str, str]) -> Key:
     method = methods.get(method, method)
     known = {
         **{name: str(row.get(name, "")) for name in KEY},
-        "bench": BENCHES.get(bench, bench),
+        "bench": FORMER_BENCHES.get(bench, bench),
         "demonstration": str(row.get("demonstration", "excite")),
         "demonstration_s": f"{float(row.get('demonstration_s', 4.0)):g}" if "task" in row else "",
         "range_ratio": f"{float(row['range_ratio']):g}" if row.get("range_ratio") is not None else "",

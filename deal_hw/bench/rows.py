@@ -64,8 +64,11 @@ def run_cells(cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], No
     return rows
 
 
-RENAMED = {"xi": "range_ratio", "honest": "fixed-range"}
-"""Fields and benches by the names that older files have."""
+FORMER_FIELDS = {"xi": "range_ratio"}
+"""Fields by the names that older files have."""
+
+FORMER_BENCHES = {"honest": "fixed-range"}
+"""Benches, likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +90,11 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     found = read_json(path, _Rows, "rows of a bench", "name another file")
     if found.format != FORMAT:
         raise DatasetError(f"{path} has format {shown(found.format)}, not {FORMAT!r}; name another file")
-    return [
-        {RENAMED.get(name, name): RENAMED.get(str(value), value) for name, value in row.items()}
-        for row in found.rows
-    ]
+    rows = [{FORMER_FIELDS.get(name, name): value for name, value in row.items()} for row in found.rows]
+    for row in rows:
+        if row.get("bench") in FORMER_BENCHES:
+            row["bench"] = FORMER_BENCHES[row["bench"]]
+    return rows
 
 
 def save_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
