@@ -89,6 +89,7 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
     """
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.methods import usual_budget
+    from deal_hw.sim.engine.batch import default_threads
 
     cpu_s = time.process_time()
     result = calibrate_episodes(
@@ -109,7 +110,7 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
     return {
         "parameters": len(case.space),
         "recorded_s": float(case.fit.steps * case.fit.step_s),
-        "threads": threads or len(os.sched_getaffinity(0)),
+        "threads": threads or default_threads(),
         "steps": result.steps,
         "seconds": result.seconds,
         "cpu_seconds": cpu_s,
