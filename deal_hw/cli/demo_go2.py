@@ -21,6 +21,8 @@ from deal_hw.control.loop import Outcome
 from deal_hw.control.velocity_error import Track, VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.reader import read_episode
+from deal_hw.data.recording.telemetry_checks import Severity
+from deal_hw.data.recording.telemetry_checks import check as check_recording
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.drivers.go2.descriptions.on_stand import on_floor
 from deal_hw.errors import ConfigurationError, SafetyError
@@ -144,21 +146,30 @@ class _Emulated:
         return _Walked(report=report, track=self.track)
 
     def whole_walk(self, policy: Path, script: Path, seconds: float, dataset: Path, times: int) -> _Walked:
-        """Let it walk, again where a walk ended early: a part of one is nothing to calibrate from.
+        """Let it walk, again where a walk ended early or its recording cannot be calibrated from.
 
         Raises:
-            SafetyError: Each walk ended early.
+            SafetyError: No walk was whole.
         """
         for _ in range(ATTEMPTS):
             walked = self.walk(policy, script, seconds, dataset, times)
-            last = walked.report.episodes[-1]
-            if last.outcome is Outcome.FINISHED:
+            reason = next(filter(None, map(_unusable, walked.report.episodes)), "")
+            if not reason:
                 return walked
-            print(f"warning: the walk ended early ({last.reason})", file=sys.stderr)
+            print(f"warning: the walk is of no use ({reason})", file=sys.stderr)
         raise SafetyError(
-            f"{ATTEMPTS} walks ended early, the last one: {last.reason}. States that are too old come from a "
-            "computer that is busy or pauses (`deal-hw doctor`); end other programs, or try another --seed"
+            f"{ATTEMPTS} walks are of no use, the last one: {reason}. Old states and clocks that jump come "
+            "from a computer that is busy or pauses (`deal-hw doctor`); end other programs, or try another "
+            "--seed"
         )
+
+
+def _unusable(episode: EpisodeReport) -> str:
+    """Return why a walk is nothing to calibrate from; "" where it is."""
+    if episode.outcome is not Outcome.FINISHED or episode.path is None:
+        return episode.reason
+    verdicts = check_recording(read_episode(episode.path).trajectory)
+    return "; ".join(v.message for v in verdicts if v.severity is Severity.FAIL)
 
 
 @contextmanager

@@ -13,8 +13,9 @@ from deal_hw.transport import Message
 PERIOD_MS: Final = 2
 RESTART_MS: Final = 1000
 """A clock that goes back further than this was restarted; by less, a state was overtaken."""
-_DRIFT: Final = 5e-4
-"""Largest rate difference between host and robot clock that counts as drift."""
+OFFSET_WINDOW_NS: Final = 1_000_000_000
+"""The clocks' offset is the least of one to two such times: a robot whose clock stood still for a moment
+(a computer that paused) is behind for good, and commands are placed by this offset."""
 _U32: Final = 1 << 32
 
 
@@ -27,7 +28,7 @@ class StateStream:
         stale: States so far that were no newer than the one before.
         sequence: Number of the newest state, counted in periods of the robot's clock.
         device_ns: The robot's clock at the newest state, without its wraps [ns].
-        offset_ns: Host clock minus robot clock, at the fastest transit seen [ns].
+        offset_ns: Host clock minus robot clock, at the fastest transit of the last moments [ns].
 
     Args:
         check: What a state must pass.
@@ -47,7 +48,7 @@ class StateStream:
         self.errors = self.accepted = self.stale = self.device_ns = self.offset_ns = 0
         self.sequence = -1
         self._tick: int | None = None
-        self._offset_at_ns = 0
+        self._recent_ns = self._former_ns = self._window_ns = 0
         self._refused = Refusals()
 
     def take(self, message: Message) -> LowStateFrame | None:
@@ -91,9 +92,11 @@ class StateStream:
 
     def _keep_time(self, receive_ns: int, first: bool) -> None:
         offset = receive_ns - self.device_ns
-        crept = self.offset_ns + round(_DRIFT * (receive_ns - self._offset_at_ns))
-        self.offset_ns = offset if first else min(offset, crept)
-        self._offset_at_ns = receive_ns
+        if first or receive_ns - self._window_ns > OFFSET_WINDOW_NS:
+            self._former_ns = offset if first else self._recent_ns
+            self._recent_ns, self._window_ns = offset, receive_ns
+        self._recent_ns = min(self._recent_ns, offset)
+        self.offset_ns = min(self._former_ns, self._recent_ns)
 
 
 class CommandEcho:

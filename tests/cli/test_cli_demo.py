@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -11,8 +12,12 @@ import pytest
 
 from deal_hw.cli import demo_go2
 from deal_hw.cli.demo import Demo, demo
-from deal_hw.errors import ConfigurationError
+from deal_hw.control.loop import Outcome
+from deal_hw.data.recording.telemetry_checks import CheckResult, Severity
+from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.settings import LinkOptions
 
 
 @pytest.mark.slow
@@ -68,6 +73,35 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     assert not list((folder / "dataset").rglob("*truth*"))
     printed = capsys.readouterr().out
     assert "FL_hip_joint.stiffness" in printed and "its own estimate" in printed
+
+
+def test_a_walk_with_a_clock_jump_is_walked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording that calibration would refuse is as good as none; three of them end the demo."""
+    jump = CheckResult("clock", Severity.FAIL, "1 clock jumps (+60.0 ms at 3.00 s)")
+    left = [[jump], [], [jump], [jump], [jump]]
+
+    def walk(_: object) -> RunReport:
+        episode = EpisodeReport(
+            path=tmp_path / f"{len(left)}.mcap",
+            outcome=Outcome.FINISHED,
+            reason="the run is over",
+            passive_confirmed=True,
+            loop_timing=None,
+            clipped={},
+            cycles_sent=1,
+            states_recorded=1,
+            warnings=(),
+        )
+        return RunReport(dataset=tmp_path, episodes=(episode,))
+
+    monkeypatch.setattr(demo_go2, "deploy", walk)
+    monkeypatch.setattr(demo_go2, "read_episode", lambda path: SimpleNamespace(trajectory=path))
+    monkeypatch.setattr(demo_go2, "check_recording", lambda _: left.pop(0))
+    robot = demo_go2._Emulated(port="lo", link=LinkOptions(), track=tmp_path / "track.csv")
+    again = robot.whole_walk(tmp_path / "p.onnx", tmp_path / "v.csv", 6.0, tmp_path, 1)
+    assert again.report.paths == (tmp_path / "4.mcap",)
+    with pytest.raises(SafetyError, match="3 walks are of no use, the last one: 1 clock jumps"):
+        robot.whole_walk(tmp_path / "p.onnx", tmp_path / "v.csv", 6.0, tmp_path, 1)
 
 
 @pytest.mark.parametrize(

@@ -390,6 +390,20 @@ def test_a_state_names_the_command_before_it() -> None:
             assert state.command_age_ns == state.device_ns - sent_ns
 
 
+def test_a_clock_that_stood_still_places_commands_right_again() -> None:
+    """A robot's computer that paused is behind for good: ages go by how late its states come since."""
+    wire = FakeBench(mode="")
+    robot = wire.armed()
+    wire.device.talks = False
+    with pytest.raises(TransportTimeoutError):
+        robot.read_state(0.08)
+    wire.device.talks = True
+    drained(robot, 1100)
+    robot.send_command(default_command(robot))
+    aged = [state.command_age_ns for state in drained(robot, 10) if state.command_sequence == 0]
+    assert aged[:3] == [2 * MS, 4 * MS, 6 * MS]
+
+
 def test_absurd_numbers_are_not_sent() -> None:
     """Finite is not enough: 1e30 rad is nobody's wish."""
     wire = FakeBench(mode="")
