@@ -30,18 +30,22 @@ ROBOTS: Final = {
     "go2_on_stand": "deal_hw.drivers.go2.robot:Go2OnStandRobot",
 }
 DESCRIPTIONS: Final = {
+    "allegro": "deal_hw.drivers.allegro.description:DESCRIPTION",
     "ant": "deal_hw.drivers.ant.description:DESCRIPTION",
     "go2": "deal_hw.drivers.go2.descriptions.floor:DESCRIPTION",
     "go2_suspended": "deal_hw.drivers.go2.descriptions.on_stand_recording:DESCRIPTION",
+    "humanoid": "deal_hw.drivers.humanoid.description:DESCRIPTION",
     "so101": "deal_hw.drivers.so101.description:DESCRIPTION",
 }
 """Robots as they are simulated and calibrated, where that is not the driver's own description."""
 SPACES: Final = {
+    "allegro": "deal_hw.drivers.allegro.description:SPACES",
     "ant": "deal_hw.drivers.ant.description:SPACES",
     "cartpole": "deal_hw.drivers.cartpole.description:SPACES",
     "go2": "deal_hw.drivers.go2.descriptions.floor:SPACES",
     "go2_on_stand": "deal_hw.drivers.go2.descriptions.on_stand:SPACES",
     "go2_suspended": "deal_hw.drivers.go2.descriptions.on_stand_recording:SPACES",
+    "humanoid": "deal_hw.drivers.humanoid.description:SPACES",
     "so101": "deal_hw.drivers.so101.description:SPACES",
 }
 """Tables of parameter sets, name -> function; the first of each is the default."""

@@ -20,7 +20,7 @@ from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
 from deal_hw.types import FloatArray
 
 ASSETS: Final = Path(__file__).parent / "assets"
-SHIPPED: Final = ("ant", "cartpole", "go2")
+SHIPPED: Final = ("allegro", "ant", "cartpole", "go2", "humanoid")
 """Robots whose demonstration policy is shipped."""
 
 

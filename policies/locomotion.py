@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from deal_hw.types import FloatArray
 
 POOL = 64
 """Settled robots that episodes start from."""
-SETTLE_S = 1.0
 
 GRAVITY, HEADING, ANGULAR, LINEAR, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
 """Columns of :func:`deal_hw.policy.base_features`."""
@@ -28,8 +27,11 @@ GRAVITY, HEADING, ANGULAR, LINEAR, HEIGHT = slice(0, 3), slice(3, 6), slice(6, 9
 class LocomotionEnv(ServoVectorEnv):
     """Robots on a floor that start from rest in their default pose.
 
-    A start is drawn from a pool of robots of the same distribution that stood (or lay) for a second, as a
+    A start is drawn from a pool of robots of the same distribution that stood (or lay) for ``settle_s``, as a
     target does before it is recorded; those that ended while settling are left out.
+
+    Attributes:
+        settle_s: How long robots of the pool settle [s].
 
     Args:
         description: The robot; its base floats.
@@ -45,6 +47,8 @@ class LocomotionEnv(ServoVectorEnv):
     Raises:
         ConfigurationError: The robot's base is fixed, or none of the settled robots may start.
     """
+
+    settle_s: ClassVar[float] = 1.0
 
     def __init__(
         self,
@@ -107,9 +111,10 @@ class LocomotionEnv(ServoVectorEnv):
         start = batch.position
         start[:, robot.joints] = self.description.default_position
         batch.set_state(start, np.zeros_like(start))
-        steps = round(SETTLE_S / robot.step_s)
-        moved = batch.advance(np.broadcast_to(self._default, (POOL, steps, len(self._default))))
-        position, velocity = moved[0][:, 0], moved[1][:, 0]
+        position, velocity = start, np.zeros_like(start)
+        if steps := round(self.settle_s / robot.step_s):
+            moved = batch.advance(np.broadcast_to(self._default, (POOL, steps, len(self._default))))
+            position, velocity = moved[0][:, 0], moved[1][:, 0]
         fit: BoolArray = np.asarray(np.isfinite(position).all(axis=1))
         fit[fit] = ~self.ended(position[fit], velocity[fit])
         if not fit.any():

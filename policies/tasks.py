@@ -79,8 +79,19 @@ class TrainingTask:
 
 
 TASKS: Final = {
+    "allegro": TrainingTask(
+        environment="deal_hw.policies.hand_env:HandEnv",
+        trainer="sac",
+        members={"ppo": 200, "sac": 64},
+        settings={
+            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
+            "sac": {**_LEGGED_SAC, "target_entropy": -16.0},
+        },
+        udr_ratio=1.75,
+        udr_latency_s=(0.0, 0.02),
+    ),
     "ant": TrainingTask(
-        environment="deal_hw.policies.ant_env:AntEnv",
+        environment="deal_hw.policies.run_env:RunEnv",
         trainer="sac",
         members={"ppo": 200, "sac": 64},
         settings={
@@ -105,6 +116,17 @@ TASKS: Final = {
         settings={"sac": {**_LEGGED_SAC, "target_entropy": -12.0}},
         udr_ratio=1.75,
         udr_latency_s=(0.0, 0.012),
+    ),
+    "humanoid": TrainingTask(
+        environment="deal_hw.policies.run_env:HumanoidEnv",
+        trainer="sac",
+        members={"ppo": 200, "sac": 64},
+        settings={
+            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
+            "sac": {**_LEGGED_SAC, "target_entropy": -21.0},
+        },
+        udr_ratio=1.75,
+        udr_latency_s=(0.0, 0.02),
     ),
 }
 

@@ -1,12 +1,15 @@
-"""Makes the shipped policies of ant and Go2, trained under uniform domain randomisation.
+"""Makes the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
 
+    python tools/train_demo_policy.py allegro
     python tools/train_demo_policy.py ant
+    python tools/train_demo_policy.py humanoid
     python tools/train_demo_policy.py go2
 
-writes policies/assets/ant_udr.onnx or go2_walk.onnx and, beside it, the record of its training and of what it
-can do with robots that it has not seen. Task, trainer and settings are those of `deal-hw train ROBOT --udr`.
-The ant's is an early checkpoint, made in minutes on one core: good enough to excite a robot for calibration
-(the paper's Table 5 studies such ones), not good locomotion.
+writes policies/assets/allegro_udr.onnx, ant_udr.onnx, humanoid_udr.onnx or go2_walk.onnx and, beside it,
+the record of its training and of what it can do with robots that it has not seen. Task, trainer and settings
+are those of `deal-hw train ROBOT --udr`. All but the Go2's are early checkpoints, made in minutes on one
+core: good enough to excite a robot for calibration (the paper's Table 5 studies such ones), not good at
+their task.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from deal_hw.training import TrainingFiles, TrainingStatus
 from deal_hw.workflows.train import train_policy, udr_distribution
 
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
-FILES = {"ant": "ant_udr", "go2": "go2_walk"}
+FILES = {"allegro": "allegro_udr", "ant": "ant_udr", "go2": "go2_walk", "humanoid": "humanoid_udr"}
 JUDGED = 256
 JUDGE_SEED = 1_000_003
 """Robots, commands and starts that the policy is judged by are the draws of this seed, none of training's."""

@@ -1,6 +1,6 @@
 """The benches' robots: for each task, profile and seed a hidden truth, its recordings, and what really was.
 
-The cart-pole is the emulated one, over its bytes in virtual time; ant and Go2 are simulated targets.
+The cart-pole is the emulated one, over its bytes in virtual time; the others are simulated targets.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ TRUTH_PART = (0.1, 0.9)
 
 LATENCY_S = (0.006, 0.024)
 """Range of a target's hidden latency in profile ``sensor`` [s]."""
+
+SETTLE_S = 1.0
+"""How long a target holds its start pose before it is recorded [s]."""
 
 MOST_REDRAWS = 50
 
@@ -175,19 +178,34 @@ def _cartpole(ask: _Ask) -> Case:
     )
 
 
-def _ant(ask: _Ask) -> Case:
-    from deal_hw.drivers.ant import description as ant
-    from deal_hw.drivers.ant.motions import flail
+def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
+    """Return a case of a robot that exists in simulators only, which reports its whole state."""
+    from deal_hw.drivers import parameter_spaces, robot_description
+    from deal_hw.drivers.simulated_motions import FAST_HZ, flail
 
     if ask.profile != "ideal":
-        raise ConfigurationError(f"the ant has no sensors, so no profile {ask.profile!r}; use ideal")
-    robot = load_model(ant.DESCRIPTION)
+        raise ConfigurationError(f"the {task} has no sensors, so no profile {ask.profile!r}; use ideal")
+    description = robot_description(task)
 
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
-        shown = _policy("ant", ant.DESCRIPTION) if ask.by_policy else flail(rng)
-        return shown, flail(rng, (1.5, 4.0))
+        shown = _policy(task, description) if ask.by_policy else flail(rng, description)
+        return shown, flail(rng, description, FAST_HZ)
 
-    return _target("ant", robot, ask.ranges(ant.SPACES), ask, motions, None)
+    space = ask.ranges(parameter_spaces(task))
+    return _target(task, load_model(description), space, ask, motions, None, settle_s)
+
+
+def _allegro(ask: _Ask) -> Case:
+    return _simulated(ask, "allegro")
+
+
+def _ant(ask: _Ask) -> Case:
+    return _simulated(ask, "ant")
+
+
+def _humanoid(ask: _Ask) -> Case:
+    # Without torque it falls within a second; a demonstration begins upright.
+    return _simulated(ask, "humanoid", 0.0)
 
 
 def _go2(ask: _Ask) -> Case:
@@ -241,6 +259,7 @@ def _target(
     ask: _Ask,
     motions: Callable[[np.random.Generator], tuple[Behaviour, Behaviour]],
     sensing: TargetSensing | None,
+    settle_s: float = SETTLE_S,
 ) -> Case:
     seed = ask.seed
     rng = np.random.default_rng([seed, sum(task.encode())])
@@ -262,6 +281,7 @@ def _target(
                     latency_s=latency_s,
                     sensing=sensing,
                     rng=rng,
+                    settle_s=settle_s,
                 )
                 for motion, seconds in zip(motions(rng), (ask.seconds, DEMONSTRATION_S), strict=True)
             )
@@ -294,8 +314,9 @@ def _target(
     )
 
 
-LOWEST_M = {"ant": 0.0, "go2": 0.12}
-"""A base below this has fallen [m]: a demonstration of a robot that lies on its trunk says little."""
+LOWEST_M = {"allegro": 0.0, "ant": 0.0, "go2": 0.12, "humanoid": 0.0}
+"""A base below this has fallen [m]: a demonstration of a Go2 that lies on its trunk says little, as of a hand
+that has lost its cube. Ant and humanoid may lie."""
 
 
 def _stands(task: str, recording: TargetRecording) -> bool:
@@ -312,6 +333,8 @@ def _channel_std(robot: RobotModel, sensing: TargetSensing) -> FloatArray:
 
 TASKS: Mapping[str, Callable[[_Ask], Case]] = {
     "cartpole": _cartpole,
+    "allegro": _allegro,
     "ant": _ant,
     "go2": _go2,
+    "humanoid": _humanoid,
 }

@@ -74,7 +74,7 @@ class Bench:
     """verdict: faults, comma separated (none, friction, backlash, jitter, mass, sign); by default all."""
 
     task: str = "cartpole"
-    """Tasks, comma separated: cartpole, ant, go2 (loop: the cart-pole only)."""
+    """Tasks, comma separated: cartpole, ant, humanoid, go2, allegro (loop: the cart-pole only)."""
 
     space: str = ""
     """Parameter set of the task; its default where nothing is named."""

@@ -10,8 +10,9 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
+from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.drivers.ant.model import ANKLE_HOME_RAD, GEAR_NM, LEG_NUMBERS, STEP_S, prepared_path
+from deal_hw.drivers.prepared import simulated_limits
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 
@@ -86,20 +87,7 @@ def description() -> RobotDescription:
         control_rate_hz=50.0,
         device_rate_hz=1 / STEP_S,
         state_rate_hz=50.0,
-        limits=SafetyLimits(
-            target=((-1.0, 1.0),) * 8,
-            target_step=(2.0,) * 8,
-            target_distance=(math.inf,) * 8,
-            trip_position=((-math.inf, math.inf),) * 8,
-            trip_velocity=(math.inf,) * 8,
-            stiffness=(0.0,) * 8,
-            damping=(0.0,) * 8,
-            effort=(GEAR_NM,) * 8,
-            speed=(math.inf,) * 8,
-            state_age_s=0.06,
-            action_age_s=0.04,
-            ease_in_s=0.0,
-        ),
+        limits=simulated_limits((GEAR_NM,) * 8),
         sensor=SensorModel(noise=(1e-3,) * 8, resolution=(2 * math.pi / 4096,) * 8, velocity_window_s=0.0),
         mjcf=prepared_path(values),
         actuation="motor",

@@ -198,7 +198,7 @@ def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:
 def test_an_unknown_task_is_refused(tmp_path: Path) -> None:
     """The tasks are listed."""
     with pytest.raises(UnknownNameError, match="go2"):
-        bench(Bench(bench="fixed-range", task="humanoid", out=tmp_path / "honest.json"))
+        bench(Bench(bench="fixed-range", task="biped", out=tmp_path / "honest.json"))
 
 
 @pytest.mark.parametrize("task", ["cartpole", "ant"])

@@ -25,6 +25,7 @@ from deal_hw.drivers import (
 )
 from deal_hw.drivers.ant import model as ant_model
 from deal_hw.drivers.ant.description import DEFAULT, PAPER
+from deal_hw.drivers.humanoid import model as humanoid_model
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
@@ -33,8 +34,12 @@ from deal_hw.sim.parameters import KIND_TABLE, check_space
 
 EVERY = [(robot, name) for robot in SPACES for name in parameter_spaces(robot)]
 SIZES = {
+    ("allegro", "default"): 42,
+    ("allegro", "paper"): 122,
     ("ant", "default"): 11,
     ("ant", "paper"): 11,
+    ("humanoid", "default"): 50,
+    ("humanoid", "paper"): 92,
     ("cartpole", "k9"): 9,
     ("cartpole", "k11"): 11,
     ("cartpole", "paper"): 11,
@@ -151,12 +156,21 @@ def test_members_all_over_the_range_stay_finite(robot: str, name: str) -> None:
     assert np.isfinite(position).all() and np.abs(velocity).max() < 100
 
 
-@pytest.mark.parametrize("name", ["ant", "cartpole", "go2"])
+@pytest.mark.parametrize("name", ["allegro", "ant", "cartpole", "go2", "humanoid"])
 def test_paper_preset_has_the_printed_values(name: str) -> None:
-    """DEAL, Tables 7 to 9: sums of the printed columns, with Go2's 12 x 20 and 12 x 0.5."""
+    """DEAL, Tables 7 to 11: sums of the printed columns, with Go2's 12 x 20 and 12 x 0.5."""
     # Table 7: 1.5 + .01 + .2 + .3 + .1 + .1 + .2 + .1 + .1 + .2 + 1 = 3.81
+    # Table 11: 4 (1 + .01) + 21 .01 of friction; .04 + 2 .075 of armature; damping 15 + 2 28.1;
+    # stiffness 50 + 2 71.
     # Table 8: .3 + .1 + .3 + .1 + .1 + .2 + .1 + .1 + .1 + .2 + 1 = 2.6
-    wanted = {"ant": 3.81, "cartpole": 2.6, "go2": 246.0}
+    # Table 10 but cube and palm: 21 (1 + .01) + 16 (.01 + .1 + .001 + 3) + 3 .144 + .128 of masses.
+    wanted = {
+        "allegro": 21.21 + 49.776 + 0.56,
+        "ant": 3.81,
+        "cartpole": 2.6,
+        "go2": 246.0,
+        "humanoid": 4.04 + 0.21 + 0.19 + 71.2 + 192.0,
+    }
     assert _space(name, "paper").nominal.sum() == pytest.approx(wanted[name])
 
 
@@ -249,12 +263,45 @@ def test_cache_that_cannot_be_written_falls_back(tmp_path: Path, monkeypatch: py
     assert ant_model.prepared_path({**DEFAULT, "contact.damping_ratio": 0.7}).is_file()
 
 
+def test_humanoid_of_another_dm_control_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file without the expected names is not half prepared, and a missing package names its extra."""
+    with pytest.raises(ConfigurationError, match=r"dm_control 1\.0"):
+        humanoid_model.prepare("<mujoco><option/></mujoco>", {"contact.damping_ratio": 0.7})
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match="dm_control is not installed"):
+        humanoid_model.source_path()
+
+
+def test_humanoid_touches_the_floor_alone_and_has_no_textures() -> None:
+    """A copy with textures has 12 MB; contacts among its bodies would double a step's cost."""
+    model = load_model(robot_description("humanoid")).model
+    assert model.ntex == model.nsite == 0
+    data, _ = _run(model, 1.5)
+    assert data.ncon and all("floor" in {model.geom(g).name for g in c.geom} for c in data.contact)
+    # The published masses follow from density and shapes; 40.8 kg is dm_control's own.
+    assert model.body_mass.sum() == pytest.approx(40.84, abs=0.01)
+
+
+def test_allegro_holds_its_cube() -> None:
+    """Three seconds in the holding pose: the cube lies on the palm, and fingers touch nothing else."""
+    model = load_model(robot_description("allegro")).model
+    data = mujoco.MjData(model)
+    pose = np.array(robot_description("allegro").default_position)
+    data.qpos[7:], data.ctrl[:] = pose, pose
+    for _ in range(600):
+        mujoco.mj_step(model, data)
+    assert np.linalg.norm(data.qpos[:3] - model.qpos0[:3]) < 0.02
+    assert np.abs(data.qpos[7:] - pose).max() < 0.05
+    assert np.abs(data.qvel).max() < 0.05
+    assert data.ncon and all("cube" in {model.geom(g).name for g in c.geom} for c in data.contact)
+
+
 def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
     """A description is not a driver."""
     for name in set(DESCRIPTIONS) - set(ROBOTS):
         with pytest.raises(ConfigurationError, match=f"{name!r}.*no driver yet.*cartpole"):
             make_robot(name, "serial", "x", MonotonicClock())
-    with pytest.raises(UnknownNameError, match=r"cartpole, go2, go2_on_stand, ant"):
+    with pytest.raises(UnknownNameError, match=r"cartpole, go2, go2_on_stand, allegro, ant"):
         robot_description("gotwo")
     with pytest.raises(UnknownNameError, match="go2_suspended"):
         parameter_spaces("gotwo")

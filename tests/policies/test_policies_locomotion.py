@@ -17,15 +17,15 @@ from deal_hw.control.safety_filter import SafetyFilter
 from deal_hw.drivers import parameter_spaces, recorded_description, robot_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
-from deal_hw.policies.ant_env import AntEnv, RunTask, run_spec
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
 from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policies.run_env import HumanoidEnv, RunEnv, RunTask, run_spec
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.types import FloatArray, JointCommand
 
 ROOT = Path(__file__).resolve().parents[2]
-ROBOTS = ("ant", "go2")
+ROBOTS = ("ant", "go2", "humanoid")
 GO2 = recorded_description("go2")
 NEVER = 10**9
 
@@ -37,7 +37,10 @@ def udr(robot: str) -> ParameterDistribution:
 
 def make(robot: str, count: int = 4, **task: Any) -> LocomotionEnv:
     if robot == "ant":
-        return AntEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
+        return RunEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
+    if robot == "humanoid":
+        task = {"top_height_m": 2.0, "least_height_m": 0.9, **task}
+        return HumanoidEnv(robot_description(robot), udr(robot), count, task=RunTask(**task))
     return Go2Env(GO2, udr(robot), count, task=WalkTask(**task))
 
 
@@ -86,7 +89,7 @@ def test_episodes_start_from_robots_that_have_settled(env: LocomotionEnv) -> Non
     env.reset(seed=0)
     position, velocity = env.loop.position, env.loop.velocity
     assert not env.ended(position, velocity).any()
-    assert (position[:, 2] < env.loop.batch.robot.model.qpos0[2]).all()
+    assert (position[:, 2] <= env.loop.batch.robot.model.qpos0[2]).all()
     np.testing.assert_array_equal(velocity, 0.0)
 
 
@@ -294,7 +297,7 @@ def test_a_fixed_base_is_refused() -> None:
     """The message names the robot and what it lacks."""
     description = dataclasses.replace(GO2, floating_base=None)
     with pytest.raises(ConfigurationError, match="'go2' has a fixed base; locomotion needs a free one"):
-        AntEnv(description, udr("go2"), 1)
+        RunEnv(description, udr("go2"), 1)
     with pytest.raises(ConfigurationError, match="'go2' has 0 feet in its description; walking needs 4"):
         Go2Env(robot_description("go2"), udr("go2"), 1)
 

@@ -1,10 +1,11 @@
-"""The running task of the ant."""
+"""The running task of robots with torque motors: ant and humanoid."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,14 +28,15 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunTask:
-    """Settings of the task; the defaults are what the shipped policy was trained with.
+    """Settings of the task; the defaults are what the ant's shipped policy was trained with.
 
     Attributes:
         ticks: Control periods in an episode.
         forward_weight: Reward of speed along the world's x axis [s/m].
-        healthy_reward: Reward of a tick in which the ant is healthy.
+        healthy_reward: Reward of a tick in which the robot is healthy.
         control_weight: Cost of the sum of squared actions.
         top_height_m: A higher torso ends the episode, as in gymnasium.
+        least_height_m: So does a lower one.
         start_noise_rad: Largest deviation of joints at the start.
     """
 
@@ -43,6 +45,7 @@ class RunTask:
     healthy_reward: float = 0.2
     control_weight: float = 0.1
     top_height_m: float = 1.0
+    least_height_m: float = -math.inf
     start_noise_rad: float = 0.1
 
     def __post_init__(self) -> None:
@@ -65,18 +68,18 @@ def run_spec(
     return locomotion_spec(description, terms, scale, trained_under, training)
 
 
-class AntEnv(LocomotionEnv):
+class RunEnv(LocomotionEnv):
     """Run along the world's x axis.
 
     The reward of a tick, from the true state after it, is gymnasium's Ant (version 4)::
 
         forward_weight vx + healthy_reward - control_weight |a|²
 
-    and 0 in the tick in which the ant stops being healthy, which ends the episode. Two things differ. An ant
-    here is healthy while its torso is not upside down and not above ``top_height_m``; gymnasium also asks for
-    a height of 0.2 m at least, below which the soft floors of this distribution let a resting ant sink. And
-    two weights are smaller than gymnasium's: of control (0.5), as the gear is 15 instead of 150, and of
-    health (1), a constant that the critics of a short training would spend their time on.
+    and 0 in the tick in which the robot stops being healthy, which ends the episode. A robot is healthy while
+    its torso is not upside down and its height within the task's. For the ant two things differ from
+    gymnasium's. It asks for a height of 0.2 m at least, below which the soft floors of this distribution let
+    a resting ant sink. And two weights are smaller here: of control (0.5), as the gear is 15 instead of 150,
+    and of health (1), a constant that the critics of a short training would spend their time on.
 
     Args:
         description: The robot.
@@ -87,6 +90,7 @@ class AntEnv(LocomotionEnv):
     """
 
     failure_reward = 0.0
+    usual_task: ClassVar[RunTask] = RunTask()
 
     def __init__(
         self,
@@ -97,7 +101,7 @@ class AntEnv(LocomotionEnv):
         task: RunTask | None = None,
         threads: int | None = 1,
     ) -> None:
-        self.task = task or RunTask()
+        self.task = task or self.usual_task
         super().__init__(
             description,
             distribution,
@@ -121,6 +125,18 @@ class AntEnv(LocomotionEnv):
         return self.loop.velocity[:, 0]
 
     def ended(self, position: FloatArray, velocity: FloatArray) -> BoolArray:
-        """Return who lies on the back or flew off."""
+        """Return who lies on the back, fell or flew off."""
         seen = base(position, velocity)
-        return np.asarray((seen[:, GRAVITY][:, 2] > 0.0) | (seen[:, HEIGHT] > self.task.top_height_m))
+        height, task = seen[:, HEIGHT], self.task
+        over = (height > task.top_height_m) | (height < task.least_height_m)
+        return np.asarray((seen[:, GRAVITY][:, 2] > 0.0) | over)
+
+
+class HumanoidEnv(RunEnv):
+    """The same for the humanoid, which falls where the ant lies: it starts standing, not settled.
+
+    To stay up is worth as much as a metre a second ahead, and its 21 motors cost less.
+    """
+
+    settle_s = 0.0
+    usual_task = RunTask(healthy_reward=1.0, control_weight=0.02, top_height_m=2.0, least_height_m=0.9)

@@ -1,0 +1,103 @@
+"""The humanoid's MJCF, prepared from the file that the installed dm_control carries; nothing is copied here.
+
+What is changed: textures, sites, sensors and cameras go (textures make every copy of the model 12 MB); the
+values of the parameter preset are written; feet alone rule their contacts, and bodies touch the floor only.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from deal_hw.drivers.prepared import cached, find, package_file
+from deal_hw.drivers.prepared import prepare as prepare_model
+
+STEP_S: Final = 0.005
+HOME_HEIGHT_M: Final = 1.29
+"""Of the torso where the feet just touch the floor [m]."""
+SIDES: Final = ("right", "left")
+ABDOMEN: Final = ("abdomen_z", "abdomen_y", "abdomen_x")
+LEG: Final = ("hip_x", "hip_z", "hip_y", "knee", "ankle_y", "ankle_x")
+ARM: Final = ("shoulder1", "shoulder2", "elbow")
+JOINTS: Final = (
+    *ABDOMEN,
+    *(f"{side}_{joint}" for side in SIDES for joint in LEG),
+    *(f"{side}_{joint}" for side in SIDES for joint in ARM),
+)
+FEET: Final = ("right_right_foot", "left_right_foot", "left_left_foot", "right_left_foot")
+"""Each foot has two capsules."""
+FIELDS: Final = ("frictionloss", "damping", "armature", "stiffness")
+_LOOKS: Final = ("include", "statistic", "sensor")
+_MARKS: Final = ("site", "camera", "light")
+
+
+def source_path() -> Path:
+    """Return dm_control's humanoid.xml. See :func:`deal_hw.drivers.prepared.package_file`."""
+    return package_file("dm_control", "suite/humanoid.xml", "bench")
+
+
+def prepare(text: str, values: Mapping[str, float]) -> str:
+    """Return dm_control's MJCF without what is only looked at, with the preset's values.
+
+    Args:
+        text: Content of humanoid.xml.
+        values: Parameter name -> value, as in ``drivers.humanoid.description``.
+
+    Raises:
+        ConfigurationError: The file is not the one this was written for.
+    """
+    return prepare_model(text, _prepare, values, "humanoid.xml of dm_control 1.0")
+
+
+def joint_type(joint: str) -> str:
+    """Return what a joint is called on both sides."""
+    return joint.removeprefix("right_").removeprefix("left_")
+
+
+def _prepare(root: ET.Element, values: Mapping[str, float]) -> None:
+    for name in _LOOKS:
+        for element in root.findall(name):
+            root.remove(element)
+    for parent in list(root.iter()):
+        for element in [
+            e for e in parent if e.tag in _MARKS or (e.tag == "default" and e.get("class") == "touch")
+        ]:
+            parent.remove(element)
+    option = find(root, "option")
+    option.set("integrator", "implicitfast")
+    option.set("timestep", repr(STEP_S))
+    damping_ratio = values["contact.damping_ratio"]
+    for geom in root.iter("geom"):
+        geom.attrib.pop("material", None)
+        geom.set("group", "1")
+        geom.set("contype", "1")
+        geom.set("conaffinity", "1" if geom.get("name") == "floor" else "0")
+    find(root, ".//geom[@name='floor']").set("contype", "0")
+    for name in FEET:
+        foot = find(root, f".//geom[@name='{name}']")
+        foot.set("priority", "1")
+        foot.set("friction", f"{values['contact.friction']!r} 0.005 0.0001")
+        foot.set("solref", f"{0.02 / damping_ratio!r} {damping_ratio!r}")
+    # The file drops it from 0.2 m above the floor.
+    find(root, ".//body[@name='torso']").set("pos", f"0 0 {HOME_HEIGHT_M!r}")
+    for name in JOINTS:
+        joint = find(root, f".//joint[@name='{name}']")
+        for field in FIELDS:
+            joint.set(field, repr(values[f"{joint_type(name)}.{field}"]))
+    if {motor.attrib["joint"] for motor in find(root, "actuator")} != set(JOINTS):
+        raise KeyError("a motor for each of 21 joints")
+    key = ET.SubElement(ET.SubElement(root, "keyframe"), "key")
+    key.set("name", "home")
+    key.set("qpos", f"0 0 {HOME_HEIGHT_M!r} 1 0 0 0 " + " ".join("0" * len(JOINTS)))
+
+
+def prepared_path(values: Mapping[str, float]) -> Path:
+    """Return the prepared MJCF in the user's cache folder, written if it is not there yet.
+
+    Raises:
+        MissingExtraError: dm_control is not installed.
+        ConfigurationError: Its file is missing or not as expected.
+    """
+    return cached("humanoid", prepare(source_path().read_text(encoding="utf-8"), values))

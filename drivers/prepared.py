@@ -1,0 +1,138 @@
+"""Simulated robots whose model another package carries: found there, prepared, kept in the user's cache.
+
+Nothing of these models is copied here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import math
+import os
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from deal_hw.description import SafetyLimits
+from deal_hw.errors import ConfigurationError, MissingExtraError
+
+
+def package_file(package: str, inside: str, extra: str) -> Path:
+    """Return a file that an installed package carries; the package is not imported.
+
+    Args:
+        package: Its name.
+        inside: The file's path inside of it.
+        extra: Our extra that brings the package.
+
+    Raises:
+        MissingExtraError: The package is not installed.
+        ConfigurationError: It is, but carries no such file.
+    """
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingExtraError(package, extra)
+    path = Path(spec.submodule_search_locations[0]) / inside
+    if not path.is_file():
+        raise ConfigurationError(f"{path} is not there; another version of {package} carries it")
+    return path
+
+
+def prepare(
+    text: str,
+    change: Callable[[ET.Element, Mapping[str, float]], None],
+    values: Mapping[str, float],
+    source: str,
+) -> str:
+    """Return an MJCF after a change.
+
+    Args:
+        text: The package's MJCF.
+        change: Changes its tree, and raises KeyError or AttributeError where something is not there.
+        values: Parameter name -> value, handed on to the change.
+        source: The file and the package's version that the change was written for.
+
+    Raises:
+        ConfigurationError: The file is not the one that the change was written for.
+    """
+    root = ET.fromstring(text)
+    try:
+        change(root, values)
+    except (AttributeError, KeyError) as err:
+        raise ConfigurationError(
+            f"the MJCF is not as expected ({err!r}); deal-hw was written for {source}"
+        ) from err
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def find(root: ET.Element, path: str) -> ET.Element:
+    """Return the element at a path.
+
+    Raises:
+        KeyError: There is none.
+    """
+    found = root.find(path)
+    if found is None:
+        raise KeyError(path)
+    return found
+
+
+def cached(robot: str, text: str) -> Path:
+    """Return a file in the user's cache folder with this content, written if it is not there yet.
+
+    Args:
+        robot: The beginning of its name.
+        text: The MJCF.
+
+    Raises:
+        ConfigurationError: No folder can be written.
+    """
+    name = f"{robot}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.xml"
+    for folder in _folders():
+        path = folder / name
+        try:
+            if not path.is_file() or path.read_text(encoding="utf-8") != text:
+                folder.mkdir(parents=True, exist_ok=True)
+                # Written under another name and moved: a second process never reads half a file.
+                handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
+                with os.fdopen(handle, "w", encoding="utf-8") as file:
+                    file.write(text)
+                os.replace(temporary, path)
+        except OSError:
+            continue
+        return path
+    raise ConfigurationError(
+        f"cannot write {name} to any of {[str(f) for f in _folders()]}; "
+        "set XDG_CACHE_HOME to a writable folder"
+    )
+
+
+def simulated_limits(effort: Sequence[float]) -> SafetyLimits:
+    """Return the limits of a robot that exists in a simulator only: actions in -1..1 and nothing else.
+
+    Args:
+        effort: Effort of each motor at action 1 [N·m].
+    """
+    count = len(effort)
+    return SafetyLimits(
+        target=((-1.0, 1.0),) * count,
+        target_step=(2.0,) * count,
+        target_distance=(math.inf,) * count,
+        trip_position=((-math.inf, math.inf),) * count,
+        trip_velocity=(math.inf,) * count,
+        stiffness=(0.0,) * count,
+        damping=(0.0,) * count,
+        effort=tuple(effort),
+        speed=(math.inf,) * count,
+        state_age_s=0.06,
+        action_age_s=0.04,
+        ease_in_s=0.0,
+    )
+
+
+def _folders() -> list[Path]:
+    home = os.environ.get("XDG_CACHE_HOME")
+    cache = Path(home) if home else Path.home() / ".cache"
+    return [cache / "deal-hw", Path(tempfile.gettempdir()) / f"deal-hw-{os.getuid()}"]
