@@ -66,6 +66,11 @@ MAKERS: Final[Mapping[tuple[str, str], str]] = {
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
 descriptor of the port that a parent process opened. It does no I/O.
 """
+SIMULATED: Final[Mapping[tuple[str, str], str]] = {
+    ("go2", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoRobot",
+    ("go2_on_stand", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot",
+}
+"""Drivers for a simulator of others in the place of a robot, (robot, simulator) -> "module:class"."""
 CAN_BUSES: Final[Mapping[str, str]] = {
     "can": "deal_hw.drivers.cartpole.can_robot:can_bus",
     "odrive": "deal_hw.drivers.cartpole.odrive_robot:odrive_bus",
@@ -86,6 +91,7 @@ __all__ = [
     "ODOMETRY",
     "REACHED_BY",
     "ROBOTS",
+    "SIMULATED",
     "SPACES",
     "TOPIC_TRANSPORTS",
     "TRANSPORTS",
@@ -124,7 +130,8 @@ def make_robot(
         port: Where: a serial port, a network interface, an endpoint.
         clock: Gives the stamps.
         options: More about a transport of topics.
-        settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2.
+        settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2. ``simulator`` names
+            what stands in the place of the robot, and with it the driver.
         can_send: False for a robot that is only listened to, as in a dry run.
 
     Raises:
@@ -134,6 +141,9 @@ def make_robot(
     """
     robot = _driver(name)
     _check_reach(name, transport_name)
+    if settings and "simulator" in settings:
+        settings = dict(settings)
+        robot = _simulated(name, settings.pop("simulator"))
     try:
         if (name, transport_name) in MAKERS:
             _refuse_options(transport_name, options)
@@ -327,6 +337,17 @@ def default_transport(name: str) -> str:
     """
     _driver(name)
     return REACHED_BY[name][0]
+
+
+def _simulated(name: str, simulator: str) -> Any:
+    known = [has for robot, has in SIMULATED if robot == name]
+    if not known:
+        raise ConfigurationError(
+            f"--simulator would have no effect: no simulator stands in for robot {name!r}"
+        )
+    if simulator not in known:
+        raise UnknownNameError(f"simulator of robot {name!r}", simulator, known)
+    return _find("simulator", {simulator: SIMULATED[name, simulator]}, simulator)
 
 
 def _options(names: Iterable[str]) -> str:

@@ -13,6 +13,8 @@ from deal_hw.transport import Message
 PERIOD_MS: Final = 2
 RESTART_MS: Final = 1000
 """A clock that goes back further than this was restarted; by less, a state was overtaken."""
+_ONE_ROBOT: Final = 0.4
+"""A larger share of states that are not new, and two robots send them."""
 _DRIFT: Final = 5e-4
 """Largest rate difference between host and robot clock that counts as drift."""
 _U32: Final = 1 << 32
@@ -84,6 +86,16 @@ class StateStream:
         self.accepted += 1
         self._keep_time(message.stamp_ns, first)
         return frame
+
+    @property
+    def doubled(self) -> bool:
+        """Whether so many states are not new that two robots send them."""
+        return self.stale > _ONE_ROBOT * self.accepted
+
+    @property
+    def standstill(self) -> str:
+        """What stands still in states that are not new, in words."""
+        return f"their clock stands still at {self.device_ns // 1_000_000} ms"
 
     def complaint(self) -> ProtocolError | None:
         """Return what is wrong where states come and none is sound; None where none came, or some are."""

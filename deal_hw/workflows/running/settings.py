@@ -50,6 +50,10 @@ class LinkOptions(Checked):
     """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
     checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
 
+    simulator: Literal["none", "unitree_mujoco"] = "none"
+    """What stands in the place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and battery
+    (docs/how-to/unitree-mujoco.md). A real robot is then refused."""
+
     record_wire: bool = True
     """Record the raw bytes, too."""
 
@@ -103,6 +107,11 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
         refuse(given(legs, LegOptions()), f"only robots with legs take that, and robot {robot!r} has none")
     if not walks:
         refuse(given(legs, LegOptions(), ["velocity"]), "no policy that walks runs here")
+    if link.simulator != "none":
+        refuse(
+            [*given(link, LinkOptions(), ["state_check"]), *given(legs, LegOptions(), ["hand_back"])],
+            f"{link.simulator} has neither checksums nor a controller of its own",
+        )
     if not stands:
         refuse(given(legs, LegOptions(), ["posture"]), "the robot neither stands up nor lies down")
     return {
@@ -124,8 +133,9 @@ def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
         "stop_buttons": legs.stop_buttons,
         "support_check": legs.support_check,
         "state_check": link.state_check,
+        "simulator": link.simulator,
     }
-    default = {"stop_buttons": "", "support_check": True, "state_check": "strict"}
+    default = {"stop_buttons": "", "support_check": True, "state_check": "strict", "simulator": "none"}
     return {name: value for name, value in given.items() if value != default[name]}
 
 

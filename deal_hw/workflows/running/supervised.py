@@ -116,7 +116,9 @@ def run_episodes(
     ExcitationLevelSearch(plan.excitation_level, attempts)
     plan = check_plan(plan, robot.description, view)
     reports: list[EpisodeReport] = []
-    if not robot.watchdog_s and not plan.dry_run:
+    if robot.notice:
+        view.note(robot.notice)
+    elif not robot.watchdog_s and not plan.dry_run:
         view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot))
     # The supervisor connects to the robot itself, so that a wrong port is known before a process is started.
     # From then on it only keeps the port, until the control process is dead.
