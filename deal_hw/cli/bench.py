@@ -110,7 +110,7 @@ class Bench:
     """Most generations of a search."""
 
     train: bool = True
-    """Train and deploy policies with the default method."""
+    """Train and deploy policies with the default method; --no-train leaves both out."""
 
     steps: Annotated[int, Range(1, 10**9)] = 300_000
     """go2-loop: steps of each fine-tune."""
