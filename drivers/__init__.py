@@ -56,6 +56,11 @@ TRANSPORTS: Final = {
 }
 TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
 """Transports without a descriptor to inherit: each process opens its own."""
+WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "dds": ("domain",),
+    "zenoh": ("listen", "mode", "insecure", "ca", "certificate", "key"),
+}
+"""What of :class:`~deal_hw.transport.WireOptions` each of them heeds."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
     ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
     ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
@@ -231,9 +236,16 @@ def make_topic_transport(
 
     Raises:
         UnknownNameError: There is no such transport, or it carries no topics.
+        ConfigurationError: An option would be ignored.
     """
     if transport_name not in TOPIC_TRANSPORTS:
         raise UnknownNameError("transport of topics", transport_name, TOPIC_TRANSPORTS)
+    foreign = [name for name in _given(options) if name not in WIRE_OPTIONS[transport_name]]
+    if foreign:
+        raise ConfigurationError(
+            f"{_options(foreign)} would have no effect: transport {transport_name!r} heeds "
+            f"{_options(WIRE_OPTIONS[transport_name])}"
+        )
     made: TopicTransport = _find("transport", TRANSPORTS, transport_name)(port, clock, options)
     return made
 
@@ -364,12 +376,16 @@ def _make(name: str, transport_name: str, port: str, clock: Clock, **settings: A
 
 def _refuse_options(transport_name: str, options: WireOptions | None) -> None:
     """Refuse settings of a network on a wire that is none."""
-    if options is not None and options != WireOptions():
-        default = WireOptions().to_json()
-        given = [name for name, value in options.to_json().items() if value != default[name]]
+    if given := _given(options):
         raise ConfigurationError(
             f"{_options(given)} would have no effect: transport {transport_name!r} is no network"
         )
+
+
+def _given(options: WireOptions | None) -> list[str]:
+    """Return the names of the options that differ from their defaults."""
+    default = WireOptions().to_json()
+    return [name for name, value in (options or WireOptions()).to_json().items() if value != default[name]]
 
 
 def _check_reach(name: str, transport_name: str) -> None:
