@@ -60,7 +60,7 @@ WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "dds": ("domain",),
     "zenoh": ("listen", "mode", "insecure", "ca", "certificate", "key"),
 }
-"""What of :class:`~deal_hw.transport.WireOptions` each of them heeds."""
+"""What of :class:`~deal_hw.transport.WireOptions` each of them takes."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
     ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
     ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
@@ -243,7 +243,7 @@ def make_topic_transport(
     foreign = [name for name in _given(options) if name not in WIRE_OPTIONS[transport_name]]
     if foreign:
         raise ConfigurationError(
-            f"{_options(foreign)} would have no effect: transport {transport_name!r} heeds "
+            f"{_options(foreign)} would have no effect: transport {transport_name!r} takes "
             f"{_options(WIRE_OPTIONS[transport_name])}"
         )
     made: TopicTransport = _find("transport", TRANSPORTS, transport_name)(port, clock, options)
