@@ -28,6 +28,9 @@ class Robot(abc.ABC):
     homes_by_motor: ClassVar[bool] = True
     """Whether ``home`` moves the motors by this driver's commands: from then on a run must end passive."""
 
+    notice: ClassVar[str] = ""
+    """What the operator should read before a run of a device that is no ordinary one; "": nothing."""
+
     @abc.abstractmethod
     def connect(self) -> None:
         """Open the transport and check that the right robot answers, in the right version.

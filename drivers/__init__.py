@@ -60,6 +60,11 @@ TRANSPORTS: Final = {
 }
 TOPIC_TRANSPORTS: Final = ("dds", "zenoh")
 """Transports without a descriptor to inherit: each process opens its own."""
+WIRE_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "dds": ("domain",),
+    "zenoh": ("listen", "mode", "insecure", "ca", "certificate", "key"),
+}
+"""What of :class:`~deal_hw.transport.WireOptions` each of them takes."""
 MAKERS: Final[Mapping[tuple[str, str], str]] = {
     ("cartpole", "can"): "deal_hw.drivers.cartpole.can_robot:can_robot",
     ("cartpole", "odrive"): "deal_hw.drivers.cartpole.odrive_robot:odrive_robot",
@@ -70,6 +75,11 @@ MAKERS: Final[Mapping[tuple[str, str], str]] = {
 The function is called as ``function(port, clock, fd=None, can_send=True)`` and returns the Robot; ``fd`` is a
 descriptor of the port that a parent process opened. It does no I/O.
 """
+SIMULATED: Final[Mapping[tuple[str, str], str]] = {
+    ("go2", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoRobot",
+    ("go2_on_stand", "unitree_mujoco"): "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot",
+}
+"""Drivers for a simulator of others in the place of a robot, (robot, simulator) -> "module:class"."""
 CAN_BUSES: Final[Mapping[str, str]] = {
     "can": "deal_hw.drivers.cartpole.can_robot:can_bus",
     "odrive": "deal_hw.drivers.cartpole.odrive_robot:odrive_bus",
@@ -90,6 +100,7 @@ __all__ = [
     "ODOMETRY",
     "REACHED_BY",
     "ROBOTS",
+    "SIMULATED",
     "SPACES",
     "TOPIC_TRANSPORTS",
     "TRANSPORTS",
@@ -128,7 +139,8 @@ def make_robot(
         port: Where: a serial port, a network interface, an endpoint.
         clock: Gives the stamps.
         options: More about a transport of topics.
-        settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2.
+        settings: The driver's own keyword arguments, such as ``stop_buttons`` of the Go2. ``simulator`` names
+            what stands in the place of the robot, and with it the driver.
         can_send: False for a robot that is only listened to, as in a dry run.
 
     Raises:
@@ -138,6 +150,9 @@ def make_robot(
     """
     robot = _driver(name)
     _check_reach(name, transport_name)
+    if settings and "simulator" in settings:
+        settings = dict(settings)
+        robot = _simulated(name, settings.pop("simulator"))
     try:
         if (name, transport_name) in MAKERS:
             _refuse_options(transport_name, options)
@@ -225,9 +240,16 @@ def make_topic_transport(
 
     Raises:
         UnknownNameError: There is no such transport, or it carries no topics.
+        ConfigurationError: An option would be ignored.
     """
     if transport_name not in TOPIC_TRANSPORTS:
         raise UnknownNameError("transport of topics", transport_name, TOPIC_TRANSPORTS)
+    foreign = [name for name in _given(options) if name not in WIRE_OPTIONS[transport_name]]
+    if foreign:
+        raise ConfigurationError(
+            f"{_options(foreign)} would have no effect: transport {transport_name!r} takes "
+            f"{_options(WIRE_OPTIONS[transport_name])}"
+        )
     made: TopicTransport = _find("transport", TRANSPORTS, transport_name)(port, clock, options)
     return made
 
@@ -333,6 +355,17 @@ def default_transport(name: str) -> str:
     return REACHED_BY[name][0]
 
 
+def _simulated(name: str, simulator: str) -> Any:
+    known = [has for robot, has in SIMULATED if robot == name]
+    if not known:
+        raise ConfigurationError(
+            f"--simulator would have no effect: no simulator stands in for robot {name!r}"
+        )
+    if simulator not in known:
+        raise UnknownNameError(f"simulator of robot {name!r}", simulator, known)
+    return _find("simulator", {simulator: SIMULATED[name, simulator]}, simulator)
+
+
 def _options(names: Iterable[str]) -> str:
     """Return settings as they are typed."""
     return ", ".join("--" + name.replace("_", "-") for name in names)
@@ -347,12 +380,16 @@ def _make(name: str, transport_name: str, port: str, clock: Clock, **settings: A
 
 def _refuse_options(transport_name: str, options: WireOptions | None) -> None:
     """Refuse settings of a network on a wire that is none."""
-    if options is not None and options != WireOptions():
-        default = WireOptions().to_json()
-        given = [name for name, value in options.to_json().items() if value != default[name]]
+    if given := _given(options):
         raise ConfigurationError(
             f"{_options(given)} would have no effect: transport {transport_name!r} is no network"
         )
+
+
+def _given(options: WireOptions | None) -> list[str]:
+    """Return the names of the options that differ from their defaults."""
+    default = WireOptions().to_json()
+    return [name for name, value in (options or WireOptions()).to_json().items() if value != default[name]]
 
 
 def _check_reach(name: str, transport_name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from deal_hw.calibration import Budget
+from deal_hw.cli.piped import PipedProgress
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.workflows.calibration.model import Recordings
 from deal_hw.workflows.options import Range, Ratio, Threads, check_ranges, given, refuse
@@ -108,7 +110,7 @@ class Bench:
     """Most generations of a search."""
 
     train: bool = True
-    """Train and deploy policies with the default method."""
+    """Train and deploy policies with the default method; --no-train leaves both out."""
 
     steps: Annotated[int, Range(1, 10**9)] = 300_000
     """go2-loop: steps of each fine-tune."""
@@ -204,10 +206,12 @@ def bench(config: Bench) -> int:
 
     def after(place: str, row: Row, rows: list[Row]) -> None:
         table.draw(out, rows)
+        piped.at(f"{place} rows done")
         if not config.quiet:
             print(f"{place} {table.line(row)}", flush=True)
 
-    rows = run_cells(table.cells, out, after)
+    with PipedProgress(f"bench {config.bench}", config.quiet or sys.stderr.isatty()) as piped:
+        rows = run_cells(table.cells, out, after)
     if not config.quiet:
         table.summary([row for row in rows if not row["error"]])
         files = (out, out.with_suffix(".csv"), out.with_suffix(".png"))

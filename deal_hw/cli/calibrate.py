@@ -57,10 +57,10 @@ class Calibrate(CalibrateSettings):
     """Write that view to a file, FILE.rrd."""
 
     report: bool = True
-    """Write report.html, one page with everything; takes some seconds."""
+    """Write report.html, one page with everything; --no-report saves some seconds."""
 
     advise: bool = True
-    """Compute what to record next where a parameter stayed weak or open; takes some seconds then."""
+    """Compute what to record next where a parameter stayed weak or open; --no-advise saves some seconds."""
 
     quiet: bool = False
     """Print nothing but errors."""

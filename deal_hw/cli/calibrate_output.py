@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 
 from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
+from deal_hw.cli.piped import PipedProgress
 from deal_hw.workflows.calibration.run import HELDOUT_WINDOW_S
 
 TABLE_WIDTH = 100
@@ -14,9 +15,12 @@ TABLE_WIDTH = 100
 
 @contextlib.contextmanager
 def show_progress(title: str, quiet: bool) -> Iterator[ProgressCallback]:
-    """Show a progress bar on a terminal; nothing otherwise."""
+    """Show a progress bar on a terminal; elsewhere a line every ten seconds."""
     if quiet or not sys.stderr.isatty():
-        yield lambda progress: None
+        with PipedProgress(title, quiet) as piped:
+            yield lambda p: piped.at(
+                f"{p.stage} {p.done}/{p.total}" + (f", {p.message}" if p.message else "")
+            )
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import tyro
 
+from deal_hw.cli.piped import PipedProgress
 from deal_hw.workflows.design_excitation import ExcitationReport, ExcitationSettings, run
 
 
@@ -22,7 +23,11 @@ class DesignExcitation(ExcitationSettings):
 
 def design_excitation(config: DesignExcitation) -> ExcitationReport:
     """Run the verb; see :func:`deal_hw.workflows.design_excitation.design_excitation`."""
-    report = run(config, note if not config.quiet and sys.stderr.isatty() else None)
+    if config.quiet or sys.stderr.isatty():
+        report = run(config, None if config.quiet else note)
+    else:
+        with PipedProgress("design-excitation") as piped:
+            report = run(config, lambda done, total, text: piped.at(f"{done}/{total} {text}"))
     if not config.quiet:
         print_design(config.robot, report)
     return report

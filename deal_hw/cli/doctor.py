@@ -22,7 +22,8 @@ _MARKS = {Level.OK: "ok  ", Level.NOTE: "note", Level.WARN: "WARN", Level.FAIL: 
 class Doctor(DoctorSettings):
     """Find out what is wrong with this computer, the link and the robot; sends no command to a motor.
 
-    Without a robot only this computer is examined.
+    Without a robot only this computer is examined. Exits with 1 where something does not work (FAIL), with 0
+    where there are notes and warnings only.
     """
 
     robot: tyro.conf.Positional[str] = ""

@@ -8,6 +8,7 @@ once and `collect` never loads what only `train` needs.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import os
 import signal
@@ -221,6 +222,7 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
         return tyro.cli(
             getattr(module, verb.config),
             prog=f"deal-hw {name}",
+            description=_description(verb, getattr(module, verb.config)),
             args=list(arguments),
             config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed),
             console_outputs=speak,
@@ -239,6 +241,13 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
             raise cause from None
         settings = read(speak=True)
     return settings, getattr(module, verb.function)
+
+
+def _description(verb: Verb, config: Any) -> str:
+    """Return what a verb's help says above its options: what it does, and a line that runs."""
+    text = inspect.cleandoc(config.__doc__) if isinstance(config, type) and config.__doc__ else verb.help
+    example = f"Example:  deal-hw {verb.example}"
+    return text if f"deal-hw {verb.example}" in text else f"{text}\n\n{example}"
 
 
 def _rules() -> Any:

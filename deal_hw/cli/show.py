@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from deal_hw.cli.design_excitation import note, print_design
+from deal_hw.cli.piped import PipedProgress
 from deal_hw.control.process_channel import MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.workflows.design_excitation import ExcitationReport
 from deal_hw.workflows.running.report import EpisodeReport
@@ -16,34 +17,40 @@ from deal_hw.workflows.say import aloud
 
 
 class SecondsBar:
-    """A bar on the terminal; without one, nothing.
+    """A bar on the terminal; without one, what the next line says.
 
     Args:
         bar: A rich Progress; None: there is no terminal.
+        piped: Tells lines; None: there is a bar.
         title: What is going on.
         seconds: How long it takes [s].
     """
 
-    def __init__(self, bar: Any, title: str, seconds: float) -> None:
-        self._bar, self._seconds = bar, seconds
+    def __init__(self, bar: Any, piped: PipedProgress | None, title: str, seconds: float) -> None:
+        self._bar, self._piped, self._title, self._seconds = bar, piped, title, seconds
         self._task = bar.add_task(title, total=seconds) if bar is not None else None
 
     def passed(self, seconds: float) -> None:
         """So many seconds have passed [s]."""
         if self._bar is not None:
             self._bar.update(self._task, completed=min(seconds, self._seconds))
+        if self._piped is not None:
+            self._piped.at(f"running, {seconds:.0f} of {self._seconds:.0f} s")
 
-    def say(self, title: str) -> None:
-        """Something else is going on."""
+    def say(self, doing: str) -> None:
+        """Something else is going on; "": the run itself."""
         if self._bar is not None:
-            self._bar.update(self._task, description=title)
+            self._bar.update(self._task, description=f"{self._title}: {doing}" if doing else self._title)
+        if self._piped is not None:
+            self._piped.at(doing)
 
 
 @contextlib.contextmanager
 def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[SecondsBar]:
-    """Show a bar while the block runs, if standard error is a terminal and nobody asked for quiet."""
+    """Show a bar on a terminal while the block runs, elsewhere a line every ten seconds."""
     if quiet or not sys.stderr.isatty():
-        yield SecondsBar(None, title, seconds)
+        with PipedProgress(title, quiet) as piped:
+            yield SecondsBar(None, piped, title, seconds)
         return
     # Only here: rich takes longer to load than all else that a robot's computer needs.
     from rich.console import Console
@@ -51,7 +58,7 @@ def seconds_bar(title: str, seconds: float, quiet: bool = False) -> Iterator[Sec
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        yield SecondsBar(bar, title, seconds)
+        yield SecondsBar(bar, None, title, seconds)
 
 
 class Terminal(RunView):
@@ -72,7 +79,7 @@ class Terminal(RunView):
 
     @contextlib.contextmanager
     def progress(self, title: str, seconds: float) -> Iterator[OnBeat]:
-        """Show a progress bar on a terminal; everywhere, each second, trouble in making the robot passive."""
+        """Show a bar on a terminal, elsewhere lines; each second trouble in making the robot passive."""
         if self._quiet:
             yield ignore
             return
@@ -86,11 +93,11 @@ class Terminal(RunView):
                     trouble = beat.phase
                     print(f"{title}: {trouble}", file=sys.stderr, flush=True)
                 if beat.phase != RUNNING:
-                    bar.say(f"{title}: {beat.phase}")
+                    bar.say(beat.phase)
                     return
                 if not started_ns:
                     started_ns = beat.stamp_ns
-                    bar.say(title)
+                    bar.say("")
                 if beat.count % 10 == 0:
                     bar.passed((beat.stamp_ns - started_ns) * 1e-9)
 

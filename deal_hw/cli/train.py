@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from deal_hw.cli.piped import PipedProgress
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import InterruptedTrainingError, Training, TrainSettings, run
 
 SHOWN_MEASURES = 3
-"""So many of a task's measures stand beside the progress bar; all are in TensorBoard's files."""
+"""So many of a task's measures are shown beside the progress; all are in TensorBoard's files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,18 +27,17 @@ class Train(TrainSettings):
     """distribution.json of a calibration: parameters, their uncertainty, latency."""
 
     quiet: bool = False
-    """No progress bar."""
+    """Show no progress."""
 
 
 def train(config: Train) -> Training:
     """Run the verb; see :func:`deal_hw.workflows.train.train`."""
-    bar = _progress_bar(config.quiet)
     try:
-        try:
-            training = run(config, _follow(bar))
-        finally:
-            if bar.live.is_started:
-                bar.stop()
+        if config.quiet or sys.stdout.isatty():
+            training = _with_bar(config)
+        else:
+            with PipedProgress("train") as piped:
+                training = run(config, lambda status: piped.at(_words(status)))
     except InterruptedTrainingError as stopped:
         _print(stopped.training)
         print("stopped before the end; --resume goes on from the checkpoint")
@@ -49,6 +50,25 @@ def _print(training: Training) -> None:
     print(f"policy: {training.path}")
     print(f"record: {training.record}")
     print(f"checkpoint: {training.checkpoint}")
+
+
+def _with_bar(config: Train) -> Training:
+    bar = _progress_bar(config.quiet)
+    try:
+        return run(config, _follow(bar))
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+def _words(status: TrainingStatus) -> str:
+    return (
+        f"{status.steps}/{status.total} steps, return {status.mean_return:.1f} {_measures(status)}".rstrip()
+    )
+
+
+def _measures(status: TrainingStatus) -> str:
+    return ", ".join(f"{name} {value:.2f}" for name, value in [*status.measures.items()][:SHOWN_MEASURES])
 
 
 def _progress_bar(quiet: bool) -> Progress:
@@ -70,13 +90,12 @@ def _follow(bar: Progress) -> TrainingProgress:
     def follow(status: TrainingStatus) -> None:
         # Not before: what is refused has no bar.
         bar.start()
-        shown = [f"{name} {value:.2f}" for name, value in status.measures.items()][:SHOWN_MEASURES]
         bar.update(
             row,
             completed=status.steps,
             total=status.total,
             recent=status.mean_return,
-            measures=", ".join(shown),
+            measures=_measures(status),
         )
 
     return follow

@@ -143,10 +143,7 @@ def _excitation(config: CollectSettings, view: RunView) -> tuple[str, float]:
     # Only here: the rest of this verb runs on computers without the extras.
     from deal_hw.workflows import design_excitation
 
-    folder = dataset_folder(config.out, config.dataset)
-    if folder is None:
-        raise RuntimeError("unreachable: dataset_folder() raises where neither folder was given")
-    path = folder.parent / EXCITATION_FILE
+    path = dataset_folder(config.out, config.dataset).parent / EXCITATION_FILE
     settings = design_excitation.ExcitationSettings(
         config.robot, out=path, seconds=config.seconds, policy=config.policy, seed=config.seed
     )

@@ -8,8 +8,8 @@ from typing import Annotated
 from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settings
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
-from deal_hw.workflows.running.settings import RunOptions, plan_options
-from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
+from deal_hw.workflows.running.settings import RunOptions, plan_options, refuse_unrecorded
+from deal_hw.workflows.running.supervised import recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.shipped import shipped_policy
 
@@ -39,8 +39,16 @@ class DeploySettings(RunOptions):
     trust_calibration: bool = False
     """Run a policy that was trained under a calibration whose verdict is red, without asking."""
 
+    record: bool = True
+    """Record the episodes; --no-record where nothing is to be kept."""
+
     dry_run: bool = False
-    """Compute everything and send nothing: the robot is neither homed nor armed."""
+    """Compute everything and send nothing: the robot is neither homed nor armed. Recorded only with --out or
+    --dataset."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_unrecorded(self, self.record)
 
 
 @from_settings(DeploySettings)
@@ -78,7 +86,9 @@ def run(config: DeploySettings, view: RunView) -> RunReport:
     return run_episodes(
         plan,
         port=config.port,
-        dataset=dataset_folder(config.out, config.dataset, required=False),
+        dataset=recording_folder(
+            config.out, config.dataset, "deploy", config.robot, record=config.record and not config.dry_run
+        ),
         episodes=config.episodes,
         purpose="deploy",
         task=config.task,

@@ -11,8 +11,8 @@ from deal_hw.drivers import driver_description
 from deal_hw.workflows.options import File, from_settings
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
-from deal_hw.workflows.running.settings import RunOptions, plan_options
-from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
+from deal_hw.workflows.running.settings import RunOptions, plan_options, refuse_unrecorded
+from deal_hw.workflows.running.supervised import recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 
 
@@ -25,6 +25,13 @@ class ReplaySettings(RunOptions):
 
     robot: str = ""
     """The robot; by default the one that was recorded."""
+
+    record: bool = True
+    """Record what happens; --no-record where nothing is to be kept."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        refuse_unrecorded(self, self.record)
 
 
 @from_settings(ReplaySettings)
@@ -61,7 +68,7 @@ def run(config: ReplaySettings, view: RunView) -> RunReport:
     return run_episodes(
         plan,
         port=config.port,
-        dataset=dataset_folder(config.out, config.dataset, required=False),
+        dataset=recording_folder(config.out, config.dataset, "replay", robot, record=config.record),
         episodes=1,
         purpose="replay",
         view=view,

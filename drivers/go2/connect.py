@@ -15,8 +15,6 @@ from deal_hw.transport import TopicTransport
 CONNECT_TIMEOUT_S: Final = 5.0
 _FIRST_STATES: Final = 20
 """Sound states with a running clock that make a Go2."""
-_ONE_ROBOT: Final = 0.4
-"""A larger share of states that are not new, and two robots send them."""
 _TOO_MANY: Final = 20
 """Messages that are no states, without one that is: then it is no Go2."""
 
@@ -46,7 +44,7 @@ def await_robot(
             pump(left_ns * 1e-9)
     if stream.accepted < _FIRST_STATES:
         raise stream.complaint() or TransportTimeoutError(_why_silent(transport, stream))
-    if stream.stale > _ONE_ROBOT * stream.accepted:
+    if stream.doubled:
         raise WrongDeviceError(
             f"go2: two robots send {topics.LOW_STATE}, or one twice: {stream.stale} of "
             f"{stream.accepted + stream.stale} states were no newer than the one before."
@@ -58,9 +56,8 @@ def _why_silent(transport: TopicTransport, stream: StateStream) -> str:
     where = getattr(transport, "port", type(transport).__name__)
     if stream.stale:
         return (
-            f"go2 on {where}: states come, but their clock stands still at "
-            f"{stream.device_ns // 1_000_000} ms; a robot that hangs (restart it), or a simulator "
-            "that leaves the tick alone?"
+            f"go2 on {where}: states come, but {stream.standstill}; a robot that hangs (restart it), or a "
+            "simulator that is paused?"
         )
     return (
         f"go2 on {where}: no {topics.LOW_STATE} within {CONNECT_TIMEOUT_S:g} s.{_seen_writing(transport)} Is "

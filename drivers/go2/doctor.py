@@ -17,8 +17,9 @@ from deal_hw.control.clock_check import judge_clock
 from deal_hw.control.leg_checks import tilt
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
-from deal_hw.drivers.go2.messages.refusals import ANOTHER_ROBOT, OTHER_RULE, Refusals, StateCheck
+from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.drivers.go2.messages.remote import decode_remote
+from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_simulated
 from deal_hw.drivers.go2.motion_switcher import CHECK_MODE, SWITCHER, RefusedError, ServiceClient
 from deal_hw.drivers.go2.state_stream import PERIOD_MS
 from deal_hw.errors import FrameError, TransportError, TransportTimeoutError
@@ -42,6 +43,7 @@ class _Heard:
     last: LowStateFrame | None = None
     refused: Refusals = field(default_factory=Refusals)
     commands: int = 0
+    repeated: int = 0
 
 
 class Go2Doctor:
@@ -52,13 +54,19 @@ class Go2Doctor:
         clock: The clock of its stamps.
         seconds: How long to listen [s].
         state_check: What a state must pass.
+        simulator: What stands in the robot's place.
     """
 
     def __init__(
-        self, link: TopicTransport, clock: Clock, seconds: float, state_check: StateCheck = "strict"
+        self,
+        link: TopicTransport,
+        clock: Clock,
+        seconds: float,
+        state_check: StateCheck = "strict",
+        simulator: Simulator = "none",
     ) -> None:
         self._link, self._clock, self._seconds = link, clock, seconds
-        self._strict = state_check == "strict"
+        self._strict, self._simulated = state_check == "strict", simulator != "none"
 
     def run(self) -> Iterator[Finding]:
         """Yield what was found; the transport is closed at the end.
@@ -76,6 +84,8 @@ class Go2Doctor:
             yield Finding("link", Level.OK, "the transport is open")
             heard = self._listen()
             yield from self._discovery()
+            if self._simulated:
+                yield Finding("states", Level.NOTE, NOTICE.removeprefix("note: "))
             if not self._strict:
                 yield Finding(
                     "states",
@@ -84,9 +94,11 @@ class Go2Doctor:
                     "leave --state-check out where the robot makes both as deal-hw expects",
                 )
             yield from _judge_states(heard, self._seconds)
-            mode = yield from self._ask_mode()
+            mode = None if self._simulated else (yield from self._ask_mode())
             yield from _judge_commands(heard, self._link.writers(topics.LOW_COMMAND), mode or "")
             if heard.last is not None:
+                if not self._simulated:
+                    yield from _judge_supply(heard.last)
                 yield from _judge_robot(heard.last)
 
     def _listen(self) -> _Heard:
@@ -94,10 +106,31 @@ class Go2Doctor:
         end_ns = self._clock.now_ns() + round(self._seconds * 1e9)
         while (left_ns := end_ns - self._clock.now_ns()) > 0:
             try:
-                _take(heard, self._link.receive(left_ns * 1e-9), self._strict)
+                self._take(heard, self._link.receive(left_ns * 1e-9))
             except TransportTimeoutError:
                 break
         return heard
+
+    def _take(self, heard: _Heard, message: Message) -> None:
+        if message.channel == topics.LOW_COMMAND:
+            heard.commands += 1
+        if message.channel != topics.LOW_STATE:
+            return
+        try:
+            if self._simulated:
+                frame = decode_simulated(message.payload)
+            else:
+                frame = decode_low_state(message.payload, self._strict)
+        except FrameError as error:
+            heard.refused.add(message.payload, error)
+            return
+        if self._simulated and heard.last is not None and heard.last.payload == frame.payload:
+            heard.repeated += 1
+            return
+        heard.stamps.append(message.stamp_ns)
+        if not self._simulated:
+            heard.ticks.append(frame.tick_ms)
+        heard.last = frame
 
     def _discovery(self) -> Iterator[Finding]:
         survey = getattr(self._link, "survey", None)
@@ -166,26 +199,19 @@ class Go2Doctor:
         self._link.send(Message(topic, payload, self._clock.now_ns()))
 
 
-def _take(heard: _Heard, message: Message, strict: bool) -> None:
-    if message.channel == topics.LOW_COMMAND:
-        heard.commands += 1
-    if message.channel != topics.LOW_STATE:
-        return
-    try:
-        frame = decode_low_state(message.payload, strict)
-    except FrameError as error:
-        heard.refused.add(message.payload, error)
-        return
-    heard.stamps.append(message.stamp_ns)
-    heard.ticks.append(frame.tick_ms)
-    heard.last = frame
-
-
 def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     if heard.refused.count:
         yield _judge_refused(heard.refused, len(heard.stamps))
         if not heard.stamps:
             return
+    if len(heard.stamps) < 2 and heard.repeated:
+        yield Finding(
+            "states",
+            Level.FAIL,
+            f"states come, but nothing in them changes: {heard.repeated} times the same",
+            "let the simulation run: it is paused",
+        )
+        return
     if len(heard.stamps) < 2:
         yield Finding(
             "states",
@@ -204,6 +230,8 @@ def _judge_states(heard: _Heard, seconds: float) -> Iterator[Finding]:
     sparse, late = rate < 0.9 * _STATE_HZ, float(np.percentile(gaps, 99)) > _LATE_S
     remedy = "a cable instead of wireless, a faster or less busy computer" if sparse or late else ""
     yield Finding("states", Level.WARN if remedy else Level.OK, text, remedy)
+    if not heard.ticks:
+        return
     ticks = np.diff(np.array(heard.ticks, dtype=np.int64).astype(np.uint32))
     steps = ticks.astype(np.int32)
     if (steps == 0).all():
@@ -233,7 +261,7 @@ def _judge_refused(refused: Refusals, sound: int) -> Finding:
             "states are corrupted on the way: another cable, no wireless; or does a second program send them?"
         )
     else:
-        remedy = OTHER_RULE if refused.by_rule else ANOTHER_ROBOT
+        remedy = refused.remedy
     return Finding("states", Level.FAIL if share > _FEW_REFUSED else Level.WARN, text, remedy)
 
 
@@ -264,7 +292,7 @@ def _judge_commands(heard: _Heard, writers: tuple[str, ...], mode: str) -> Itera
         yield Finding("commands", Level.OK, "nobody else commands the motors")
 
 
-def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
+def _judge_supply(frame: LowStateFrame) -> Iterator[Finding]:
     charge = frame.battery_percent
     text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
     low = charge < 20
@@ -277,6 +305,9 @@ def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
         f"hottest motor {hottest} °C",
         "let it cool down" if hot else "",
     )
+
+
+def _judge_robot(frame: LowStateFrame) -> Iterator[Finding]:
     lean = math.degrees(tilt(frame.orientation))
     tilted = not lean < 30.0 or not abs(float(frame.orientation @ frame.orientation) - 1.0) < 0.01
     yield Finding(

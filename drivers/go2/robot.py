@@ -88,6 +88,7 @@ class Go2Robot(Robot):
 
     description: ClassVar[RobotDescription] = DRIVER
     homes_by_motor: ClassVar[bool] = False
+    _has_services: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -100,7 +101,7 @@ class Go2Robot(Robot):
     ) -> None:
         self._transport, self._clock = transport, clock
         self._stop_text, self._stop_mask = stop_buttons, parse_combination(stop_buttons)
-        self._stream = StateStream(state_check)
+        self._stream = self._make_stream(state_check)
         self._states: deque[RobotState] = deque(maxlen=_QUEUE)
         self._wire: deque[Message] = deque(maxlen=_QUEUE)
         self._sender = CommandSender(transport, clock, self.description, self._wire.append)
@@ -126,6 +127,7 @@ class Go2Robot(Robot):
             self._pump,
             self._motion,
             None if self.description.floating_base is None else np.array(self.description.rest_position),
+            services=self._has_services,
         )
         self._frame: LowStateFrame | None = None
         self._armed = self._homed = self._in_charge = False
@@ -142,7 +144,7 @@ class Go2Robot(Robot):
         try:
             self._forget()
             self._wire.clear()
-            await_robot(self._transport, self._clock, self._stream, self._pump)
+            self._await_robot()
             self._stream.errors = 0
             self._states.clear()
             self.info = self._read_info()
@@ -224,7 +226,7 @@ class Go2Robot(Robot):
             try:
                 self._pump(max(0, deadline_ns - self._clock.now_ns()) * 1e-9)
             except TransportTimeoutError as error:
-                frozen = " (it repeats old ones: its clock stands still)" * (self._stream.stale > stale)
+                frozen = f" (it repeats old ones: {self._stream.standstill})" * (self._stream.stale > stale)
                 raise TransportTimeoutError(
                     f"go2: no new state within {timeout_s:g} s{frozen}; is the robot on, is the cable in "
                     f"({self.transport_errors} transport errors so far)?"
@@ -290,6 +292,12 @@ class Go2Robot(Robot):
         wire = list(self._wire)
         self._wire.clear()
         return wire
+
+    def _make_stream(self, check: StateCheck) -> StateStream:
+        return StateStream(check)
+
+    def _await_robot(self) -> None:
+        await_robot(self._transport, self._clock, self._stream, self._pump)
 
     def _read_info(self) -> Go2Info | None:
         if self._frame is None:
@@ -367,14 +375,15 @@ class Go2Robot(Robot):
     def _status(self, frame: LowStateFrame) -> Status:
         if self._passive_ns is not None:
             sensed_ns = self._stream.device_ns + self._stream.offset_ns
-            if sensed_ns - self._passive_ns >= PASSIVE_DELAY_NS and is_damped(
-                frame, self._sender.damping, self._sender.effort_limit
-            ):
+            if sensed_ns - self._passive_ns >= PASSIVE_DELAY_NS and self._is_passive(frame):
                 self._passive_ns = None
         status = Status.HOMED if self._homed else Status.NONE
         if self._armed or self._passive_ns is not None:
             status |= Status.ARMED
         return status | Status.FAULT if self._fault else status
+
+    def _is_passive(self, frame: LowStateFrame) -> bool:
+        return is_damped(frame, self._sender.damping, self._sender.effort_limit)
 
     def _motion(self) -> tuple[FloatArray, FloatArray]:
         """Return newest positions and velocities; zeros before the first state."""

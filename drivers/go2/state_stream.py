@@ -16,6 +16,8 @@ RESTART_MS: Final = 1000
 OFFSET_WINDOW_NS: Final = 1_000_000_000
 """The clocks' offset is the least of one to two such times: a robot whose clock stood still for a moment
 (a computer that paused) is behind for good, and commands are placed by this offset."""
+_ONE_ROBOT: Final = 0.4
+"""A larger share of states that are not new, and two robots send them."""
 _U32: Final = 1 << 32
 
 
@@ -85,6 +87,16 @@ class StateStream:
         self.accepted += 1
         self._keep_time(message.stamp_ns, first)
         return frame
+
+    @property
+    def doubled(self) -> bool:
+        """Whether so many states are not new that two robots send them."""
+        return self.stale > _ONE_ROBOT * self.accepted
+
+    @property
+    def standstill(self) -> str:
+        """What stands still in states that are not new, in words."""
+        return f"their clock stands still at {self.device_ns // 1_000_000} ms"
 
     def complaint(self) -> ProtocolError | None:
         """Return what is wrong where states come and none is sound; None where none came, or some are."""

@@ -38,6 +38,7 @@ class Takeover:
             TransportTimeoutError where none comes.
         motion: Returns positions and velocities of the joints in the newest state, (J,) each.
         rest: The pose of a lying robot, (J,) [rad]; None for one whose base is held, which cannot fall.
+        services: Whether it has services, and with them a controller of its own that must let go.
     """
 
     def __init__(
@@ -48,11 +49,14 @@ class Takeover:
         pump: Callable[[float], None],
         motion: Callable[[], tuple[FloatArray, FloatArray]],
         rest: FloatArray | None,
+        *,
+        services: bool = True,
     ) -> None:
         self._transport, self._clock, self._pump = transport, clock, pump
         self._motion, self._rest = motion, rest
         self._services = ServiceClient(send, pump, clock)
         self._switcher = MotionSwitcher(self._services, clock)
+        self._has_services = services
         self._foreign, self._foreign_ns = 0, -1
 
     def take(self, message: Message) -> None:
@@ -72,7 +76,7 @@ class Takeover:
                 motors; the text names it.
         """
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while name := self._switcher.active(self._left_s(deadline_ns)):
+        while name := self._active(deadline_ns):
             self._lie_down(name, deadline_ns)
             self._switcher.release(name, self._left_s(deadline_ns))
             self._pump_until(self._clock.now_ns() + round(RELEASE_PAUSE_S * 1e9))
@@ -111,6 +115,9 @@ class Takeover:
             f"go2: another program commands the robot's motors on {topics.LOW_COMMAND}.{who} Stop it; if it "
             "is the robot's own sport mode, switch that off in the vendor's app"
         )
+
+    def _active(self, deadline_ns: int) -> str:
+        return self._switcher.active(self._left_s(deadline_ns)) if self._has_services else ""
 
     def _lie_down(self, name: str, deadline_ns: int) -> None:
         """Lay the robot down where it does not lie: released while it stands, it falls."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import math
 import typing
 from collections.abc import Iterator
@@ -223,6 +224,18 @@ def test_words_that_do_not_parse_still_get_the_box(capsys: pytest.CaptureFixture
         ("deploy cartpole --port p --velocity 0.3,0,0", "--velocity"),
         ("collect go2 --port p --out o --velocity 0.3,0,0", "--velocity"),
         ("deploy cartpole --port p --hand-back", "--hand-back"),
+        ("deploy go2 --port lo --simulator unitree_mujoco --hand-back", "--hand-back"),
+        ("deploy go2 --port lo --simulator unitree_mujoco --state-check length", "--state-check"),
+        ("deploy cartpole --port p --simulator unitree_mujoco", "--simulator"),
+        ("deploy cartpole --port p --out o --no-record", "--out"),
+        ("replay e --port p --dataset d --no-record", "--dataset"),
+        ("deploy cartpole --port p --no-record --no-record-wire", "--record-wire"),
+        ("doctor cartpole --port p --simulator unitree_mujoco", "--simulator"),
+        ("doctor cartpole --port p --state-check length", "--state-check"),
+        ("doctor --state-check length", "--state-check"),
+        ("doctor --transport can", "--transport"),
+        ("doctor --seconds 5", "--seconds"),
+        ("doctor go2 --port lo --simulator unitree_mujoco --state-check length", "--state-check"),
         ("collect cartpole --port p --out o --profile chirp --excite multisine", "--profile"),
         ("collect cartpole --port p --out o --profile chirp --excitation-level 1", "--excitation-level"),
         ("collect cartpole --port p --out o --profile hold --policy a.onnx", "--policy"),
@@ -248,3 +261,27 @@ def test_a_missing_recording_is_told_before_the_missing_desktop(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert main(["inspect", "nothere.mcap"]) == 2
     assert "nothere.mcap cannot be read" in capsys.readouterr().err
+
+
+def test_a_flag_that_leaves_something_out_says_so() -> None:
+    """The help shows `--no-report`; its text must not read as if that wrote a report."""
+    checked = set()
+    for verb in VERBS.values():
+        for settings in dataclasses_of(getattr(importlib.import_module(verb.module), verb.config)):
+            parts = [part for part in settings.__mro__ if dataclasses.is_dataclass(part)]
+            source = "".join(map(inspect.getsource, parts))
+            for field in dataclasses.fields(settings):
+                if field.default is True and f"\n    {field.name}: bool" in source:
+                    text = source.partition(f"\n    {field.name}: bool")[2].partition('"""')[2]
+                    assert f"--no-{field.name.replace('_', '-')}" in text.partition('"""')[0]
+                    checked.add(field.name)
+    assert checked >= {"record_wire", "support_check", "report", "advise", "refine", "train", "record"}
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_every_help_page_has_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A line that runs, above the options."""
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    page = capsys.readouterr().out.partition("options")[0]
+    assert f"deal-hw {VERBS[name].example}" in " ".join(page.split())

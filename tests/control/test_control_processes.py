@@ -183,6 +183,11 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     asked = [d.read(0).trajectory.requested_position for d in (first, Dataset.open(tmp_path / "b"))]
     assert asked[0].shape == (25, 1)
     assert (asked[0] == asked[1]).all()
+    said = report.episodes[-1]
+    assert said.replay is not None and said.replay.position[0] < 0.05
+    lines = said.lines()
+    assert lines[1].startswith("  ran for 0.5 of 0.5 s")
+    assert any(line.startswith("  off the recording by ") for line in lines)
 
 
 def test_dry_run_leaves_the_motor_off(emulator: Emulator, tmp_path: Path) -> None:

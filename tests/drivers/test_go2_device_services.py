@@ -97,7 +97,7 @@ def test_a_move_is_answered_and_not_walked(make_go2: Any) -> None:
         ("sport", 1008, {"x": 1.0}, 3204),
         ("sport", 1008, {"x": float("nan"), "y": 0.0, "z": 0.0}, 3204),
         ("motion_switcher", 1002, {"name": "gallop"}, 7004),
-        ("motion_switcher", 1002, {"name": "ai"}, 7002),
+        ("motion_switcher", 1002, {"name": "ai"}, 0),
         ("motion_switcher", 1002, {"name": "normal"}, 0),
         ("robot_state", 1001, {"name": "tea_kitchen", "switch": 1}, 3204),
         ("motion_switcher", 1, {}, 0),
@@ -109,6 +109,27 @@ def test_codes_of_answers(
     """Unknown functions, bad parameters and wrong names have the vendor's error codes."""
     answer = make_go2(sport="normal").call(service, api, parameter)
     assert answer == Response(77_000_000_001, api, code, answer.data if answer else "")
+
+
+@pytest.mark.parametrize("service", ["motion_switcher", "sport", "robot_state"])
+def test_the_version_is_the_text_that_the_sdk_compares(make_go2: Any, service: str) -> None:
+    """Its client prints "not equal" where the text differs from its own 1.0.0.1, by quotes, too."""
+    answer = make_go2(sport="normal").call(service, 1, {})
+    assert answer is not None and answer.data == "1.0.0.1"
+
+
+def test_another_mode_may_be_selected_while_one_is_active(make_go2: Any) -> None:
+    """As programs do on the robot: the new one has it, standing. While one lets go, the switcher is busy."""
+    bench = make_go2(sport="normal", start="standing")
+    assert bench.call("motion_switcher", 1002, {"name": "ai"}).code == 0
+    assert bench.mode() == "ai"
+    bench.run(1600)
+    assert bench.device.base_height > 0.31
+    bench.call("motion_switcher", 1003)
+    assert bench.call("motion_switcher", 1002, {"name": "normal"}).code == 7002
+    bench.run(320)
+    assert bench.mode() == ""
+    assert bench.call("motion_switcher", 1002, {"name": "normal"}).code == 0
 
 
 def test_no_reply_is_no_reply(make_go2: Any) -> None:

@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 
 from deal_hw.clock import VirtualClock
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.doctor import Go2Doctor
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
+from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.rpc import decode_response, encode_response
+from deal_hw.drivers.go2.messages.simulated import Simulator
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.errors import TransportError
 from deal_hw.findings import Finding, Level
@@ -254,3 +257,37 @@ def test_a_refused_question_is_not_taken_for_a_free_robot() -> None:
     findings = examine(tamper=refuse)
     assert only(findings, "services", "checking the mode failed").level is Level.WARN
     assert not any("low level is free" in f.message for f in findings)
+
+
+# unitree_mujoco in the robot's place.
+
+
+def simulated(simulator: Simulator, **attributes: Any) -> list[Finding]:
+    """Return the findings on a stand-in of the simulator."""
+    clock = VirtualClock()
+    device = UnitreeMujoco(np.array(DRIVER.rest_position))
+    for name, value in attributes.items():
+        setattr(device, name, value)
+    return list(Go2Doctor(VirtualTopics(device, clock), clock, 1.0, simulator=simulator).run())
+
+
+def test_a_simulator_is_recognised_and_its_option_named() -> None:
+    """One finding for all its states, with what to add and when not to."""
+    found = only(simulated("none"), "states", "are no Go2 states")
+    assert found.level is Level.FAIL
+    assert "--simulator unitree_mujoco" in found.remedy and "A real Go2 never sends them" in found.remedy
+
+
+def test_a_simulator_that_is_named_is_well() -> None:
+    """Services and battery that it lacks are no findings, and what is not checked is said once."""
+    findings = simulated("unitree_mujoco")
+    assert {f.level for f in findings} == {Level.OK, Level.NOTE}
+    assert only(findings, "states", "states a second").message.startswith("500 ")
+    assert len([f for f in findings if "no head, clock, checksum and battery" in f.message]) == 1
+    assert not [f for f in findings if f.area == "services" or "battery 0" in f.message]
+
+
+def test_a_simulator_that_is_paused_is_said() -> None:
+    """Its states go on and do not change."""
+    found = only(simulated("unitree_mujoco", paused=True), "states", "nothing in them changes")
+    assert (found.level, found.remedy) == (Level.FAIL, "let the simulation run: it is paused")

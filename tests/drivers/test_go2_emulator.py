@@ -133,7 +133,9 @@ def test_its_own_faults_do_not_end_it(transport: str, shares: dict[str, float], 
     clock = VirtualClock(5_000 * MS)
     device = Go2Device(nominal_truth(), sport="", plan=FaultPlan(**shares))  # type: ignore[arg-type]
     port = free_port({"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:0"}[transport])
-    wire = make_transport(transport, port, WireOptions(domain=dds_domain, listen=transport == "zenoh"))
+    wire = make_transport(
+        transport, port, WireOptions(listen=True) if transport == "zenoh" else WireOptions(domain=dds_domain)
+    )
     emulator = Go2Emulator(device, wire, clock)
     emulator.open()
     try:

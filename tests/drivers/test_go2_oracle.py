@@ -14,6 +14,7 @@ from pycdr2 import IdlStruct
 from pycdr2.types import array, float32, int16, int32, int64, sequence, uint8, uint16, uint32
 
 from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS
+from deal_hw.drivers.go2.emulator.unitree_mujoco import UnitreeMujoco
 from deal_hw.drivers.go2.messages import remote, rpc, sport_state
 from deal_hw.drivers.go2.messages.protocol import (
     WIRE_JOINTS,
@@ -578,3 +579,17 @@ def test_garbage_is_refused_not_crashed_on(data: bytes, cut: int) -> None:
                 reader(payload)
             except FrameError:
                 continue
+
+
+def test_the_simulators_state_equals_the_oracle() -> None:
+    """The stand-in of unitree_mujoco fills in what the vendor's bridge does, and leaves zeros elsewhere."""
+    payload = UnitreeMujoco(np.linspace(0.1, 1.2, 12), settle_s=0.1).state()
+    frame = decode_low_state(payload, strict=False)
+    message = LowStateIdl.deserialize(HEADER + bytes(1176))
+    slots: Any = message.motor_state
+    for motor, joint in zip(slots, IN_WIRE_ORDER, strict=False):
+        motor.q, motor.dq, motor.tau_est = frame.position[joint], frame.velocity[joint], frame.effort[joint]
+    imu = message.imu_state
+    imu.quaternion, imu.gyroscope = frame.orientation.tolist(), frame.angular_velocity.tolist()
+    imu.accelerometer = frame.specific_force.tolist()
+    assert payload == message.serialize()

@@ -56,7 +56,7 @@ ROOMS = {
         {"emulator", "claim", "motion_switcher", "motions", "odometry", "state_stream", "support"},
         {"bridge", "command_sender", "connect", "doctor", "takeover"},
         {"robot"},
-        {"fake"},
+        {"fake", "unitree_mujoco"},
     ),
     "data": ({"files"}, {"recording", "run_folder"}, {"importing"}, {"checks", "export"}),
     "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings"}),

@@ -143,6 +143,7 @@ def test_a_file_that_holds_no_distribution_is_refused(tmp_path: Path, text: str,
 def test_an_unknown_robot_is_refused_by_name() -> None:
     """The message lists the robots that can be trained."""
     with pytest.raises(
-        UnknownNameError, match=r"unknown robot with a training environment 'go3'; known: ant, cartpole, go2"
+        UnknownNameError,
+        match=r"unknown robot with a training environment 'go3'; known: allegro, ant, cartpole, ",
     ):
         train(Train(robot="go3", udr=True, quiet=True))

@@ -71,6 +71,9 @@ def test_the_drivers_own_settings_are_carried_where_they_were_given() -> None:
     settings = options["robot_settings"]
     assert settings == {"support_check": False, "state_check": "length"}
     clock = VirtualClock()
+    simulated = plan_options("go2", LinkOptions(simulator="unitree_mujoco"), LegOptions())["robot_settings"]
+    assert simulated == {"simulator": "unitree_mujoco"}
+    assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, simulated).notice
     assert make_robot("go2", "zenoh", "tcp/127.0.0.1:7447", clock, None, settings).info is None  # type: ignore[attr-defined]
     with pytest.raises(ConfigurationError, match="--support-check, --state-check would have no effect"):
         make_robot("cartpole", "serial", "/dev/ttyUSB0", clock, None, settings)

@@ -29,7 +29,9 @@ ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 0.6
 
 
-def test_a_robot_is_emulated_recorded_and_replayed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_is_emulated_recorded_and_replayed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Paths, outcome and truth come back; sentences go to `say` alone; a path may be a string."""
     said: list[str] = []
     with deal_hw.emulate("cartpole", nominal=True, profile="sensor", seed=3) as robot:
@@ -40,9 +42,14 @@ def test_a_robot_is_emulated_recorded_and_replayed(tmp_path: Path, capfd: pytest
         )
         again = deal_hw.replay(run.paths[0], port=port, dataset=str(tmp_path / "again"))
         dry = deal_hw.deploy("cartpole", port=port, seconds=SECONDS, dry_run=True)
+        monkeypatch.chdir(tmp_path)
+        kept = deal_hw.replay(run.paths[0], port=port)
+        lost = deal_hw.replay(run.paths[0], port=port, record=False)
     assert run.outcome is again.outcome is dry.outcome is Outcome.FINISHED
     assert run.dataset == tmp_path / "dataset" and run.paths[0].is_file()
     assert again.paths[0].parent == tmp_path / "again" / "episodes" and dry.paths == ()
+    assert kept.dataset == Path("runs/replay_cartpole/dataset") and kept.paths[0].is_file()
+    assert lost.dataset is None and lost.paths == ()
     assert any("too short for `deal-hw calibrate`" in text for text in said)
     assert "finished: the run is over" in said
     for shown in (run._repr_html_(), run.table()):

@@ -112,7 +112,7 @@ class CalibrateSettings(Checked):
     """Most generations of the search."""
 
     refine: bool = True
-    """Follow the search by multiple shooting on prediction error."""
+    """Follow the search by multiple shooting on prediction error; --no-refine ends with the search."""
 
     seed: Seed = 0
     """Fixes everything random."""

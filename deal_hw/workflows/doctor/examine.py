@@ -20,7 +20,7 @@ from deal_hw.findings import Finding, Level
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.doctor.robot import examine_robot
-from deal_hw.workflows.options import Checked, Range, from_settings
+from deal_hw.workflows.options import Checked, Range, from_settings, given, refuse
 from deal_hw.workflows.say import html_table
 
 
@@ -39,6 +39,9 @@ class DoctorSettings(Checked):
 
     state_check: Literal["strict", "length"] = "strict"
     """What the states of a Go2 must pass: strict, or length to leave head and checksum out."""
+
+    simulator: Literal["none", "unitree_mujoco"] = "none"
+    """What stands in the place of a Go2, such as the simulator unitree_mujoco."""
 
     seconds: Annotated[float, Range(0.5, 600, "s")] = 3.0
     """How long to listen to the robot [s]."""
@@ -93,12 +96,12 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
     from deal_hw.drivers.transports.can_transport import open_can
     from deal_hw.workflows.doctor.can import list_adapters, listen_to_bus
 
+    name = _transport(config)
     yield from examine_machine()
     yield from list_adapters()
     yield from judge_interfaces(config.port)
     if not config.robot:
         return
-    name = config.transport or default_transport(config.robot)
     clock = MonotonicClock()
     try:
         if name not in TOPIC_TRANSPORTS:
@@ -115,9 +118,28 @@ def examine(config: DoctorSettings) -> Iterator[Finding]:
         from deal_hw.drivers.go2.doctor import Go2Doctor
 
         link = make_topic_transport(name, config.port, clock, config.wire)
-        yield from Go2Doctor(link, clock, config.seconds, config.state_check).run()
+        yield from Go2Doctor(link, clock, config.seconds, config.state_check, config.simulator).run()
     except DealHwError as error:
         yield Finding("link", Level.FAIL, str(error))
+
+
+def _transport(config: DoctorSettings) -> str:
+    """Return how the robot is reached; "" without a robot.
+
+    Raises:
+        ConfigurationError: An option would be ignored.
+    """
+    default = DoctorSettings()
+    if not config.robot:
+        options = ("transport", "state_check", "simulator", "seconds", "wire")
+        refuse(given(config, default, options), "without a robot only this computer is examined")
+        return ""
+    name = config.transport or default_transport(config.robot)
+    if name not in TOPIC_TRANSPORTS:
+        refuse(given(config, default, ("state_check", "simulator")), "only a Go2's states have that")
+    elif config.simulator != "none":
+        refuse(given(config, default, ("state_check",)), f"{config.simulator} has no checksums")
+    return name
 
 
 def judge_interfaces(port: str) -> Iterator[Finding]:

@@ -73,7 +73,7 @@ class Go2Options:
         return WireOptions(
             domain=self.domain,
             listen=transport == "zenoh" and self.mode == "peer",
-            mode=self.mode,
+            mode="" if transport == "dds" and self.mode == Go2Options.mode else self.mode,
             insecure=self.insecure,
             ca=self.ca,
             certificate=self.certificate,

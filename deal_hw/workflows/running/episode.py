@@ -20,6 +20,7 @@ from deal_hw.control.process_channel import (
     STARTING,
     Beat,
 )
+from deal_hw.control.replay_error import ReplayError, replay_error
 from deal_hw.control.supervisor import OPERATOR, Supervisor
 from deal_hw.control.velocity_error import VelocityError, velocity_error, wanted_velocity
 from deal_hw.data.recording.excitation import Excitation
@@ -110,7 +111,12 @@ class EpisodeRun:
         with listening:
             end = supervisor.run()
         self.signal = end.signal
-        report = account(end, self._path, self._robot.watchdog_s)
+        report = dataclasses.replace(
+            account(end, self._path, self._robot.watchdog_s), planned_s=self._plan.total_s
+        )
+        report = dataclasses.replace(
+            report, ran_s=report.cycles_sent / self._robot.description.control_rate_hz
+        )
         if self._store is not None and self._path is not None:
             try:
                 kept = {name: self._metadata[name] for name in ("task", "profile", "excitation_level")}
@@ -119,7 +125,10 @@ class EpisodeRun:
                 if moved is not None:
                     report = dataclasses.replace(report, motion=Excitation(**moved))
                 report = dataclasses.replace(
-                    report, walk=self._walk(self._path), balance=self._balance(self._path)
+                    report,
+                    walk=self._walk(self._path),
+                    balance=self._balance(self._path),
+                    replay=self._replayed(self._path),
                 )
             except (DealHwError, OSError) as err:
                 # As on a full disk. The report matters more, and the next open takes the recording in.
@@ -139,6 +148,13 @@ class EpisodeRun:
         if self._plan.robot not in BALANCE or self._plan.profile != "balance":
             return None
         return balanced(self._plan.robot, read_trajectory(path))
+
+    def _replayed(self, path: Path) -> ReplayError | None:
+        """Return how far a replay's motion is from the recorded one."""
+        if self._plan.profile != "replay":
+            return None
+        before_s = self._plan.posture.before_s if self._plan.stand else 0.0
+        return replay_error(read_trajectory(Path(self._plan.recording)), read_trajectory(path), before_s)
 
     def _make_passive(
         self, phase: str, in_vain: bool, supervisor: Supervisor, on_beat: Callable[[Beat], None]

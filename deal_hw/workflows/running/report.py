@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from deal_hw import errors
 from deal_hw.control.balance import FALLEN_RAD, BalanceResult
 from deal_hw.control.loop import Outcome
 from deal_hw.control.loop_timing import LoopTimingReport
+from deal_hw.control.replay_error import ReplayError
 from deal_hw.control.velocity_error import VelocityError
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.workflows.say import html_table, text_table
@@ -37,6 +40,9 @@ class EpisodeReport:
         walk: How well a walking robot followed what it was told, by its own sensors; None where it did not
             walk or nothing was recorded.
         balance: How well a policy held the cart-pole's pole up, as the robot reported; None where none did.
+        replay: How far a replay's motion is from the recorded one; None for other runs.
+        ran_s: How long commands went out [s].
+        planned_s: How long they should have [s]; 0 where that is not known.
     """
 
     path: Path | None
@@ -52,6 +58,9 @@ class EpisodeReport:
     motion: Excitation | None = None
     walk: VelocityError | None = None
     balance: BalanceResult | None = None
+    replay: ReplayError | None = None
+    ran_s: float = 0.0
+    planned_s: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -70,6 +79,9 @@ class EpisodeReport:
     def lines(self) -> list[str]:
         """Return the account for the operator; warnings are extra."""
         lines = [f"{self.outcome.value}: {self.reason}"]
+        if self.planned_s and self.cycles_sent:
+            hit = "" if self.clipped or self.outcome is Outcome.TRIPPED else "; no limit was hit"
+            lines.append(f"  ran for {self.ran_s:.1f} of {self.planned_s:.1f} s{hit}")
         if self.loop_timing is not None:
             lines += ["  " + line for line in self.loop_timing.lines()]
         for limit, cycles in self.clipped.items():
@@ -86,6 +98,12 @@ class EpisodeReport:
                 f"  pole upright (within {FALLEN_RAD} rad) for {self.balance.upright_s:.1f} of "
                 f"{self.balance.duration_s:.1f} s; mean |angle| {self.balance.angle_error_rad:.3f} rad, "
                 f"mean |cart speed| {self.balance.cart_speed_m_s:.3f} m/s"
+            )
+        if self.replay is not None:
+            worst = int(np.argmax(self.replay.position))
+            lines.append(
+                f"  off the recording by {self.replay.position[worst]:.3g} at most (RMS of joint "
+                f"{self.replay.joint_names[worst]!r}, rad or m), over {self.replay.seconds:.1f} s"
             )
         return lines
 

@@ -9,7 +9,7 @@ from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import Checked, File, given, refuse
+from deal_hw.workflows.options import Checked, File, given, option, refuse
 from deal_hw.workflows.say import Say, silent
 
 
@@ -32,7 +32,8 @@ class LegOptions:
     L2+B)."""
 
     support_check: bool = True
-    """Refuse a go2 on a stand and a go2_on_stand on the floor. Leave out only to try a policy in the air."""
+    """Refuse a go2 on a stand and a go2_on_stand on the floor; --no-support-check only to try a policy in the
+    air."""
 
     posture: PostureConfig = field(default_factory=PostureConfig)
     """How long standing up and lying down take."""
@@ -50,8 +51,12 @@ class LinkOptions(Checked):
     """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
     checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
 
+    simulator: Literal["none", "unitree_mujoco"] = "none"
+    """What stands in the place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and battery
+    (docs/how-to/unitree-mujoco.md). A real robot is then refused."""
+
     record_wire: bool = True
-    """Record the raw bytes, too."""
+    """Record the raw bytes, too; --no-record-wire leaves them out."""
 
     wire: WireOptions = field(default_factory=WireOptions)
     """More about a network."""
@@ -73,8 +78,8 @@ class RunOptions(Checked):
     """What a robot with legs needs to be told."""
 
     out: File | None = None
-    """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET nothing is recorded; collect needs
-    one of the two."""
+    """Run folder; the episodes go to OUT/dataset. Without OUT and DATASET deploy and replay record in
+    runs/VERB_ROBOT; collect needs one of the two."""
 
     dataset: File | None = None
     """Dataset folder instead of OUT/dataset; new episodes are added to those that are there."""
@@ -82,6 +87,18 @@ class RunOptions(Checked):
     say: Say = silent
     """From Python: called with sentences on what happens; ``print`` shows them. By default warnings alone are
     told, on standard error."""
+
+
+def refuse_unrecorded(options: RunOptions, record: bool) -> None:
+    """Refuse options of a recording that is not to be made.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    if not record:
+        names = [name for name in ("out", "dataset") if getattr(options, name) is not None]
+        wire = given(options.link, LinkOptions(), ["record_wire"])
+        refuse([*map(option, names), *wire], "--no-record keeps nothing")
 
 
 def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool = True) -> dict[str, Any]:
@@ -103,6 +120,11 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
         refuse(given(legs, LegOptions()), f"only robots with legs take that, and robot {robot!r} has none")
     if not walks:
         refuse(given(legs, LegOptions(), ["velocity"]), "no policy that walks runs here")
+    if link.simulator != "none":
+        refuse(
+            [*given(link, LinkOptions(), ["state_check"]), *given(legs, LegOptions(), ["hand_back"])],
+            f"{link.simulator} has neither checksums nor a controller of its own",
+        )
     if not stands:
         refuse(given(legs, LegOptions(), ["posture"]), "the robot neither stands up nor lies down")
     return {
@@ -124,8 +146,9 @@ def _settings(link: LinkOptions, legs: LegOptions) -> dict[str, Any]:
         "stop_buttons": legs.stop_buttons,
         "support_check": legs.support_check,
         "state_check": link.state_check,
+        "simulator": link.simulator,
     }
-    default = {"stop_buttons": "", "support_check": True, "state_check": "strict"}
+    default = {"stop_buttons": "", "support_check": True, "state_check": "strict", "simulator": "none"}
     return {name: value for name, value in given.items() if value != default[name]}
 
 

@@ -52,19 +52,39 @@ def _both(first: OnBeat, second: OnBeat) -> OnBeat:
     return on_beat
 
 
-def dataset_folder(out: File | None, dataset: File | None, *, required: bool = True) -> Path | None:
+def dataset_folder(out: File | None, dataset: File | None) -> Path:
     """Return the dataset's folder from the options --out and --dataset.
 
     Raises:
-        ConfigurationError: Both were given, or neither where one is required.
+        ConfigurationError: Both were given, or neither.
     """
     if out is not None and dataset is not None:
         raise errors.ConfigurationError("give --out RUN or --dataset DIR, not both")
-    if out is None and dataset is None and required:
-        raise errors.ConfigurationError("give --out RUN (the episodes go to RUN/dataset) or --dataset DIR")
     if out is not None:
         return Path(out) / "dataset"
-    return None if dataset is None else Path(dataset)
+    if dataset is None:
+        raise errors.ConfigurationError("give --out RUN (the episodes go to RUN/dataset) or --dataset DIR")
+    return Path(dataset)
+
+
+def recording_folder(
+    out: File | None, dataset: File | None, purpose: str, robot: str, *, record: bool = True
+) -> Path | None:
+    """Return where a run is recorded that needs no recording; None where it is not.
+
+    Args:
+        out: --out.
+        dataset: --dataset.
+        purpose: "deploy" or "replay"; with the robot's name, that of the folder in runs by default.
+        robot: The robot.
+        record: Whether to record; False leaves only a folder that was named.
+
+    Raises:
+        ConfigurationError: Both were given.
+    """
+    if out is None and dataset is None:
+        return Path("runs") / f"{purpose}_{robot}" / "dataset" if record else None
+    return dataset_folder(out, dataset)
 
 
 def run_episodes(
@@ -116,7 +136,9 @@ def run_episodes(
     ExcitationLevelSearch(plan.excitation_level, attempts)
     plan = check_plan(plan, robot.description, view)
     reports: list[EpisodeReport] = []
-    if not robot.watchdog_s and not plan.dry_run:
+    if robot.notice:
+        view.note(robot.notice)
+    elif not robot.watchdog_s and not plan.dry_run:
         view.note(HOLDS_LAST_COMMAND.format(robot=plan.robot))
     # The supervisor connects to the robot itself, so that a wrong port is known before a process is started.
     # From then on it only keeps the port, until the control process is dead.

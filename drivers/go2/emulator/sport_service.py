@@ -1,8 +1,9 @@
 """The emulated Go2's services: who moves the robot, what sport mode shall do, what runs on the robot.
 
 Names, numbers and answers: unitree_sdk2_python @ 37116c5 and unitree_sdk2 @ 21d0a3b (motion switcher, sport,
-robot state, RPC errors). Not published, so assumed: a release takes 0.3 s, and waits for a movement under
-way; sport mode that is selected stands the robot up; released, the motors keep the last command.
+robot state, RPC errors). Programs of others on real robots select a mode while another one is active, and
+wait for the robot to stand up. Not published, so assumed: a release takes 0.3 s, and waits for a movement
+under way; meanwhile the switcher is busy; released, the motors keep the last command.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ BAD_PARAMETER: Final = 3204
 SWITCHER_BUSY: Final = 7002
 SWITCHER_NAME: Final = 7004
 API_VERSION: Final = 1
-_VERSION: Final = '"1.0.0.1"'
+_VERSION: Final = "1.0.0.1"
+"""As text without quotes, as the SDK's own server sends it: its client compares it as it comes."""
 _SWITCH_PROTECTED: Final = 5
 _OTHER_SERVICES: Final = ("motion_switcher", "robot_state")
 
@@ -52,6 +54,11 @@ class SportMode:
         self.name = name
         self.controller = SportController()
         self._release_ms: int | None = None
+
+    @property
+    def releasing(self) -> bool:
+        """Whether it is letting go."""
+        return self._release_ms is not None
 
     def select(self, name: str, position: FloatArray, now_ms: int) -> None:
         """Take the robot over and stand it up, from measured positions (12,)."""
@@ -143,9 +150,10 @@ class ServiceServer:
         name = aliases.get(name, name)
         if name not in SERVICE_OF:
             return SWITCHER_NAME, None
-        if self._sport.name:
-            return (0 if self._sport.name == name else SWITCHER_BUSY), None
-        self._sport.select(name, position, now_ms)
+        if self._sport.releasing:
+            return SWITCHER_BUSY, None
+        if self._sport.name != name:
+            self._sport.select(name, position, now_ms)
         return 0, None
 
     def _release(self, asked: Any, position: FloatArray, now_ms: int) -> tuple[int, Any]:

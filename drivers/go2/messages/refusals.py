@@ -7,6 +7,7 @@ from typing import Final, Literal
 
 from deal_hw.drivers.go2.messages import topics
 from deal_hw.drivers.go2.messages.layout import LOW_STATE_BYTES
+from deal_hw.drivers.go2.messages.simulated import UNITREE_MUJOCO, is_unitree_mujoco
 from deal_hw.drivers.go2.messages.wire import CDR_HEADER
 from deal_hw.errors import FrameError, ProtocolError, VersionMismatchError, WrongDeviceError
 
@@ -30,7 +31,7 @@ class Refusals:
 
     def __init__(self) -> None:
         self.count, self.first = 0, ""
-        self._ruled = 0
+        self._ruled = self._simulated = 0
         self._lengths: Counter[int] = Counter()
 
     def add(self, payload: bytes, error: FrameError) -> None:
@@ -39,18 +40,26 @@ class Refusals:
         self.first = self.first or str(error)
         self._lengths[len(payload)] += 1
         self._ruled += len(payload) == LOW_STATE_BYTES and payload[:4] == CDR_HEADER
+        self._simulated += is_unitree_mujoco(payload)
 
     @property
     def by_rule(self) -> bool:
         """Whether most have a Go2's length and encoding, but not its head or checksum."""
         return 2 * self._ruled > self.count
 
+    @property
+    def remedy(self) -> str:
+        """What to do where every state was refused."""
+        if 2 * self._simulated > self.count:
+            return UNITREE_MUJOCO
+        return OTHER_RULE if self.by_rule else ANOTHER_ROBOT
+
     def error(self) -> ProtocolError:
         """Return what is wrong where every state was refused."""
         if self.by_rule:
             return VersionMismatchError(
                 f"go2: {self._ruled} states have the right length, and none the right head and checksum (the "
-                f"first: {self.first}): {OTHER_RULE}"
+                f"first: {self.first}): {self.remedy}"
             )
         length = self._lengths.most_common(1)[0][0]
         if length != LOW_STATE_BYTES:

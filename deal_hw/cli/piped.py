@@ -1,0 +1,73 @@
+"""Where a long verb stands, told in lines: for logs and pipes, where no terminal shows a bar."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+from collections.abc import Callable
+from types import TracebackType
+
+from deal_hw.clock import Clock, MonotonicClock
+
+EVERY_S = 10.0
+
+
+def _to_stderr(line: str) -> None:
+    # A reader that has gone, such as `head`, ends the lines and nothing else.
+    with contextlib.suppress(OSError, ValueError):
+        print(line, file=sys.stderr, flush=True)
+
+
+class PipedProgress:
+    """Tells every ten seconds how long a verb has run and what it was last doing.
+
+    A thread tells: what is computed may take longer than ten seconds between two steps, and a pipe that
+    nobody reads must not hold up a process that watches a robot.
+
+    Args:
+        title: The verb.
+        quiet: Whether to tell nothing.
+        clock: For the time that has passed.
+        wait: Waits so long [s] and returns whether the verb has ended; by default until the block is left.
+        say: Called with each line.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        quiet: bool = False,
+        *,
+        clock: Clock | None = None,
+        wait: Callable[[float], bool] | None = None,
+        say: Callable[[str], None] = _to_stderr,
+    ) -> None:
+        self._title, self._clock, self._say = title, clock or MonotonicClock(), say
+        self._text = ""
+        self._ended = threading.Event()
+        self._wait = wait or self._ended.wait
+        self._began_ns = self._clock.now_ns()
+        self._thread = None if quiet else threading.Thread(target=self.tell, name="progress", daemon=True)
+
+    def at(self, text: str) -> None:
+        """Note what is being done now; the next line says it."""
+        self._text = text
+
+    def tell(self) -> None:
+        """Say a line every ten seconds until the verb has ended."""
+        while not self._wait(EVERY_S):
+            passed_s = (self._clock.now_ns() - self._began_ns) * 1e-9
+            self._say(f"{self._title}: {passed_s:.0f} s" + (f", {self._text}" if self._text else ""))
+
+    def __enter__(self) -> PipedProgress:
+        if self._thread is not None:
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._ended.set()

@@ -1,0 +1,170 @@
+"""The vendor's simulator unitree_mujoco in the place of a Go2: what its states lack, what is checked instead.
+
+It speaks the Go2's topics, and fills less of them (:mod:`deal_hw.drivers.go2.emulator.unitree_mujoco` has the
+facts). Nobody gets here unasked: the option names the simulator, and a state with a head or a battery, which
+a real robot sends, is refused.
+
+| missing | what is checked instead |
+|---|---|
+| head | the states must have none, and no battery: then they are not a real Go2's |
+| tick | a state is new where it differs from the one before, and is as old as its reception |
+| checksum | length and header; the checksums of UDP or TCP stand for the rest |
+| battery | nothing: the limits of charge and voltage are 0 |
+| motion switcher | nothing is released; before arming nobody may have commanded the motors, as on the robot |
+
+It turns a command into torques once, and holds these. So the command in force is sent again with each state
+while the robot is passive, and it counts as passive only once its joints are slow.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from deal_hw.clock import Clock
+from deal_hw.description import RobotDescription
+from deal_hw.drivers.go2.descriptions import on_stand
+from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.messages import topics
+from deal_hw.drivers.go2.messages.low_state import LowStateFrame
+from deal_hw.drivers.go2.messages.refusals import StateCheck
+from deal_hw.drivers.go2.messages.simulated import NOTICE, decode_simulated
+from deal_hw.drivers.go2.robot import STOP_BUTTONS, Go2Robot
+from deal_hw.drivers.go2.state_stream import StateStream
+from deal_hw.errors import ConfigurationError, FrameError, WrongDeviceError
+from deal_hw.transport import Message, TopicTransport
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitreeMujocoConfig:
+    """Where the lines are drawn."""
+
+    still_rad_s: float = 0.1
+    """Passive is a simulator whose joints are slower [rad/s]: with the passive damping of 5 N·m·s/rad it
+    holds at most 0.5 N·m afterwards. A limp robot that lies was seen at 0.004 rad/s."""
+
+    def __post_init__(self) -> None:
+        if not self.still_rad_s > 0:
+            raise ConfigurationError(f"still_rad_s must be positive, got {self.still_rad_s}")
+
+
+class SimulatorStream(StateStream):
+    """Judges states without a tick: new is what differs, and its time is that of its reception.
+
+    The simulator publishes faster than its physics steps, so a state that comes again is no error; it is not
+    taken, and the limit of a state's age holds. Lost states leave no trace.
+    """
+
+    def reset(self) -> None:
+        """Forget everything."""
+        super().reset()
+        self._last = b""
+
+    @property
+    def doubled(self) -> bool:
+        """False: repeated states are the rule here. Two simulators are found by DDS's discovery."""
+        return False
+
+    @property
+    def standstill(self) -> str:
+        """What stands still in states that are not new, in words."""
+        return "nothing in them changes"
+
+    def take(self, message: Message) -> LowStateFrame | None:
+        """Return the state in a message; None where it is corrupt or not new.
+
+        Raises:
+            VersionMismatchError: It has a head, as a real Go2's.
+        """
+        payload = message.payload
+        try:
+            frame = decode_simulated(payload)
+        except FrameError as error:
+            self.errors += 1
+            self._refused.add(payload, error)
+            return None
+        if payload == self._last:
+            self.stale += 1
+            return None
+        self._last = payload
+        self.device_ns = max(message.stamp_ns, self.device_ns + 1)
+        self.sequence += 1
+        self.accepted += 1
+        return frame
+
+
+def without_battery(description: RobotDescription) -> RobotDescription:
+    """Return the description of a Go2 without limits of charge and voltage; all others stay."""
+    limits = description.limits
+    if limits.legs is None:
+        raise ConfigurationError(f"{description.name}: no limits of a robot with legs")
+    legs = dataclasses.replace(limits.legs, battery=0.0, battery_low=0.0, voltage=0.0, arm_voltage=0.0)
+    why = "unitree_mujoco has no battery"
+    return dataclasses.replace(
+        description,
+        limits=dataclasses.replace(limits, legs=legs),
+        sources={
+            **description.sources,
+            **dict.fromkeys(("legs.battery", "legs.battery_low", "legs.voltage", "legs.arm_voltage"), why),
+        },
+    )
+
+
+class UnitreeMujocoRobot(Go2Robot):
+    """The driver of a Go2 in front of unitree_mujoco.
+
+    Args:
+        transport: Topics of the simulator.
+        clock: The clock of the transport's stamps.
+        stop_buttons: As the Go2's; the simulator has them where a gamepad is plugged in.
+        support_check: As the Go2's.
+        config: Where the lines are drawn.
+    """
+
+    description: ClassVar[RobotDescription] = without_battery(DRIVER)
+    notice: ClassVar[str] = NOTICE
+    _has_services: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        transport: TopicTransport,
+        clock: Clock,
+        *,
+        stop_buttons: str = STOP_BUTTONS,
+        support_check: bool = True,
+        config: UnitreeMujocoConfig | None = None,
+    ) -> None:
+        self._config = config or UnitreeMujocoConfig()
+        super().__init__(transport, clock, stop_buttons=stop_buttons, support_check=support_check)
+
+    def _make_stream(self, check: StateCheck) -> StateStream:
+        return SimulatorStream(check)
+
+    def _await_robot(self) -> None:
+        super()._await_robot()
+        writers = self._transport.writers(topics.LOW_STATE)
+        if len(writers) > 1:
+            raise WrongDeviceError(
+                f"go2: {len(writers)} programs write {topics.LOW_STATE}: {'; '.join(writers)}. Without clock "
+                "and checksum their states cannot be told apart; stop all but one, or choose another domain"
+            )
+
+    def _take_frame(self, frame: LowStateFrame, receive_ns: int) -> None:
+        super()._take_frame(frame, receive_ns)
+        if not self._armed:
+            # Its damping is a torque that was right once. Sent every 20 ms it shakes the legs.
+            self.repeat()
+
+    def _is_passive(self, frame: LowStateFrame) -> bool:
+        return super()._is_passive(frame) and bool(
+            np.nanmax(np.abs(frame.velocity)) < self._config.still_rad_s
+        )
+
+
+class UnitreeMujocoOnStandRobot(UnitreeMujocoRobot):
+    """The same with its base held in the air, as by the simulator's elastic band."""
+
+    description: ClassVar[RobotDescription] = without_battery(on_stand.DESCRIPTION)

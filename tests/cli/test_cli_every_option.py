@@ -1,0 +1,243 @@
+"""Every option of the verbs that reach a robot changes what they do, or is refused; every option is read."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deal_hw.cli.main import VERBS, parse
+from deal_hw.clock import VirtualClock
+from deal_hw.control.posture import PostureConfig
+from deal_hw.drivers import driver_description, make_robot
+from deal_hw.errors import DealHwError
+from deal_hw.transport import WireOptions
+from deal_hw.types import Trajectory
+from deal_hw.workflows import collect, deploy, replay
+from deal_hw.workflows.doctor import examine
+from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.running.settings import LegOptions, LinkOptions
+
+ROOT = Path(__file__).resolve().parents[2]
+ZENOH = "--transport zenoh --port tcp/127.0.0.1:7447"
+LINES = (
+    "collect cartpole --port p --out o",
+    "collect cartpole --port p --out o --profile chirp",
+    "collect cartpole --port p --out o --profile hold",
+    "collect go2 --port lo --out o --profile hold",
+    f"collect go2_on_stand {ZENOH} --out o",
+    "deploy cartpole --port p",
+    "deploy cartpole --port p --out o --dry-run",
+    "deploy go2 --port lo",
+    f"deploy go2 {ZENOH} --no-record",
+    "replay e --port p",
+    "replay e --port lo --robot go2",
+    f"replay e {ZENOH} --robot go2 --stand False",
+    "doctor",
+    "doctor cartpole --port p",
+    "doctor go2 --port lo",
+    f"doctor go2 {ZENOH} --simulator unitree_mujoco",
+)
+VALUES = {
+    "robot": "go2_on_stand",
+    "transport": "zenoh",
+    "port": "p2",
+    "profile": "chirp",
+    "excite": "multisine",
+    "velocity": "0.1,0,0",
+    "stop_buttons": "R2+A",
+    "stand": "False",
+    "task": "balance",
+    "mode": "peer",
+    "state_check": "length",
+    "simulator": "unitree_mujoco",
+    "out": "o2",
+    "dataset": "d2",
+    "policy": "other.onnx",
+    "json": "findings.json",
+    "ca": "ca.pem",
+    "certificate": "c.pem",
+    "key": "k.pem",
+}
+"""What options that are no numbers and flags are given, where that is not their default."""
+COMPOSED = (("", "_after_s"), ("servo_", ""))
+"""Beginnings and ends of names that the emulators of the Go2 and of the servos compose."""
+TOLD_ELSEWHERE = {"quiet", "json", "say"}
+"""They change what is printed or written of the result, which the tests of each verb look at."""
+
+
+def dataclasses_of(hint: Any) -> Iterator[type[Any]]:
+    """Yield the dataclasses in a type, those inside them included."""
+    for part in typing.get_args(hint):
+        yield from dataclasses_of(part)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        yield hint
+        for inner in typing.get_type_hints(hint, include_extras=True).values():
+            yield from dataclasses_of(inner)
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """An option as it is typed."""
+
+    name: str
+    words: tuple[str, ...]
+
+
+def options(config: type[Any], line: str) -> Iterator[Option]:
+    """Yield every option of a verb's settings, each with a value that is not its default in this line."""
+    values = {**VALUES, "stand": "True"} if "go2_on_stand" in line else VALUES
+    for settings in (config, LinkOptions, WireOptions, LegOptions, PostureConfig):
+        if settings not in set(dataclasses_of(config)):
+            continue
+        hints = typing.get_type_hints(settings)
+        for entry in dataclasses.fields(settings):
+            flag = entry.name.replace("_", "-")
+            hint = str(hints[entry.name])
+            if entry.name in ("say", "episode") or any(dataclasses_of(hints[entry.name])):
+                continue
+            if hints[entry.name] is bool:
+                yield Option(entry.name, (f"--no-{flag}" if entry.default is True else f"--{flag}",))
+            elif entry.name in values:
+                yield Option(entry.name, (f"--{flag}", values[entry.name]))
+            elif "int" in hint or "float" in hint:
+                whole = "int" in hint and "float" not in hint
+                yield Option(entry.name, (f"--{flag}", "2" if whole else "2.5"))
+
+
+def cases() -> Iterator[Any]:
+    """Yield each line with each option that is not in it."""
+    for line in LINES:
+        verb, *words = line.split()
+        config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
+        for option in options(config, line):
+            flags = {f"--{option.name.replace('_', '-')}", f"--no-{option.name.replace('_', '-')}"}
+            positional = option.name == "robot" and verb != "replay"
+            if option.name not in TOLD_ELSEWHERE and not positional and not flags & set(words):
+                yield pytest.param(line, option, id=f"{line} {option.name}")
+
+
+def recorded() -> Trajectory:
+    """Return a recording of a cart-pole with two commands."""
+    facts = driver_description("cartpole")
+    flat, joints = np.zeros((2, 1)), np.zeros((3, 2))
+    return Trajectory(
+        joint_names=facts.joint_names,
+        actuated=facts.actuated,
+        receive_s=np.arange(3.0),
+        device_s=np.arange(3.0),
+        position=joints,
+        velocity=joints,
+        effort=joints,
+        status=np.zeros(3, np.int64),
+        command_sequence=np.zeros(3, np.int64),
+        command_age_s=np.zeros(3),
+        sent_s=np.arange(2.0),
+        sent_sequence=np.arange(2),
+        requested_position=flat,
+        position_target=flat,
+        stiffness=flat,
+        damping=flat,
+        effort_limit=flat,
+        speed_limit=flat,
+        events=(),
+        metadata={"robot": "cartpole"},
+    )
+
+
+@pytest.fixture
+def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What a verb did at the end: which robot it made, with which plan, and where it recorded."""
+    did: list[Any] = []
+
+    def run_episodes(plan: Any, *, port: str, **others: Any) -> RunReport:
+        # The same call as the supervisor's: a driver or a wire refuses settings that it does not have.
+        make_robot(plan.robot, plan.transport, port, VirtualClock(), plan.wire, plan.robot_settings)
+        others.pop("view")
+        did.append((plan.to_json(), port, others))
+        return RunReport(dataset=None, episodes=())
+
+    def behaviour(trajectory: Trajectory, description: Any) -> Any:
+        return type("Replayed", (), {"duration_s": 2.0})()
+
+    for module in (collect, deploy, replay):
+        monkeypatch.setattr(module, "run_episodes", run_episodes)
+    monkeypatch.setattr(replay, "read_trajectory", lambda path: recorded())
+    monkeypatch.setattr(replay, "ReplayBehaviour", behaviour)
+
+    def examine_robot(*arguments: Any) -> Iterator[Any]:
+        did.append([arguments[0], arguments[3]])
+        return iter(())
+
+    class Listener:
+        def __init__(self, link: Any, clock: Any, *others: Any) -> None:
+            did.append(others)
+
+        def run(self) -> Iterator[Any]:
+            return iter(())
+
+    def made(*arguments: Any) -> Any:
+        did.append([value for value in arguments if not hasattr(value, "now_ns")])
+        from deal_hw import drivers
+
+        kind = drivers.make_robot if arguments[0] in drivers.ROBOTS else drivers.make_topic_transport
+        return kind(*arguments)
+
+    monkeypatch.setattr(examine, "make_robot", made)
+    monkeypatch.setattr(examine, "make_topic_transport", made)
+    monkeypatch.setattr(examine, "examine_robot", examine_robot)
+    monkeypatch.setattr(examine, "examine_machine", lambda: iter(()))
+    monkeypatch.setattr(examine, "judge_interfaces", lambda port: iter(()))
+    monkeypatch.setattr("deal_hw.drivers.go2.doctor.Go2Doctor", Listener)
+    return did
+
+
+def outcome(done: list[Any], words: list[str]) -> Any:
+    """Return what a verb did with some words, or the refusal."""
+    done.clear()
+    try:
+        settings, function = parse(words[0], words[1:])
+        function(settings)
+    except DealHwError as error:
+        return error
+    return repr(done)
+
+
+@pytest.mark.parametrize(("line", "option"), list(cases()))
+def test_an_option_changes_something_or_is_refused(line: str, option: Option, done: list[Any]) -> None:
+    """In this combination. The lines themselves are not refused."""
+    plain = outcome(done, line.split())
+    assert not isinstance(plain, DealHwError), plain
+    changed = outcome(done, [*line.split(), *option.words])
+    assert isinstance(changed, DealHwError) or changed != plain, f"{' '.join(option.words)} did nothing"
+
+
+def test_every_option_of_every_verb_is_read() -> None:
+    """As an attribute, or by its name in a list of names: an option that nobody reads does nothing.
+
+    Another thing of the same name would hide one. Names that the emulators compose count as read.
+    """
+    read: set[str] = set()
+    for folder in ("deal_hw", "drivers", "policies", "calib"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                    read.add(node.attr)
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    read.add(node.value)
+    unread = {
+        f"{verb} {entry.name}"
+        for verb, found in VERBS.items()
+        for settings in dataclasses_of(getattr(importlib.import_module(found.module), found.config))
+        for entry in dataclasses.fields(settings)
+        if entry.name not in read
+        and not any(entry.name.startswith(a) and entry.name.endswith(b) for a, b in COMPOSED)
+    }
+    assert unread == set()
