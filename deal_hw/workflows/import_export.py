@@ -127,7 +127,7 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
 
     Args:
         config: Settings.
-        say: Called with sentences on what was mended in the dataset.
+        say: Called with sentences on what was mended in the dataset, and what was filled.
 
     Returns:
         How many episodes, and the robot's name.
@@ -147,7 +147,10 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
         paths = [config.path]
     trajectories = [read_trajectory(path) for path in paths]
     robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
-    return export_lerobot(trajectories, config.out, robot, config.task), robot
+    frames, filled = export_lerobot(trajectories, config.out, robot, config.task)
+    if filled:
+        say(f"{filled} of {frames} frames stand for lost samples: interpolated, and `filled` is true there")
+    return len(trajectories), robot
 
 
 def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:

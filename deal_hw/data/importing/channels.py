@@ -27,6 +27,7 @@ class Channels:
         digest: SHA-256 of what was read.
         arrays: By name, (T,) or (T, K); those of one clock have one length.
         labels: Names of the K columns of an array, where the file tells them.
+        units: Units of the K columns of an array, where the file tells them.
         joint_names: Names of the joints, where the file lists them.
         part: Which recording of the file it is, such as "episode 3"; "" where there is only one.
         notes: What the reader of the file left out or changed.
@@ -37,6 +38,7 @@ class Channels:
     digest: str
     arrays: Mapping[str, FloatArray]
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    units: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
     part: str = ""
     notes: tuple[str, ...] = ()

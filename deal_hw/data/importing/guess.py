@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels
-from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
+from deal_hw.data.importing.columns import POSITION_UNITS, ColumnMap, JointColumns, TimeColumn
 from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
@@ -177,6 +177,8 @@ def _from_arrays(
         time = _guess_time(channels, channels.arrays, (f"{topic}.",)) or time
         command_time = _guess_command_time(channels, arrays["target"].channel) if "target" in arrays else None
     unit = arrays["position"].unit or "rad"
+    units = channels.units.get(array, ())
+    units = units if len(units) == width and set(units) <= set(POSITION_UNITS) else (unit,) * width
     fits = {role: guess.channel for role, guess in arrays.items()}
     return ColumnMap(
         time=time,
@@ -186,7 +188,7 @@ def _from_arrays(
         velocity=_of_same_rows(channels, fits, "velocity"),
         effort=_of_same_rows(channels, fits, "effort"),
         joints=tuple(
-            JointColumns(name=model, column=name, index=index if by_order else None, unit=unit)
+            JointColumns(name=model, column=name, index=index if by_order else None, unit=units[index])
             for model, name, index in found
         ),
         source=("guessed",),
