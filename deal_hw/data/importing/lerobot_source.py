@@ -179,7 +179,7 @@ def _stamped(arrays: dict[str, FloatArray], fps: float) -> dict[str, FloatArray]
             arrays["timestamp"] = regular
     if "command_age" in arrays:  # Written by our own export: when each action came into force.
         sent = np.round(arrays["timestamp"] - arrays["command_age"], 6)
-        arrays["command_time"] = np.maximum.accumulate(sent)
+        arrays["command_time_s"] = np.maximum.accumulate(sent)
     lost = arrays.pop("filled", np.zeros(1))
     if lost.any():  # Interpolated by our own export: no measurement.
         arrays = {name: values[lost == 0] for name, values in arrays.items()}
