@@ -1,6 +1,6 @@
 """Measures what the standard messages of an episode cost: bytes a second, the recorder's time for a cycle.
 
-    python tools/measure_recording_size.py
+    python tools/measure_recording_size.py --out FILE.json
 
 The cart-pole has 4 state samples in a cycle of 20 ms, the Go2 has 10 and what its body senses. Numbers are
 noisy, as those of a robot are: repeated ones would compress to nothing.
@@ -17,6 +17,7 @@ from unittest import mock
 
 import numpy as np
 
+from deal_hw.bench.rows import write_rows
 from deal_hw.clock import VirtualClock
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
@@ -123,7 +124,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each recording")
+    parser.add_argument("--out", type=Path, help="a JSON file for the rows")
     options = parser.parse_args()
+    rows = []
     for robot in ("cartpole", "go2"):
         made = cycles(robot, round(options.seconds * 50), np.random.default_rng(0))
         without, with_ = record(robot, made, frozenset(STANDARD)), record(robot, made, frozenset())
@@ -131,6 +134,11 @@ def main() -> None:
             f"{robot}: {without[0] / 1e3:.1f} kB/s without, {with_[0] / 1e3:.1f} with standard messages: "
             f"{with_[0] / without[0]:.2f} times; {without[1]:.3f} and {with_[1]:.3f} ms a cycle"
         )
+        sizes = {"bytes_per_second": without[0], "with_standard_messages": with_[0]}
+        times = {"ms_per_cycle": without[1], "ms_with_standard_messages": with_[1]}
+        rows.append({"robot": robot, **sizes, **times})
+    if options.out is not None:
+        write_rows(options.out, rows, program="tools/measure_recording_size.py")
 
 
 if __name__ == "__main__":

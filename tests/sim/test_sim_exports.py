@@ -123,6 +123,9 @@ def test_actuator_table_by_hand(robot: RobotModel, result: CalibrationResult) ->
     assert table["without_value"] == {"shoulder": ["armature"]}
     first = table["mjlab"]["actuators"][0]
     assert first["damping"] == 9.0 and first["target_names_expr"] == ["shoulder"]
+    assert first["viscous_damping"] == 0.2 and table["mjlab"]["actuators"][1]["viscous_damping"] == 0.0
+    # 12.5 ms and the 4 ms of its own, at 2 ms a step: 8.25; without its own 6.25.
+    assert [row["delay_max_lag"] for row in table["mjlab"]["actuators"]] == [8, 6]
     for part in (isaac, table["mjlab"]):
         assert any("elbow.bias = 0.05 rad" in text for text in part["cannot_express"])
         assert not any("shoulder.stiffness" in text for text in part["cannot_express"])

@@ -2,7 +2,7 @@
 
 Each file lists what its format cannot hold, and which values the recordings say nothing about. Field names
 are those of Isaac Lab's ``ActuatorBaseCfg`` and ``DelayedPDActuatorCfg``, of mjlab's
-``BuiltinPositionActuatorCfg`` and ``DelayedActuatorCfg``, and of URDF.
+``BuiltinPositionActuatorCfg`` (1.6), and of URDF.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ _ISAAC_LAB = (
     "value",
 )
 _MJLAB = (
-    "damping is the servo's D gain alone: the joint's own damping stays in calibrated.xml, which mjlab reads",
     "velocity_limit has no field: no set-point is limited in speed",
-    "delay_min_lag and delay_max_lag are whole physics steps, of the 90 % interval of the latency",
+    "delay_min_lag and delay_max_lag are the latency in whole physics steps: a range would be drawn anew in "
+    "each step",
 )
 _URDF = (
     "armature has no field: most importers set 0",
@@ -122,7 +122,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
             "cannot_express": [*_ISAAC_LAB, *_left_out(result, _ACTUATOR_KINDS)],
         },
         "mjlab": {
-            "class": "DelayedActuatorCfg of BuiltinPositionActuatorCfg",
+            "class": "BuiltinPositionActuatorCfg",
             "actuators": [
                 {
                     "target_names_expr": [joint],
@@ -131,11 +131,11 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
                     "effort_limit": row["effort_limit"],
                     "armature": row["armature"],
                     "frictionloss": row["friction"],
+                    "viscous_damping": row["joint_damping"],
+                    **dict.fromkeys(("delay_min_lag", "delay_max_lag"), round(row["delay_s"] / robot.step_s)),
                 }
                 for joint, row in rows.items()
             ],
-            "delay_min_lag": steps["min"],
-            "delay_max_lag": steps["max"],
             "cannot_express": [*_MJLAB, *_left_out(result, _ACTUATOR_KINDS)],
         },
     }
