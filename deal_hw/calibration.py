@@ -162,6 +162,13 @@ class CalibrationResult:
     seconds: float = 0.0
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def without_value(self) -> tuple[str, ...]:
+        """Names of the parameters of which the recordings say nothing."""
+        verdicts = self.verdicts or ("",) * len(self.space)
+        named = zip(self.space.names, verdicts, strict=True)
+        return tuple(name for name, verdict in named if verdict == "not identifiable")
+
     def distribution(self) -> ParameterDistribution:
         """Return what is now known about the parameters."""
         covariance = self.covariance

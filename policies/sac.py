@@ -13,11 +13,13 @@ import stable_baselines3
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from deal_hw.policies.checkpoint import Checkpoint, write_checkpoint
 from deal_hw.policies.network_policy import NetworkPolicy, diverged, is_finite, one_thread, trained_spec
+from deal_hw.policies.sb3_model import model_path, read_start, restore_optimisers, write_model
 from deal_hw.policies.training_log import TrainingLog
 from deal_hw.policies.vector_env import ServoVectorEnv
 from deal_hw.policy import Observation
@@ -108,7 +110,9 @@ class SacTrainer:
                 from it, as stable-baselines3 draws from them.
             progress: Called about a hundred times.
             files: Checkpoint, TensorBoard files, and the word to stop. A checkpoint holds the networks and
-                not the transitions: a training that goes on gathers new ones.
+                not the transitions: a training that goes on gathers new ones. The model of stable-baselines3
+                lies beside it and has the optimisers' memory, which a resumed training takes up. It can be a
+                start, too.
 
         Returns:
             The mean action, without exploration.
@@ -120,7 +124,7 @@ class SacTrainer:
         files = files or TrainingFiles()
         with one_thread(), TrainingLog(files.log) as log:
             seed = int(rng.integers(2**31))
-            found = files.source(env.layout, read_checkpoint)
+            found = files.source(env.layout, read_start)
             done = int(found.notes["steps"]) if found is not None and files.resume else 0
             if done:
                 seed = int(np.random.default_rng([seed, done]).integers(2**31))
@@ -129,6 +133,8 @@ class SacTrainer:
             if found is not None:
                 _load(model, config, found)
                 model.num_timesteps = done
+            if files.resume and files.checkpoint is not None:
+                restore_optimisers(model_path(files.checkpoint), model)
             mean = _MeanActor(config.steps * (1.0 - config.averaged))
             report = _Report(adapter, config, progress, files, log)
             if done < config.steps:
@@ -156,13 +162,10 @@ def _load(model: SAC, config: SacConfig, found: Checkpoint) -> None:
 
 
 def _model(adapter: _Adapter, config: SacConfig, seed: int) -> SAC:
-    def learning_rate(remaining: float) -> float:
-        return config.final_learning_rate + remaining * (config.learning_rate - config.final_learning_rate)
-
     return SAC(
         "MlpPolicy",
         adapter,
-        learning_rate=learning_rate,
+        learning_rate=LinearSchedule(config.learning_rate, config.final_learning_rate, 1.0),
         buffer_size=config.buffer,
         learning_starts=config.warmup,
         batch_size=config.batch,
@@ -316,6 +319,7 @@ class _Report(BaseCallback):
         }
         found = Checkpoint(tensors={**tensors, "entropy.log": model.log_ent_coef}, notes=notes)
         write_checkpoint(self._files.checkpoint, found, self._adapter.env.layout)
+        write_model(model_path(self._files.checkpoint), model)
 
 
 def _losses(model: Any) -> dict[str, float]:

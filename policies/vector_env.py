@@ -79,7 +79,7 @@ class ServoVectorEnv(VectorEnv[Observation, FloatArray, Any], abc.ABC):
         self.num_envs = count
         self.ticks = ticks
         self.host_delay_s = host_delay_s
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         O, A = len(layout.observation), len(layout.actuated)  # noqa: E741
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (O,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)

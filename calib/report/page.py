@@ -20,6 +20,7 @@ from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
+from deal_hw.sim.mjcf.exports import write_exports
 
 DISTRIBUTION = "distribution.json"
 MODEL = "calibrated.xml"
@@ -242,11 +243,18 @@ def write_result(
             if report is not None:
                 write_report(waiting / REPORT, report)
                 names.append(REPORT)
+            names += write_exports(waiting, robot, result)
             source = f"method {result.method}, distribution {result.distribution().digest()}"
             try:
                 require_other(folder / MODEL, robot.description.mjcf)
                 written = write_calibrated_mjcf(
-                    robot, result.space, result.estimate, waiting / MODEL, result.latency_s, source
+                    robot,
+                    result.space,
+                    result.estimate,
+                    waiting / MODEL,
+                    result.latency_s,
+                    source,
+                    result.without_value,
                 )
                 names += [file.name for file in written]
             except ConfigurationError as err:

@@ -114,7 +114,9 @@ class Calibration:
         path, robot, result = Path(path), self.inputs.robot, self.result
         require_other(path, robot.description.mjcf)
         source = f"method {result.method}, distribution {self.distribution.digest()}"
-        write_calibrated_mjcf(robot, result.space, result.estimate, path, result.latency_s, source)
+        write_calibrated_mjcf(
+            robot, result.space, result.estimate, path, result.latency_s, source, result.without_value
+        )
         return path
 
     def save(self, folder: Path | str) -> dict[str, Path]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from deal_hw.errors import ConfigurationError
+from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
 from deal_hw.workflows.options import Checked, Range, given, refuse
@@ -15,6 +15,7 @@ from deal_hw.workflows.say import Say, silent
 if TYPE_CHECKING:
     from deal_hw.data.importing.table import Table
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.reader import Episode
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
@@ -23,7 +24,8 @@ class ImportSettings(Checked):
     """Settings of :func:`import_recordings`."""
 
     paths: tuple[Path, ...]
-    """CSV, NPZ or MCAP files, or folders of LeRobot datasets; of one robot."""
+    """CSV, NPZ or MCAP files, folders of LeRobot datasets or ROS 2 bags; episodes and datasets of deal-hw; of
+    one robot."""
     out: Path
     """The dataset to make or add to."""
     columns: Path | None = None
@@ -74,6 +76,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.importing.grid import common_period, to_trajectories
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
+    from deal_hw.data.importing.table import table_of
 
     if config.description is not None:
         default = ImportSettings(paths=config.paths, out=config.out)
@@ -82,7 +85,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     facts = _joint_facts(config.model, say)
     described = None if config.description is None else _description(config.description)
     joints = described["joint_names"] if described is not None else None if facts is None else facts.names
-    tables = [table for path in config.paths for table in load_tables(path, columns, joints, say)]
+    episodes, foreign = ([], list(config.paths)) if columns or described else _as_recorded(config, facts, say)
+    tables = [table for path in foreign for table in load_tables(path, columns, joints, say)]
+    checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
+    if episodes:
+        described = dict(episodes[0].description)
     problems = {
         table.name: [
             v.to_json()
@@ -90,9 +97,9 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
                 table, facts, config.force, servo=_takes_positions(facts, table), say=say
             )
         ]
-        for table in tables
+        for table in checked
     }
-    period = common_period(tables)
+    period = common_period(checked)
     recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
     for part in recordings:
         how = part.trajectory.metadata["import"]
@@ -111,7 +118,39 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         mjcf=config.model,
         rates_per_sample=config.device_periods,
     )
-    return write_dataset(config.out, recordings, values, {"plausibility": problems}, say)
+    return write_dataset(
+        config.out, recordings, values, {"plausibility": problems}, say, [e.path for e in episodes]
+    )
+
+
+def _as_recorded(
+    config: ImportSettings, facts: JointFacts | None, say: Say
+) -> tuple[list[Episode], list[Path]]:
+    """Return the episodes of ours, which are copied as they are, and the files that are to be interpreted.
+
+    Those whose joints the model does not have are interpreted, too: a column map can name them.
+    """
+    from deal_hw.data.importing.load import own_episodes
+    from deal_hw.data.recording.reader import read_episode
+
+    found: list[Episode] = []
+    foreign: list[Path] = []
+    for path in config.paths:
+        episodes = [read_episode(episode) for episode in own_episodes(path, say)]
+        names = {name for episode in episodes for name in episode.trajectory.joint_names}
+        if episodes and (facts is None or names <= set(facts.names)):
+            found += episodes
+        else:
+            foreign.append(path)
+    for episode in found:
+        if episode.description != found[0].description:
+            raise DatasetError(
+                f"{episode.path} has another description of its robot than {found[0].path}; import them apart"
+            )
+    if found:
+        default = ImportSettings(paths=config.paths, out=config.out)
+        refuse(given(config, default, ("name", "device_periods")), "the episodes' own description says it")
+    return found, foreign
 
 
 def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
@@ -127,7 +166,7 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
 
     Args:
         config: Settings.
-        say: Called with sentences on what was mended in the dataset.
+        say: Called with sentences on what was mended in the dataset, and what was filled.
 
     Returns:
         How many episodes, and the robot's name.
@@ -147,7 +186,10 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
         paths = [config.path]
     trajectories = [read_trajectory(path) for path in paths]
     robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
-    return export_lerobot(trajectories, config.out, robot, config.task), robot
+    frames, filled = export_lerobot(trajectories, config.out, robot, config.task)
+    if filled:
+        say(f"{filled} of {frames} frames stand for lost samples: interpolated, and `filled` is true there")
+    return len(trajectories), robot
 
 
 def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:

@@ -70,7 +70,8 @@ class TrainSettings(Checked):
     record (.json) and TensorBoard's files go beside it."""
 
     start: File | None = None
-    """A checkpoint (.safetensors) to fine-tune: its networks are where training starts."""
+    """A checkpoint (.safetensors) to fine-tune: its networks are where training starts. SAC also takes a
+    model of stable-baselines3 (.zip), whose tensors alone are read."""
 
     resume: bool = False
     """Go on where the training that wrote this --out was stopped."""

@@ -337,7 +337,9 @@ def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tm
     """Everything is written and read back; without inputs there is no report."""
     robot = load_model(DESCRIPTION)
     files = write_result(tmp_path / "a", robot, gathered.result, gathered)
-    assert set(files) == {"result.json", "distribution.json", "trace.npz", "report.html", "calibrated.xml"}
+    exports = {"actuators.yaml", "urdf.yaml", "values.yaml"}
+    numbers = {"result.json", "distribution.json", "trace.npz"}
+    assert set(files) == {*numbers, *exports, "report.html", "calibrated.xml"}
     assert all(file.is_file() for file in files.values())
     digest = gathered.result.distribution().digest()
     assert f"method truth, distribution {digest}" in files["calibrated.xml"].read_text()

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.data.importing.grid import Gains, common_period, grid_rate, period_of, to_trajectories
-from deal_hw.data.importing.load import load_recordings, table_of
+from deal_hw.data.importing.load import load_recordings
 from deal_hw.data.importing.store import write_dataset
-from deal_hw.data.importing.table import Table
+from deal_hw.data.importing.table import Table, table_of
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError

@@ -68,7 +68,8 @@ def test_round_trip(
     folder = tmp_path_factory.mktemp("lerobot") / "out"
     tables = [some_table(length, joints, actuated, rate_hz, seed) for seed, length in enumerate(lengths)]
     parts = [part.trajectory for table in tables for part in to_trajectories(table)]
-    assert export_lerobot(parts, folder, "test", "move about") == len(lengths)
+    frames, filled = export_lerobot(parts, folder, "test", "move about")
+    assert (frames, filled) == (sum(lengths), 0)
     back = load_tables(folder)
     assert [table.source["part"] for table in back] == [f"episode {i}" for i in range(len(lengths))]
     for before, after in zip(tables, back, strict=True):
@@ -84,21 +85,28 @@ def test_round_trip(
 def test_layout(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
     """The files of layout v3.0 with what a reader looks for: versions, paths, ranges, statistics, tasks."""
     assert (
-        export_lerobot([make_trajectory(), make_trajectory()], tmp_path / "out", "cartpole", "swing up") == 2
-    )
+        export_lerobot([make_trajectory(), make_trajectory()], tmp_path / "out", "cartpole", "swing up")
+    ) == (1598, 0)
     info = json.loads((tmp_path / "out/meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] == 200 and isinstance(info["fps"], int)
     assert info["robot_type"] == "cartpole" and info["splits"] == {"train": "0:2"}
     # The first command comes into force after the first sample: that one has no action and is no frame.
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (2, 1598, 1)
     state = info["features"]["observation.state"]
-    assert state == {"dtype": "float32", "shape": [2], "names": ["cart.pos", "pole.pos"]}
+    assert state == {
+        "dtype": "float32",
+        "shape": [2],
+        "names": ["cart.pos", "pole.pos"],
+        "units": ["m", "rad"],
+    }
+    assert info["features"]["observation.effort"]["units"] == ["N", "N*m"]
     assert info["features"]["action"]["names"] == ["cart.pos"]
     assert {"timestamp", "frame_index", "episode_index", "index", "task_index"} < set(info["features"])
     table = pq.read_table(tmp_path / "out" / info["data_path"].format(chunk_index=0, file_index=0))
     assert set(table.column_names) == set(info["features"])
     assert table.schema.field("observation.state").type == pa.list_(pa.float32(), 2)
-    assert table.schema.field("action").type == pa.list_(pa.float32(), 1)
+    # LeRobot reads shape [1] as a plain number and cannot cast a list of one.
+    assert table.schema.field("action").type == pa.float32() and info["features"]["action"]["shape"] == [1]
     assert table.column("index").to_pylist() == list(range(1598))
     np.testing.assert_allclose(table.column("timestamp").to_pylist()[799:802], [0, 0.005, 0.01], atol=1e-7)
     file = pq.ParquetFile(tmp_path / "out" / "data/chunk-000/file-000.parquet")
@@ -127,23 +135,54 @@ def test_timing_of_slower_commands_survives(make_trajectory: MakeTrajectory, tmp
     np.testing.assert_allclose(sent, 0.001 + 0.02 * np.arange(200), atol=2e-6)
 
 
-def test_gap_starts_another_episode(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
-    """LeRobot's frames are evenly spaced, so that a hole cannot be inside an episode."""
+def without(trajectory: Trajectory, lost: slice) -> dict[str, Any]:
+    """Return the samples of a trajectory, as fields, without some."""
+    keep = np.delete(np.arange(trajectory.device_s.size), lost)
+    names = ("receive_s", "device_s", "position", "velocity", "effort", "status")
+    return {name: getattr(trajectory, name)[keep] for name in (*names, "command_sequence", "command_age_s")}
+
+
+@pytest.mark.parametrize(("lost", "filled"), [(slice(400, 401), 1), (slice(300, 340), 40)])
+def test_lost_samples_are_filled_flagged_and_left_out_on_the_way_back(
+    make_trajectory: MakeTrajectory, tmp_path: Path, lost: slice, filled: int
+) -> None:
+    """One episode a recording: a hole, also a long one, is interpolated and says so; importing takes none."""
     whole = make_trajectory()
-    keep = np.delete(np.arange(800), [400])
-    names = (
-        "receive_s",
-        "device_s",
-        "position",
-        "velocity",
-        "effort",
-        "status",
-        "command_sequence",
-        "command_age_s",
+    cut = make_trajectory(**without(whole, lost))
+    assert export_lerobot([cut], tmp_path / "out") == (799, filled)
+    table = pq.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
+    flags = np.array(table.column("filled").to_pylist())
+    # The first sample has no command and is no frame.
+    assert np.flatnonzero(flags).tolist() == list(range(lost.start - 1, lost.stop - 1))
+    position = np.array(table.column("observation.state").to_pylist())
+    middle = (lost.start + lost.stop - 1) / 2
+    between = (whole.position[lost.start - 1] + whole.position[lost.stop]) / 2
+    np.testing.assert_allclose(
+        position[[int(middle - 1), int(np.ceil(middle - 1))]].mean(axis=0), between, atol=1e-6
     )
-    cut = make_trajectory(**{name: getattr(whole, name)[keep] for name in names})
-    assert export_lerobot([cut], tmp_path / "out") == 2
-    assert [table.time_s.size for table in load_tables(tmp_path / "out")] == [399, 399]
+    (back,) = load_tables(tmp_path / "out")
+    assert back.time_s.size == 799 - filled and back.units == ("m", "rad")
+    np.testing.assert_allclose(np.diff(back.time_s).max(), 0.005 * (filled + 1), atol=1e-9)
+    np.testing.assert_allclose(back.position, cut.position[1:], atol=1e-6)
+
+
+def test_a_recording_that_would_mostly_be_filled_is_refused(
+    make_trajectory: MakeTrajectory, tmp_path: Path
+) -> None:
+    """A robot that was silent for most of the time gives no episode of invented frames."""
+    cut = make_trajectory(**without(make_trajectory(), slice(100, 700)))
+    with pytest.raises(DatasetError, match=r"recording 0 lacks 600 of 799 samples.*50%"):
+        export_lerobot([cut], tmp_path / "out")
+
+
+def test_jittered_recordings_with_a_pause(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:
+    """Samples off the grid are read at its times; in the pause nothing counts as measured."""
+    rng = np.random.default_rng(0)
+    whole = make_trajectory()
+    fields = without(whole, slice(300, 340))
+    fields["device_s"] = fields["device_s"] + rng.uniform(-0.001, 0.001, fields["device_s"].size)
+    frames, filled = export_lerobot([make_trajectory(**fields)], tmp_path / "out")
+    assert abs(frames - 799) <= 1 and abs(filled - 40) <= 1
 
 
 def test_refusals(make_trajectory: MakeTrajectory, tmp_path: Path) -> None:

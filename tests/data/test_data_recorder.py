@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import resource
@@ -20,10 +21,12 @@ from deal_hw.data.recording.mcap_scan import FoundRecord, messages, scan
 from deal_hw.data.recording.reader import read_episode, read_trajectory, read_wire
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
-from deal_hw.data.recording.repair import verify
-from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS
+from deal_hw.data.recording.repair import repair, verify
+from deal_hw.data.recording.schemas import CHANNELS, FIRST_CHANNELS, OLD_TOPICS, STANDARD
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.errors import DatasetError, EmptyRecordingError, TornRecordingError
+from deal_hw.transport import Message
+from deal_hw.types import BodyState
 
 CYCLES = 150
 MakeCycle = Callable[[int], CycleRecord]
@@ -120,11 +123,123 @@ def test_mcap_ros2_reads_the_whole_file(write_episode: WriteEpisode) -> None:
     with open(path, "rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         decoded = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
-    # Per cycle: 4 states, asked, sent, cycle, rx, tx; once: the robot and one event.
-    assert len(decoded) == 9 * CYCLES + 2
+    # Per cycle: 4 states, asked, sent, cycle, rx, tx; states and commands once more for other programs; once:
+    # the robot and one event, that once more.
+    assert len(decoded) == 15 * CYCLES + 3
     states = [message for topic, message in decoded if topic == "/state"]
     assert [state.sequence for state in states] == list(range(4 * CYCLES))
     assert states[10].position == [0.01, 0.1]
+
+
+WALL_NS = 1_760_000_000_123_456_789
+
+
+def standard_messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Return log time and message of each topic, as another program decodes them."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with open(path, "rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for _, channel, raw, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((raw.log_time, message))
+    return found
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a ROS stamp in ns."""
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+@pytest.fixture
+def with_body(tmp_path: Path, make_cycle: MakeCycle) -> Path:
+    """A recording of ten cycles on a known wall clock, with a body that leans by a quarter turn about y."""
+    half = np.sqrt(0.5)
+    body = BodyState(
+        orientation=np.array([half, 0.0, half, 0.0]),
+        angular_velocity=np.zeros(3),
+        acceleration=np.zeros(3),
+        foot_force=np.zeros(4),
+        temperature=np.zeros(2),
+        lost=np.zeros(2, dtype=np.int64),
+        battery=1.0,
+        voltage=28.0,
+        current=1.0,
+        sticks=np.zeros(4),
+        buttons=0,
+    )
+    path = tmp_path / "wall.mcap"
+    clock = VirtualClock(7_000_000_000_000)
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {}, clock, wall_ns=lambda: WALL_NS) as recorder:
+        for number in range(10):
+            cycle = make_cycle(number)
+            states = tuple(dataclasses.replace(state, body=body) for state in cycle.states)
+            recorder.write(dataclasses.replace(cycle, states=states))
+    return path
+
+
+def test_log_times_are_on_the_wall_clock(with_body: Path) -> None:
+    """Every message is logged at the wall time of its host stamp, by one difference for the whole episode."""
+    found = standard_messages(with_body)
+    shift = WALL_NS - 7_000_000_000_000
+    assert [at - message.receive_ns for at, message in found["/state"]] == [shift] * 40
+    assert [at - message.stamp_ns for at, message in found["/command"]] == [shift] * 10
+    assert [at - message.start_ns for at, message in found["/cycle"]] == [shift] * 10
+    assert found["/robot"][0][0] == WALL_NS
+    assert read_episode(with_body).wall_utc == "2025-10-09T08:53:20.123456+00:00"
+
+
+def test_standard_messages_hold_what_ours_hold(with_body: Path) -> None:
+    """JointState measured, sent and requested, foxglove.Log and tf, with stamps that are their log times."""
+    found = standard_messages(with_body)
+    for (at, ours), (their_at, theirs) in zip(found["/state"], found["/joint_states"], strict=True):
+        assert at == their_at == nanoseconds(theirs.header.stamp) and theirs.name == ["cart", "pole"]
+        for name in ("position", "velocity", "effort"):
+            assert getattr(theirs, name) == getattr(ours, name)
+    for ours_topic, topic in (
+        ("/command", "/joint_commands"),
+        ("/command/requested", "/joint_commands/requested"),
+    ):
+        for (at, ours), (their_at, theirs) in zip(found[ours_topic], found[topic], strict=True):
+            assert at == their_at == nanoseconds(theirs.header.stamp) and theirs.name == ["cart"]
+            assert theirs.position == ours.position_target and theirs.velocity == ours.velocity_target
+    ((at, log),) = found["/log"]
+    assert (at, log.level, log.name) == (nanoseconds(log.timestamp), 3, "clipped")
+    assert log.message == "the target was too far"
+    (transform,) = found["/tf"][0][1].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("world", "base")
+    turn = transform.transform.rotation
+    np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], [0, np.sqrt(0.5), 0, np.sqrt(0.5)])
+    assert len(found["/tf"]) == 40
+
+
+def test_recordings_on_the_monotonic_clock_read_alike(
+    with_body: Path, make_cycle: MakeCycle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Version 1 logged on the host's clock and had our own messages alone: the same episode comes out."""
+    monkeypatch.setattr(recorder_module, "FORMAT_VERSION", 1)
+    monkeypatch.setattr(recorder_module, "CHANNELS", dict(list(CHANNELS.items())[:FIRST_CHANNELS]))
+    monkeypatch.setattr(EpisodeRecorder, "_add_joints", lambda *_: None)
+    add = EpisodeRecorder._add
+    monkeypatch.setattr(
+        EpisodeRecorder, "_add", lambda self, topic, *rest: topic in STANDARD or add(self, topic, *rest)
+    )
+    old = tmp_path / "old.mcap"
+    clock = VirtualClock(7_000_000_000_000)
+    with EpisodeRecorder(old, DESCRIPTION.to_json(), {}, clock, wall_ns=clock.now_ns) as recorder:
+        for number in range(10):
+            cycle = make_cycle(number)
+            recorder.write(dataclasses.replace(cycle, wire=(Message("can0", b"x", cycle.start_ns),)))
+    monkeypatch.undo()
+    before, after = read_episode(old), read_episode(with_body)
+    assert (before.start_ns, before.device_start_ns) == (after.start_ns, after.device_start_ns)
+    for name in ("receive_s", "device_s", "position", "position_target", "sent_s", "command_age_s"):
+        np.testing.assert_array_equal(getattr(before.trajectory, name), getattr(after.trajectory, name))
+    # Without the first chunk and the index nothing names /wire/can0, and no other topic takes its place.
+    data = bytearray(old.read_bytes())
+    chunk = next(i for i in scan(bytes(data)) if isinstance(i, FoundRecord) and i.contents)
+    data[chunk.offset + 80] ^= 0x10
+    old.write_bytes(data[: len(data) - 4000])
+    repair(old)
+    assert not set(standard_messages(old)) & set(STANDARD)
 
 
 def test_missing_cycles_and_frames_are_counted(tmp_path: Path, make_cycle: MakeCycle) -> None:
@@ -155,7 +270,7 @@ def test_chunks_close_every_50_ms(write_episode: WriteEpisode) -> None:
     data = write_episode(cycles=CYCLES).read_bytes()
     chunks = [list(messages(item)) for item in scan(data) if isinstance(item, FoundRecord) and item.contents]
     assert len(chunks) >= CYCLES / 4
-    assert max(len(chunk) for chunk in chunks) <= 4 * 9 + 1
+    assert max(len(chunk) for chunk in chunks) <= 4 * 15 + 2
 
 
 def test_nothing_to_flush_means_no_deadline(tmp_path: Path, make_cycle: MakeCycle) -> None:

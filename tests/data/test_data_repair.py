@@ -46,7 +46,7 @@ def test_a_sound_file_is_left_alone(write_episode: WriteEpisode) -> None:
     report = repair(path)
     assert report.sound and not report.repaired
     assert report == verify(path)
-    assert report.messages == 9 * 150 + 2
+    assert report.messages == 15 * 150 + 3
     assert path.read_bytes() == before
 
 
@@ -92,7 +92,7 @@ def test_flipped_byte_costs_one_chunk(write_episode: WriteEpisode) -> None:
     report = repair(path)
     assert report.repaired and not report.torn
     assert len(report.damaged) == 1
-    assert report.messages == 9 * 150 + 2 - lost
+    assert report.messages == 15 * 150 + 3 - lost
     assert len(report.lost_spans_s) == 1
     assert report.original is not None and report.original.read_bytes() == before
     assert count_with_mcap_ros2(path) == report.messages

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,11 @@ import numpy as np
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
-from deal_hw.errors import ConfigurationError, TrainingDivergedError, UnknownNameError
+from deal_hw.errors import CheckpointError, ConfigurationError, TrainingDivergedError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.cartpole_env import BalanceTask, CartPoleEnv, balance_spec
 from deal_hw.policies.evaluate import evaluate_batch
@@ -19,7 +23,9 @@ from deal_hw.policies.network_policy import NetworkPolicy
 from deal_hw.policies.onnx_export import export_network
 from deal_hw.policies.ppo import PpoConfig, PpoTrainer
 from deal_hw.policies.sac import SacConfig, SacTrainer
+from deal_hw.policies.sb3_model import model_path, read_start, restore_optimisers
 from deal_hw.policies.servo_loop import EXACT_SENSOR
+from deal_hw.policies.single_env import SingleEnv
 from deal_hw.policies.tasks import TASKS
 from deal_hw.policies.trainers import TRAINERS, make_trainer
 from deal_hw.policy import Policy
@@ -102,6 +108,77 @@ class TestPpo(TrainerSuite):
         return toy_case(
             PpoTrainer(), 64, PpoConfig(steps=60_000, **settings), PpoConfig(steps=1_024, **settings)
         )
+
+
+SHORT = SacConfig(steps=800, hidden=(32, 32), warmup=500)
+
+
+def toy() -> CartPoleEnv:
+    """Return the toy with four members."""
+    return CartPoleEnv(DESCRIPTION, TOY, 4, task=TASK, sensor=EXACT_SENSOR)
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Train shortly with SAC; return the checkpoint."""
+    file = tmp_path_factory.mktemp("kept") / "policy.safetensors"
+    SacTrainer().train(toy(), SHORT, np.random.default_rng(0), files=TrainingFiles(checkpoint=file))
+    return file
+
+
+def test_stable_baselines3_goes_on_with_the_model_that_is_kept(kept: Path, tmp_path: Path) -> None:
+    """The zip opens in SAC.load on a registered task's spaces, trains there, and is a start of ours again."""
+    path = model_path(kept)
+    vector = make_vec_env(lambda: SingleEnv(CartPoleEnv(DESCRIPTION, TOY, 1, task=TASK)), n_envs=2)
+    model = SAC.load(path, env=vector, device="cpu")
+    assert model.num_timesteps == SHORT.steps
+    before = [value.clone() for value in model.policy.actor.parameters()]
+    model.learn(40, reset_num_timesteps=False)
+    model.learning_starts = 0
+    model.learn(40, reset_num_timesteps=False)
+    after = list(model.policy.actor.parameters())
+    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    model.save(tmp_path / "theirs.zip")
+    start = read_start(tmp_path / "theirs.zip", toy().layout)
+    for name, value in model.policy.state_dict().items():
+        assert torch.equal(start.tensors[f"policy.{name}"], value)
+    files = TrainingFiles(start=tmp_path / "theirs.zip", stop=lambda: True)
+    policy = SacTrainer().train(toy(), SHORT, np.random.default_rng(1), files=files)
+    assert policy.spec.training["algorithm"] == "sac"
+
+
+def test_a_resumed_training_takes_up_the_optimisers_memory(kept: Path, tmp_path: Path) -> None:
+    """Where checkpoint and model are of one moment; a model of another moment is left alone."""
+    model = SAC.load(model_path(kept), device="cpu")
+    fresh = SAC.load(model_path(kept), device="cpu")
+    for optimiser in (fresh.actor.optimizer, fresh.critic.optimizer, fresh.ent_coef_optimizer):
+        assert optimiser is not None
+        optimiser.state.clear()
+    assert restore_optimisers(model_path(kept), fresh)
+    mine, theirs = fresh.actor.optimizer.state_dict(), model.actor.optimizer.state_dict()
+    assert mine["state"] and float(mine["state"][0]["step"]) == float(theirs["state"][0]["step"]) > 0
+    with torch.no_grad():
+        next(fresh.policy.parameters()).add_(1.0)
+    assert not restore_optimisers(model_path(kept), fresh)
+    assert not restore_optimisers(tmp_path / "none.zip", fresh)
+
+
+def test_models_that_are_none_are_refused(tmp_path: Path) -> None:
+    """A file that is no archive, and one that has pickles alone: nothing of it is executed."""
+    marker = tmp_path / "executed"
+
+    class Evil:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return Path.touch, (marker,)
+
+    (tmp_path / "x.zip").write_text("no archive")
+    with zipfile.ZipFile(tmp_path / "y.zip", "w") as archive:
+        archive.writestr("policy.pth", pickle.dumps(Evil(), protocol=2))
+        archive.writestr("data", pickle.dumps(Evil(), protocol=2))
+    for name in ("x.zip", "y.zip", "none.zip"):
+        with pytest.raises(CheckpointError, match="SAC model"):
+            read_start(tmp_path / name, toy().layout)
+    assert not marker.exists()
 
 
 def test_a_training_that_diverges_is_stopped_and_keeps_its_checkpoint(

@@ -90,7 +90,10 @@ def make_cycle(number: int, body: bool = False) -> CycleRecord:
 def make_episode(path: Path, cycles: int, body: bool = False, torn: bool = False) -> bytes:
     """Record some cycles and return the file."""
     clock = VirtualClock(7_000_000_000_000)
-    recorder = EpisodeRecorder(path, DESCRIPTION.to_json(), {"purpose": "fuzz"}, clock)
+    wall_ns = 1_760_000_000_000_000_000
+    recorder = EpisodeRecorder(
+        path, DESCRIPTION.to_json(), {"purpose": "fuzz"}, clock, wall_ns=lambda: wall_ns
+    )
     recorder.open()
     for number in range(cycles):
         clock.sleep_until_ns(7_000_000_000_000 + (number + 1) * _CYCLE_NS)

@@ -11,6 +11,7 @@ frame_index / fps.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 
 from deal_hw.data.files import write_json
 from deal_hw.data.importing.grid import common_period, to_trajectories
-from deal_hw.data.importing.load import table_of
+from deal_hw.data.importing.table import table_of
 from deal_hw.errors import DatasetError, InsufficientDataError, MissingExtraError
 from deal_hw.types import FloatArray, Trajectory
 
@@ -40,24 +41,32 @@ class _Episode:
 
 
 def export_lerobot(
-    trajectories: Sequence[Trajectory], folder: Path, robot_type: str = "", task: str = "deal-hw"
-) -> int:
-    """Write a LeRobot dataset; return its number of episodes.
+    trajectories: Sequence[Trajectory],
+    folder: Path,
+    robot_type: str = "",
+    task: str = "deal-hw",
+    most_filled: float = 0.5,
+) -> tuple[int, int]:
+    """Write a LeRobot dataset, one episode a recording; return how many frames it has, and how many filled.
 
     ``observation.state`` holds measured positions, ``action`` the position target in force at the frame,
     each named ``<joint>.pos`` in rad or m; ``observation.velocity`` and ``observation.effort`` follow where
-    they were measured. ``command_age`` says how long before the frame the action came into force [s], so that
-    the exact timing survives. A gap in a recording starts another episode.
+    they were measured. Each of these features says its ``units`` in ``info.json``. ``command_age`` says how
+    long before the frame the action came into force [s], so that the exact timing survives.
+
+    Frames lie on a uniform grid without holes: one whose sample was lost is interpolated from its neighbours,
+    and ``filled`` is true there. Importing leaves those out again. Frames before the first command are none.
 
     Args:
         trajectories: Of one robot.
         folder: What to write; it must not hold a dataset yet.
         robot_type: Goes into ``info.json``.
         task: What the robot did, in words.
+        most_filled: A recording of which a larger share would be filled is refused.
 
     Raises:
         MissingExtraError: pyarrow is not installed.
-        DatasetError: The folder is taken, or the recordings do not fit one dataset.
+        DatasetError: The folder is taken, the recordings do not fit one dataset, or too much of one was lost.
     """
     try:
         import pyarrow.parquet  # noqa: F401
@@ -71,61 +80,86 @@ def export_lerobot(
     first = trajectories[0]
     if any((t.joint_names, t.actuated) != (first.joint_names, first.actuated) for t in trajectories):
         raise DatasetError("the recordings have different joints; export those of one robot at a time")
-    tables = [table_of(trajectory) for trajectory in trajectories]
+    tables = [table_of(trajectory, f"recording {number}") for number, trajectory in enumerate(trajectories)]
     period = common_period(tables)
-    episodes = [
-        episode
-        for table in tables
-        for part in to_trajectories(table, period_s=period)
-        for episode in _frames(part.trajectory, period)
-    ]
-    if not episodes:
-        raise InsufficientDataError("no recording has two regular samples with a command in force")
-    features = _features(first, episodes)
+    episodes = []
+    for table in tables:
+        (whole,) = to_trajectories(table, period_s=period, gap_periods=math.inf)
+        episodes.append(_frames(table.name, whole.trajectory, period, most_filled))
+    features = _features(first, tables[0].units, episodes)
     episodes = [_Episode({name: e.frames[name] for name in features}, e.length) for e in episodes]
     try:
         _write(folder, episodes, features, 1 / period, robot_type, task)
     except OSError as error:
         raise DatasetError(f"{folder} cannot be written: {error.strerror}") from error
-    return len(episodes)
+    return sum(e.length for e in episodes), int(sum(e.frames["filled"].sum() for e in episodes))
 
 
-def _frames(trajectory: Trajectory, period: float) -> list[_Episode]:
-    """Return the runs of samples without a hole and with a command in force."""
-    index = np.round(trajectory.device_s / period).astype(np.int64)
-    known = trajectory.command_sequence >= 0
-    cuts = np.flatnonzero((np.diff(index) != 1) | (np.diff(known.astype(np.int64)) != 0)) + 1
-    runs = [run for run in np.split(np.arange(index.size), cuts) if run.size >= 2 and known[run[0]]]
-    return [
-        _Episode(
-            {
-                "observation.state": trajectory.position[run],
-                "observation.velocity": trajectory.velocity[run],
-                "observation.effort": trajectory.effort[run],
-                "action": trajectory.position_target[trajectory.command_sequence[run]],
-                "command_age": trajectory.command_age_s[run],
-            },
-            run.size,
+def _frames(name: str, trajectory: Trajectory, period: float, most_filled: float) -> _Episode:
+    """Return the frames from the first command on, lost ones filled and flagged."""
+    begin = int(np.argmax(trajectory.command_sequence >= 0))
+    time_s = trajectory.device_s[begin:] - trajectory.device_s[begin]
+    if time_s.size < 2 or trajectory.command_sequence[begin] < 0:
+        raise InsufficientDataError(f"{name} has no two samples with a command in force; leave it out")
+    index = np.round(time_s / period).astype(np.int64)
+    length = int(index[-1]) + 1
+    if length - index.size > most_filled * length:
+        raise DatasetError(
+            f"{name} lacks {length - index.size} of {length} samples; LeRobot's grid is even, and at most "
+            f"{most_filled:.0%} of it may be filled: leave that recording out"
         )
-        for run in runs
-    ]
+    filled = np.ones(length, dtype=bool)
+    filled[index] = False
+    grid = np.arange(length)
+
+    def on_grid(values: FloatArray) -> FloatArray:
+        return np.stack([np.interp(grid, index, column) for column in values[begin:].T], axis=1)
+
+    # A command holds until the next one, also where no sample shows it.
+    sent_s = trajectory.sent_s - trajectory.device_s[begin]
+    in_force = np.searchsorted(sent_s, grid * period + 1e-9, side="right") - 1
+    return _Episode(
+        {
+            "observation.state": on_grid(trajectory.position),
+            "observation.velocity": on_grid(trajectory.velocity),
+            "observation.effort": on_grid(trajectory.effort),
+            "action": trajectory.position_target[in_force],
+            "command_age": np.maximum(grid * period - sent_s[in_force], 0.0),
+            "filled": filled,
+        },
+        length,
+    )
 
 
-def _features(first: Trajectory, episodes: Sequence[_Episode]) -> dict[str, dict[str, Any]]:
+def _features(
+    first: Trajectory, units: Sequence[str], episodes: Sequence[_Episode]
+) -> dict[str, dict[str, Any]]:
     """Return the features that are known in every frame, as ``info.json`` lists them."""
-    names = {
-        "observation.state": [f"{joint}.pos" for joint in first.joint_names],
-        "observation.velocity": [f"{joint}.vel" for joint in first.joint_names],
-        "observation.effort": [f"{joint}.effort" for joint in first.joint_names],
-        "action": [f"{joint}.pos" for joint in first.actuated],
-        "command_age": None,
-    }
-    return {
-        name: {"dtype": "float32", "shape": [1 if labels is None else len(labels)], "names": labels}
-        for name, labels in names.items()
-        if all(np.isfinite(episode.frames[name]).all() for episode in episodes)
-    }
+    unit = dict(zip(first.joint_names, units, strict=True))
+    features: dict[str, dict[str, Any]] = {}
+    for name, word, joints in (
+        ("observation.state", "pos", first.joint_names),
+        ("observation.velocity", "vel", first.joint_names),
+        ("observation.effort", "effort", first.joint_names),
+        ("action", "pos", first.actuated),
+    ):
+        if all(np.isfinite(episode.frames[name]).all() for episode in episodes):
+            features[name] = {
+                "dtype": "float32",
+                "shape": [len(joints)],
+                "names": [f"{joint}.{word}" for joint in joints],
+                "units": [_UNITS[word].get(unit[joint], unit[joint]) for joint in joints],
+            }
+    age = {"dtype": "float32", "shape": [1], "names": None, "units": ["s"]}
+    return {**features, "command_age": age, "filled": {"dtype": "bool", "shape": [1], "names": None}}
 
+
+_UNITS: Mapping[str, Mapping[str, str]] = {
+    "pos": {},
+    "vel": {"rad": "rad/s", "m": "m/s"},
+    "effort": {"rad": "N*m", "m": "N"},
+}
+"""Unit of each quantity of a joint, by the unit of its position."""
 
 _INDEX_FEATURES = {
     "timestamp": {"dtype": "float32", "shape": [1], "names": None},
@@ -214,9 +248,9 @@ def _arrow(features: Mapping[str, dict[str, Any]], frames: Mapping[str, Any]) ->
     for name, feature in features.items():
         values = np.ascontiguousarray(frames[name], dtype=feature["dtype"])
         flat = pa.array(values.reshape(-1))
-        # One column a joint stays a list even for one joint: shape [1] is a plain number only without names.
-        listed = feature["names"] is not None and values.ndim == 2
-        columns[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if listed else flat
+        # LeRobot reads shape [1] as a plain number, named or not, and fails on a list of one.
+        (width,) = feature["shape"]
+        columns[name] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
     return pa.table(columns)
 
 

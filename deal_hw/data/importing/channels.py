@@ -23,10 +23,12 @@ class Channels:
 
     Attributes:
         path: The file or folder.
-        kind: "csv", "npz", "mcap" or "lerobot".
+        kind: "csv", "npz", "mcap", "lerobot" or "deal-hw".
         digest: SHA-256 of what was read.
         arrays: By name, (T,) or (T, K); those of one clock have one length.
         labels: Names of the K columns of an array, where the file tells them.
+        units: Units of the K columns of an array, where the file tells them.
+        types: Message type of each topic, such as "sensor_msgs/msg/JointState"; of a bag.
         joint_names: Names of the joints, where the file lists them.
         part: Which recording of the file it is, such as "episode 3"; "" where there is only one.
         notes: What the reader of the file left out or changed.
@@ -37,6 +39,8 @@ class Channels:
     digest: str
     arrays: Mapping[str, FloatArray]
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    units: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    types: Mapping[str, str] = field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
     part: str = ""
     notes: tuple[str, ...] = ()

@@ -91,7 +91,11 @@ def common_period(tables: Sequence[Table]) -> float:
 
 
 def to_trajectories(
-    table: Table, gains: Gains | None = None, period_s: float | None = None, purpose: str = "import"
+    table: Table,
+    gains: Gains | None = None,
+    period_s: float | None = None,
+    purpose: str = "import",
+    gap_periods: float = GAP_PERIODS,
 ) -> list[Recording]:
     """Put a recording on a uniform grid; gaps split it.
 
@@ -106,6 +110,8 @@ def to_trajectories(
         gains: What the servo was set to; None: unknown.
         period_s: The grid's period [s]; None: the recording's own.
         purpose: Goes into the metadata.
+        gap_periods: A pause of more periods splits the recording; infinite: none does, and its samples are
+            absent.
 
     Returns:
         The stretches of at least two samples, in order.
@@ -119,7 +125,7 @@ def to_trajectories(
         )
     clock, rows = _clock(table)
     period = period_of(table) if period_s is None else period_s
-    limit = GAP_PERIODS * period
+    limit = gap_periods * period
     cuts = np.flatnonzero(np.diff(clock) > limit) + 1
     stretches = [part for part in np.split(np.arange(clock.size), cuts) if part.size >= 2]
     if not stretches:
@@ -191,7 +197,10 @@ def _recording(
     index = np.round(np.diff(clock) / period).clip(1).cumsum().astype(np.int64)
     index = np.concatenate(([0], index))
     # A few ppm between this recording's clock and the grid's add up: evenness is judged step by step.
-    even = bool(np.all(np.abs(np.diff(clock) - np.diff(index) * period) <= EVEN * period))
+    # Over a pause they add up to more.
+    steps = np.diff(clock)
+    uneven = (np.abs(steps - np.diff(index) * period) > EVEN * period) & (steps <= GAP_PERIODS * period)
+    even = not uneven.any()
     put = _keep if even else _interpolate
     placed = put(clock, index, period, values, table.command_s)
     orientation = placed.values.pop("orientation", None)
@@ -228,6 +237,8 @@ def _interpolate(
     number = np.arange(first, (clock[-1] - origin) / period + EVEN)
     times = origin + number * period
     after = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
+    known = clock[after] - clock[after - 1] <= GAP_PERIODS * period
+    number, times, after = number[known], times[known], after[known]
     nearest = np.minimum(np.abs(clock[after] - times), np.abs(clock[after - 1] - times))
     read = {
         name: np.stack([np.interp(times, clock, column) for column in array.T], axis=1)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels
-from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
+from deal_hw.data.importing.columns import POSITION_UNITS, ColumnMap, JointColumns, TimeColumn
 from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
@@ -27,6 +27,7 @@ _FILLERS = {"dof", "joint", "joints", "motor", "motors"}
 _UNITS = {"rad": "rad", "radians": "rad", "deg": "deg", "degrees": "deg", "mm": "mm"}
 _TIME_NAMES = ("time", "timestamp", "timestamps", "t", "stamp", "log_time")
 _TIME_SUFFIXES = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "ns": "ns"}
+_COMMAND_TIMES = ("command_time", "time_command", "target_time", "command_time_s")
 _SPLIT = re.compile(r"[^A-Za-z0-9]+")
 
 
@@ -65,7 +66,7 @@ def guess_columns(channels: Channels, joints: Sequence[str] | None = None) -> Co
     """
     time = _guess_time(channels, channels.arrays, ("",))
     if time is None:
-        raise _unguessed(channels, "which channel is the time")
+        raise unguessed(channels, "which channel is the time")
     guesses = [_read_name(name, joints or ()) for name in channels.arrays]
     arrays = {
         guess.role: guess
@@ -164,19 +165,21 @@ def _from_arrays(
             model = (
                 "" if joints is None else f" (the model has {len(joints)}: {short(', '.join(joints), 80)})"
             )
-            raise _unguessed(channels, f"which joints the {width} columns of {array!r} are{model}")
+            raise unguessed(channels, f"which joints the {width} columns of {array!r} are{model}")
         names = list(joints)
-    found = _rename(channels, names, joints)
+    found = match_joints(channels, names, joints)
     topic = array.rpartition(".")[0]
     command_time = None
     if "target" in arrays and len(channels.arrays[arrays["target"].channel]) != len(channels.arrays[array]):
         command_time = _guess_command_time(channels, arrays["target"].channel)
-    elif "command_time" in channels.arrays:
+    elif any(name in channels.arrays for name in _COMMAND_TIMES):
         command_time = _guess_command_time(channels, "")
     if topic.startswith("/"):
         time = _guess_time(channels, channels.arrays, (f"{topic}.",)) or time
         command_time = _guess_command_time(channels, arrays["target"].channel) if "target" in arrays else None
     unit = arrays["position"].unit or "rad"
+    units = channels.units.get(array, ())
+    units = units if len(units) == width and set(units) <= set(POSITION_UNITS) else (unit,) * width
     fits = {role: guess.channel for role, guess in arrays.items()}
     return ColumnMap(
         time=time,
@@ -186,7 +189,7 @@ def _from_arrays(
         velocity=_of_same_rows(channels, fits, "velocity"),
         effort=_of_same_rows(channels, fits, "effort"),
         joints=tuple(
-            JointColumns(name=model, column=name, index=index if by_order else None, unit=unit)
+            JointColumns(name=model, column=name, index=index if by_order else None, unit=units[index])
             for model, name, index in found
         ),
         source=("guessed",),
@@ -200,15 +203,24 @@ def _of_same_rows(channels: Channels, fits: dict[str, str], role: str) -> str | 
     return array
 
 
-def _rename(channels: Channels, names: list[str], joints: Sequence[str] | None) -> list[tuple[str, str, int]]:
-    """Return name in the model, name in the file and column of each joint of the file that the model has."""
+def match_joints(
+    channels: Channels, names: list[str], joints: Sequence[str] | None
+) -> list[tuple[str, str, int]]:
+    """Return name in the model, name in the file and column of each joint of the file that the model has.
+
+    Raises:
+        DatasetError: It has none of them; it says what to write in a column map.
+    """
     if joints is None:
         return [(name, name, index) for index, name in enumerate(names)]
     by_key = {_key(name): name for name in joints}
     found = [(by_key[_key(name)], name, index) for index, name in enumerate(names) if _key(name) in by_key]
     if not found:
-        raise _unguessed(
-            channels, f"which of the model's joints ({', '.join(joints)}) the file's ({', '.join(names)}) are"
+        pairs = ", ".join(f"{{name: {m}, column: {n}}}" for m, n in zip(joints, names, strict=False))
+        raise unguessed(
+            channels,
+            f"which of the model's joints ({short(', '.join(joints), 80)}) the file's "
+            f"({short(', '.join(names), 80)}) are (such as joints: [{short(pairs, 120)}])",
         )
     return found
 
@@ -237,12 +249,12 @@ def _from_columns(
         found.setdefault(name, {}).setdefault(guess.role, guess)
     found = {name: roles for name, roles in found.items() if "position" in roles}
     if not found:
-        raise _unguessed(channels, "which channels are the joints' positions")
+        raise unguessed(channels, "which channels are the joints' positions")
     ordered = [name for name in (joints or found) if name in found]
-    own_time = channels.arrays.get("command_time")
+    own_time = any(name in channels.arrays for name in _COMMAND_TIMES)
     return ColumnMap(
         time=time,
-        command_time=_guess_command_time(channels, "") if own_time is not None else None,
+        command_time=_guess_command_time(channels, "") if own_time else None,
         joints=tuple(_joint(name, found[name]) for name in ordered),
         source=("guessed",),
     )
@@ -289,12 +301,13 @@ def _guess_command_time(channels: Channels, target: str) -> TimeColumn | None:
     topic = target.rpartition(".")[0]
     if topic.startswith("/"):
         return _guess_time(channels, channels.arrays, (f"{topic}.",))
-    for name in ("command_time", "time_command", "target_time", "command_time_s"):
+    for name in _COMMAND_TIMES:
         if name in channels.arrays:
-            return TimeColumn(column=name, unit=_unit_of(channels.arrays[name]))
+            unit = "s" if name.endswith("_s") else _unit_of(channels.arrays[name])
+            return TimeColumn(column=name, unit=unit)
     rows = len(channels.arrays[target]) if target in channels.arrays else 0
     other = f", which has {rows} rows and not those of the time" if rows else ""
-    raise _unguessed(channels, f"which channel is the time of {target!r}{other}")
+    raise unguessed(channels, f"which channel is the time of {target!r}{other}")
 
 
 def _unit_of(stamps: FloatArray) -> str:
@@ -307,7 +320,13 @@ def _unit_of(stamps: FloatArray) -> str:
     return "ns"
 
 
-def _unguessed(channels: Channels, what: str) -> DatasetError:
+def is_target(name: str) -> bool:
+    """Say whether a word of a topic's or channel's name stands for a command."""
+    return any(_ROLE.get(word.lower()) == "target" for word in _SPLIT.split(name))
+
+
+def unguessed(channels: Channels, what: str) -> DatasetError:
+    """Return the error that says what cannot be told, and which channels there are."""
     names = [
         name if values.ndim == 1 else f"{name}[{values.shape[1]}]" for name, values in channels.arrays.items()
     ]

@@ -54,6 +54,10 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
     found: dict[int, list[dict[str, FloatArray]]] = {}
     for file in files:
         for episode, arrays in _read_file(file, info.features):
+            for name, feature in info.features.items():
+                # One motor's values are plain numbers in the file; their name says that they are a joint's.
+                if name in arrays and arrays[name].ndim == 1 and feature.get("names"):
+                    arrays[name] = arrays[name][:, None]
             if episodes is None or episode in episodes:
                 found.setdefault(episode, []).append(arrays)
     missing = sorted(set(episodes or ()) - set(found))
@@ -62,6 +66,9 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
     digest = _digest(path, files)
     with reading(path / "meta" / "info.json", "the description of a LeRobot dataset"):
         labels = {name: _names(feature) for name, feature in info.features.items()}
+        units = {
+            name: tuple(map(short, _flat(f.get("units"), _DEEPEST))) for name, f in info.features.items()
+        }
     return [
         Channels(
             path=path,
@@ -69,6 +76,7 @@ def read_lerobot(path: Path, episodes: tuple[int, ...] | None = None) -> list[Ch
             digest=digest,
             arrays=_stamped(_joined(parts), info.fps),
             labels={name: names for name, names in labels.items() if names},
+            units={name: given for name, given in units.items() if given},
             part=f"episode {episode}",
         )
         for episode, parts in sorted(found.items())
@@ -171,7 +179,10 @@ def _stamped(arrays: dict[str, FloatArray], fps: float) -> dict[str, FloatArray]
             arrays["timestamp"] = regular
     if "command_age" in arrays:  # Written by our own export: when each action came into force.
         sent = np.round(arrays["timestamp"] - arrays["command_age"], 6)
-        arrays["command_time"] = np.maximum.accumulate(sent)
+        arrays["command_time_s"] = np.maximum.accumulate(sent)
+    lost = arrays.pop("filled", np.zeros(1))
+    if lost.any():  # Interpolated by our own export: no measurement.
+        arrays = {name: values[lost == 0] for name, values in arrays.items()}
     return {name: values for name, values in arrays.items() if name not in _DROPPED}
 
 

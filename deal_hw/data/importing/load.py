@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 from mcap.records import Chunk, Metadata
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import ColumnMap
 from deal_hw.data.importing.csv_source import read_csv
+from deal_hw.data.importing.episode_source import read_own
 from deal_hw.data.importing.grid import Gains, Recording, common_period, to_trajectories
 from deal_hw.data.importing.guess import describe, guess_columns
+from deal_hw.data.importing.guess_topics import guess_topics
 from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
@@ -21,10 +22,8 @@ from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.recording.spikes import position_units
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
-from deal_hw.types import Trajectory
 
 Say = Callable[[str], None]
 _READERS: dict[str, Callable[[Path], Channels]] = {
@@ -38,7 +37,7 @@ _HEAD_BYTES = 1 << 20
 
 
 def read_channels(path: Path) -> list[Channels]:
-    """Read a file or a LeRobot folder; one entry a recording in it.
+    """Read a file, a LeRobot folder, a dataset of ours or the folder of a ROS 2 bag; one entry a recording.
 
     Raises:
         DatasetError: There is no such file, or it is of no known kind.
@@ -47,11 +46,24 @@ def read_channels(path: Path) -> list[Channels]:
     if path.is_dir():
         if is_lerobot(path):
             return read_lerobot(path)
+        if is_dataset(path):
+            dataset = Dataset.open(path, lambda text: None)
+            return [read_own(dataset.path(index)) for index in range(len(dataset.episodes))]
+        bags = sorted(path.glob("*.mcap")) if (path / "metadata.yaml").is_file() else []
+        if len(bags) == 1:
+            return [read_mcap(bags[0])]
         raise DatasetError(
-            f"{path} is a folder but no LeRobot dataset (it has no meta/info.json); name a file"
+            f"{path} is a folder but no dataset, no LeRobot dataset (meta/info.json) and no ROS 2 bag of one "
+            "MCAP file (metadata.yaml); name a file"
         )
     if not path.exists():
         raise DatasetError(f"{path} does not exist; check its name")
+    if path.suffix.lower() == ".db3":
+        raise DatasetError(
+            f"{path} is a ROS 2 bag in SQLite; write it as MCAP (`ros2 bag convert` with storage_id: mcap)"
+        )
+    if is_episode(path):
+        return [read_own(path)]
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise DatasetError(
@@ -67,7 +79,8 @@ def load_tables(
     """Read the recordings in a file, in SI units, on their own stamps.
 
     Args:
-        path: A CSV, NPZ or MCAP file, or the folder of a LeRobot dataset.
+        path: A CSV, NPZ or MCAP file, an episode of ours, or the folder of a dataset of ours, of LeRobot's or
+            of a ROS 2 bag.
         columns: What its channels mean; None: guessed from their names.
         joints: Names of the model's joints; None: as the map, or the file, names them.
         say: Called with sentences on what was guessed and left out.
@@ -91,7 +104,7 @@ def tables_of(
     """Interpret channels, as :func:`load_tables` does with those of a file."""
     tables = []
     for number, channels in enumerate(recordings):
-        used = columns if columns is not None else guess_columns(channels, joints)
+        used = columns or guess_topics(channels, joints) or guess_columns(channels, joints)
         if say is not None:
             _tell(say, channels, used, joints, columns is None and number == 0)
         tables.append(build_table(channels, used, joints))
@@ -120,13 +133,9 @@ def load_recordings(
     own: list[Recording] = []
     tables: list[Table] = []
     for path in map(Path, paths):
-        if is_dataset(path):
-            dataset = Dataset.open(path, say or (lambda text: None))
-            episodes = [dataset.path(index) for index in range(len(dataset.episodes))]
-            own += [Recording(read_trajectory(episode), None, None) for episode in episodes]
-        elif is_episode(path):
-            own.append(Recording(read_trajectory(path), None, None))
-        else:
+        episodes = own_episodes(path, say)
+        own += [Recording(read_trajectory(episode), None, None) for episode in episodes]
+        if not episodes:
             tables += load_tables(path, columns, joints, say)
     if not tables:
         return own
@@ -138,6 +147,18 @@ def load_recordings(
         )
     period = common_period(tables)
     return own + [part for table in tables for part in to_trajectories(table, gains, period)]
+
+
+def own_episodes(path: Path, say: Say | None = None) -> list[Path]:
+    """Return the episodes of a dataset of ours, or the one that is named; none of any other file.
+
+    Raises:
+        DatasetError: The dataset cannot be read.
+    """
+    if is_dataset(path):
+        dataset = Dataset.open(path, say or (lambda text: None))
+        return [dataset.path(index) for index in range(len(dataset.episodes))]
+    return [path] if is_episode(path) else []
 
 
 def is_dataset(path: Path) -> bool:
@@ -158,31 +179,6 @@ def is_episode(path: Path) -> bool:
         if isinstance(item.record, Metadata):
             return item.record.name == METADATA_NAME
     return False
-
-
-def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
-    """Return a trajectory as a table: commands at the device time from which they were in force."""
-    seen = trajectory.command_sequence
-    order = {int(number): row for row, number in enumerate(trajectory.sent_sequence)}
-    numbers, first = np.unique(seen, return_index=True)
-    known = [(order[int(n)], int(at)) for n, at in zip(numbers, first, strict=True) if int(n) in order]
-    rows = np.array([row for row, _ in known], dtype=np.int64)
-    at = np.array([sample for _, sample in known], dtype=np.int64)
-    age = np.nan_to_num(trajectory.command_age_s[at]) if at.size else np.empty(0)
-    return Table(
-        joint_names=trajectory.joint_names,
-        actuated=trajectory.actuated,
-        units=position_units(trajectory),
-        time_s=trajectory.device_s,
-        position=trajectory.position,
-        velocity=trajectory.velocity,
-        effort=trajectory.effort,
-        command_s=trajectory.device_s[at] - age if at.size else np.empty(0),
-        target=trajectory.position_target[rows],
-        orientation=None,
-        gyro=None,
-        source={"file": name, "part": "", "kind": "deal-hw", "sha256": "", "columns": [], "notes": []},
-    )
 
 
 def _tell(

@@ -26,6 +26,18 @@ CHUNK_BYTES = 64 * MIB
 """Largest record, and largest chunk once it is unpacked; recorders write chunks of 1 to 4 MiB."""
 _LEAF_COST = 16
 """What a field of a message costs in memory, in numbers, beside its values."""
+LIST_BYTES = MIB
+"""Largest message with a list of messages; a trajectory of ten thousand points."""
+NAME_FIELDS = ("name", "joint_names", "dof_names")
+"""Fields that name the joints of a message."""
+_LISTS = {
+    "trajectory_msgs/JointTrajectoryPoint": [
+        *[("float64", "[]")] * 4,
+        ("builtin_interfaces/Duration", ""),
+    ],
+    "std_msgs/MultiArrayDimension": [("string", ""), ("uint32", ""), ("uint32", "")],
+}
+"""Messages that may come in lists: each entry takes bytes in the file, so none is longer than its bytes."""
 _SCHEMA_PART = re.compile(r"^={3,}\s*^MSG:\s+(\S+)\s*$", re.MULTILINE)
 _SCHEMA_FIELD = re.compile(r"^[ \t]*(\w+(?:/\w+)*)(?:<=\d+)?(\[[^\]\n]*\])?[ \t]+\w+", re.MULTILINE)
 
@@ -38,8 +50,9 @@ def read_mcap(path: Path) -> Channels:
     ``/joint_states.log_time`` and ``/joint_states.header.stamp`` (T,) [s], both on one zero. Nested fields
     are joined by dots: ``/imu.orientation.w``.
 
-    Topics whose messages hold lists of messages are left out with a note. Sizes are limited, see
-    :mod:`deal_hw.reading`.
+    A trajectory of one point gives the fields of that point (``/traj.points.positions``), one of several only
+    their number (``/traj.points.count``). Topics with other lists of messages are left out with a note. Sizes
+    are limited, see :mod:`deal_hw.reading`.
 
     Raises:
         DatasetError: It cannot be read, or the messages of one topic differ in their joints.
@@ -53,11 +66,13 @@ def read_mcap(path: Path) -> Channels:
 
 def _channels(path: Path, digest: str) -> Channels:
     topics: dict[str, list[dict[str, Any]]] = {}
+    types: dict[str, str] = {}
     factory, notes = DecoderFactory(), {}
     budget = NUMBERS
     for schema, channel, message in _messages(path):
         if channel.topic not in notes:
             notes[channel.topic] = _reason_to_leave_out(schema)
+            types[channel.topic] = "" if schema is None else schema.name
         if notes[channel.topic]:
             continue
         decode = factory.decoder_for(channel.message_encoding, schema)
@@ -65,8 +80,11 @@ def _channels(path: Path, digest: str) -> Channels:
             raise ValueError(
                 f"{short(channel.topic)} is not in ROS 2's encoding, but {channel.message_encoding}"
             )
+        if len(message.data) > LIST_BYTES and _has_lists(schema):
+            raise ValueError(f"a message of more than {LIST_BYTES / MIB:g} MiB on {short(channel.topic)}")
         row = dict(_fields(decode(message.data)))
         row["log_time"] = message.log_time
+        row["name"] = next((row[field] for field in NAME_FIELDS if field in row), ())
         budget -= sum(_LEAF_COST + (len(v) if _is_list(v) else 0) for v in row.values())
         if budget < 0:
             raise ValueError(f"more than {NUMBERS} numbers; keep the joints' topics (`mcap filter`)")
@@ -85,7 +103,9 @@ def _channels(path: Path, digest: str) -> Channels:
                 if names and values.ndim == 2 and values.shape[1] == len(names):
                     labels[f"{topic}.{field}"] = names
     left_out = tuple(f"{short(topic, 60)} is left out: {why}" for topic, why in notes.items() if why)
-    return Channels(path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels, notes=left_out)
+    return Channels(
+        path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels, types=types, notes=left_out
+    )
 
 
 def _messages(path: Path) -> Iterator[tuple[Schema | None, Channel, Message]]:
@@ -141,13 +161,17 @@ def _reason_to_leave_out(schema: Schema | None) -> str:
         for kind, is_list in fields.get(open_.pop(), ()):
             full = kind if "/" in kind else f"{package}/{kind}"
             if full.replace("/msg/", "/") in fields:
-                if is_list:
+                if is_list and fields[full.replace("/msg/", "/")] != _LISTS.get(full.replace("/msg/", "/")):
                     return f"{kind}{is_list} is a list of messages"
                 open_.append(full.replace("/msg/", "/"))
             count += 1
             if count > NAMES:
                 return f"its messages have more than {NAMES} fields"
     return ""
+
+
+def _has_lists(schema: Schema | None) -> bool:
+    return schema is not None and any(f"MSG: {name}" in schema.data.decode() for name in _LISTS)
 
 
 def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -163,6 +187,10 @@ def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
                 yield from _fields(value, f"{name}.")
         elif isinstance(value, (bool, int, float)) or _is_list(value):
             yield name, value
+        elif isinstance(value, list) and hasattr(value[0], "__slots__"):
+            yield f"{name}.count", len(value)
+            if len(value) == 1:
+                yield from _fields(value[0], f"{name}.")
 
 
 def _is_list(value: Any) -> bool:
@@ -182,7 +210,7 @@ def _first_stamp(topics: dict[str, list[dict[str, Any]]]) -> int:
 
 def _names(path: Path, topic: str, rows: list[dict[str, Any]]) -> tuple[str, ...]:
     """Return the joints of a topic in the order of its first message; () where it names none."""
-    first: Any = rows[0].get("name")
+    first: Any = rows[0]["name"]
     if not _is_list(first) or not all(isinstance(name, str) for name in first):
         return ()
     names = tuple(first)

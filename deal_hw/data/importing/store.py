@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ def write_dataset(
     description: RobotDescription | Mapping[str, Any],
     facts: Mapping[str, Any] | None = None,
     notify: Notify = print,
+    episodes: Sequence[Path] = (),
 ) -> Dataset:
     """Write recordings as the episodes of a dataset and return it, closed.
 
@@ -38,6 +40,7 @@ def write_dataset(
         description: Of the robot, or its plain JSON values.
         facts: Plain JSON values to keep with each episode.
         notify: Called with a sentence for each repair.
+        episodes: Episodes of ours, of the same robot, to copy as they are.
 
     Raises:
         DatasetError: It belongs to another robot or cannot be written.
@@ -54,6 +57,10 @@ def write_dataset(
                 "correct the column map"
             )
     with Dataset.create_or_open(folder, values, notify) as dataset:
+        for episode in episodes:
+            path = dataset.next_episode_path()
+            shutil.copyfile(episode, path)
+            dataset.note_episode(path, facts)
         for recording in recordings:
             path = dataset.next_episode_path()
             write_episode(path, recording.trajectory, values)

@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import TIME_UNITS, ColumnMap, JointColumns, Vector
+from deal_hw.data.recording.spikes import position_units
 from deal_hw.errors import DatasetError, short
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, Trajectory
 
 _QUANTITIES = ("pos", "position", "vel", "velocity", "effort", "torque")
 
@@ -141,6 +142,31 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
             "rows_without_position": int(np.sum(~kept)),
             "rows_without_target": int(np.sum(~sent)),
         },
+    )
+
+
+def table_of(trajectory: Trajectory, name: str = "episode") -> Table:
+    """Return a trajectory as a table: commands at the device time from which they were in force."""
+    seen = trajectory.command_sequence
+    order = {int(number): row for row, number in enumerate(trajectory.sent_sequence)}
+    numbers, first = np.unique(seen, return_index=True)
+    known = [(order[int(n)], int(at)) for n, at in zip(numbers, first, strict=True) if int(n) in order]
+    rows = np.array([row for row, _ in known], dtype=np.int64)
+    at = np.array([sample for _, sample in known], dtype=np.int64)
+    age = np.nan_to_num(trajectory.command_age_s[at]) if at.size else np.empty(0)
+    return Table(
+        joint_names=trajectory.joint_names,
+        actuated=trajectory.actuated,
+        units=position_units(trajectory),
+        time_s=trajectory.device_s,
+        position=trajectory.position,
+        velocity=trajectory.velocity,
+        effort=trajectory.effort,
+        command_s=trajectory.device_s[at] - age if at.size else np.empty(0),
+        target=trajectory.position_target[rows],
+        orientation=None,
+        gyro=None,
+        source={"file": name, "part": "", "kind": "deal-hw", "sha256": "", "columns": [], "notes": []},
     )
 
 

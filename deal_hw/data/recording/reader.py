@@ -15,7 +15,7 @@ from mcap.records import Message as McapMessage
 from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
 from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS, message_type
+from deal_hw.data.recording.schemas import CHANNELS, OLD_TOPICS, STANDARD, message_type
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -182,7 +182,7 @@ def _channel(channels: Mapping[int, Channel], message: McapMessage) -> Channel:
 
 def _collect(path: Path) -> tuple[dict[str, str], dict[str, list[tuple[Any, ...]]]]:
     preamble: dict[str, str] | None = None
-    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in CHANNELS}
+    rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in CHANNELS if topic not in STANDARD}
     channels: dict[int, Channel] = {}
     for found in _records(path):
         if isinstance(found.record, Metadata) and found.record.name == METADATA_NAME:

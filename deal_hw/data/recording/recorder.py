@@ -1,5 +1,8 @@
 """Writes an episode as MCAP, in small chunks that are on their way to the disk every 50 ms.
 
+Messages are logged on the wall clock, as other programs expect it; the monotonic stamps are inside. Beside
+our own messages stand the same values as standard ones (JointState, foxglove.Log, tf).
+
 A chunk goes to the kernel in one piece and is never touched again, so that a killed recorder loses the chunk
 in progress and nothing else. What remains has no footer: :mod:`deal_hw.data.recording.repair` writes one.
 """
@@ -9,8 +12,9 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import time
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -27,8 +31,11 @@ from deal_hw.data.recording.schemas import (
     COMMAND,
     CYCLE,
     EVENT,
+    JOINT_STATE,
+    LOG,
     ROBOT,
     STATE,
+    TRANSFORM,
     WIRE,
     message_type,
 )
@@ -39,9 +46,12 @@ from deal_hw.version import __version__
 FLUSH_INTERVAL_S = 0.05
 """Longest time a record waits for its chunk to be closed: half the loss that is allowed, so that a busy
 machine may be late by as much again."""
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Since 2 log times are on the wall clock and standard messages are written; both versions read alike."""
 METADATA_NAME = "deal-hw"
 END_NAME = "deal-hw.end"
+LOG_LEVELS = {"velocity": 1, "clipped": 3, "warning": 3}
+"""Level of foxglove.Log by an event's kind: 1 debug, 3 warning; others 2, info."""
 LIBRARY = f"deal-hw/{__version__}"
 
 
@@ -54,6 +64,7 @@ class EpisodeRecorder:
         metadata: Plain JSON values: robot, description digest, purpose, policy, task, ...
         clock: The host's monotonic clock, on which all stamps are.
         flush_interval_s: Longest time a record waits for its chunk to be closed [s].
+        wall_ns: The wall clock, ns since 1970; asked once, when the file is opened.
     """
 
     def __init__(
@@ -63,6 +74,7 @@ class EpisodeRecorder:
         metadata: Mapping[str, Any],
         clock: Clock,
         flush_interval_s: float = FLUSH_INTERVAL_S,
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.path = Path(path)
         self.cycles = 0
@@ -72,6 +84,10 @@ class EpisodeRecorder:
         self._clock = clock
         self._flush_interval_ns = round(flush_interval_s * 1e9)
         self._oldest_ns = -1
+        self._read_wall_ns = wall_ns
+        self._wall_minus_host_ns = 0
+        self._joints: tuple[str, ...] = tuple(description.get("joint_names", ()))
+        self._actuated: tuple[str, ...] = tuple(description.get("actuated", ()))
         self._channels: dict[str, int] = {}
         self._file: _ChunkFile | None = None
 
@@ -95,8 +111,7 @@ class EpisodeRecorder:
         self._writer.add_metadata(METADATA_NAME, self._preamble())
         self._register_channels()
         text = json.dumps(self._description)
-        names = self._description.get("joint_names", ()), self._description.get("actuated", ())
-        self._add("/robot", self._clock.now_ns(), ROBOT.encode(text, *names))
+        self._add("/robot", self._clock.now_ns(), ROBOT.encode(text, self._joints, self._actuated))
         self.flush()
 
     def write(self, record: CycleRecord) -> None:
@@ -124,12 +139,20 @@ class EpisodeRecorder:
                 state.effort,
             )
             self._add("/state", state.receive_ns, data, state.sequence)
+            self._add_joints("/joint_states", state.receive_ns, self._joints, state)
             self._add_body(state)
-        self._add_command("/command/requested", record, record.requested)
-        self._add_command("/command", record, record.sent)
+        self._add_command("/command/requested", "/joint_commands/requested", record, record.requested)
+        self._add_command("/command", "/joint_commands", record, record.sent)
         for event in record.events:
             data = EVENT.encode(event.stamp_ns, event.kind, event.message, json.dumps(dict(event.data)))
             self._add("/events", event.stamp_ns, data)
+            level = LOG_LEVELS.get(event.kind, 2)
+            words = event.message or json.dumps(dict(event.data))
+            self._add(
+                "/log",
+                event.stamp_ns,
+                LOG.encode(*self._wall(event.stamp_ns), level, words, event.kind, "", 0),
+            )
         action = () if record.action is None else record.action
         data = CYCLE.encode(
             record.cycle,
@@ -207,8 +230,10 @@ class EpisodeRecorder:
             self._oldest_ns = min(max(stamp_ns, 0), self._clock.now_ns())
 
     def _preamble(self) -> dict[str, str]:
-        host_ns = self._clock.now_ns()
-        wall = datetime.datetime.now(datetime.timezone.utc)
+        host_ns, wall_ns = self._clock.now_ns(), self._read_wall_ns()
+        # One difference for the whole episode: a wall clock that is set meanwhile must not bend its times.
+        self._wall_minus_host_ns = wall_ns - host_ns
+        wall = datetime.datetime.fromtimestamp(wall_ns // 1000 / 1e6, datetime.timezone.utc)
         return {
             "format_version": str(FORMAT_VERSION),
             "host_ns": str(host_ns),
@@ -246,8 +271,28 @@ class EpisodeRecorder:
             body.buttons,
         )
         self._add("/body", state.receive_ns, data, state.sequence)
+        w, x, y, z = body.orientation
+        frames = 1, *self._wall(state.receive_ns), "world", "base"
+        data = TRANSFORM.encode(*frames, 0.0, 0.0, 0.0, x, y, z, w)
+        self._add("/tf", state.receive_ns, data, state.sequence)
 
-    def _add_command(self, topic: str, record: CycleRecord, command: JointCommand | None) -> None:
+    def _add_joints(
+        self, topic: str, stamp_ns: int, names: Sequence[str], values: JointCommand | RobotState
+    ) -> None:
+        if isinstance(values, JointCommand):
+            moving = values.position_target, values.velocity_target
+        else:
+            moving = values.position, values.velocity
+        data = JOINT_STATE.encode(*self._wall(stamp_ns), "", names, *moving, values.effort)
+        self._add(topic, stamp_ns, data)
+
+    def _wall(self, stamp_ns: int) -> tuple[int, int]:
+        """Return seconds and nanoseconds of the wall clock at a host stamp."""
+        return divmod(max(stamp_ns, 0) + self._wall_minus_host_ns, 10**9)
+
+    def _add_command(
+        self, topic: str, standard: str, record: CycleRecord, command: JointCommand | None
+    ) -> None:
         if command is None:
             return
         stamp_ns = record.sent_ns if record.sent_ns >= 0 else record.start_ns
@@ -264,14 +309,15 @@ class EpisodeRecorder:
             command.speed_limit,
         )
         self._add(topic, stamp_ns, data, record.cycle)
+        self._add_joints(standard, stamp_ns, self._actuated, command)
 
     def _add(self, topic: str, stamp_ns: int, data: bytes, sequence: int = 0) -> None:
         if topic not in self._channels:
             kind = message_type(topic)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind.name])
         self._wait_since(self._clock.now_ns())
-        stamp_ns = max(stamp_ns, 0)
-        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, sequence & 0xFFFFFFFF)
+        wall_ns = max(stamp_ns, 0) + self._wall_minus_host_ns
+        self._writer.add_message(self._channels[topic], wall_ns, data, wall_ns, sequence & 0xFFFFFFFF)
 
     def __enter__(self) -> Self:
         self.open()

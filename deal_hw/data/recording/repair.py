@@ -18,8 +18,8 @@ from mcap.writer import CompressionType, Writer
 
 from deal_hw.data.files import read_episode_bytes
 from deal_hw.data.recording.mcap_scan import FoundRecord, Lost, messages, scan
-from deal_hw.data.recording.recorder import LIBRARY
-from deal_hw.data.recording.schemas import CHANNELS
+from deal_hw.data.recording.recorder import LIBRARY, METADATA_NAME
+from deal_hw.data.recording.schemas import CHANNELS, FIRST_CHANNELS
 from deal_hw.errors import DatasetError
 
 REPAIR_NAME = "deal-hw.repair"
@@ -156,7 +156,10 @@ class _Findings:
 
 
 def _inspect(path: Path, data: bytes) -> _Findings:
-    schemas, channels = _known()
+    schemas, known = _known()
+    # Recorders of version 1 gave later numbers to other channels.
+    channels = {number: channel for number, channel in known.items() if number <= FIRST_CHANNELS}
+    later = {number: channel for number, channel in known.items() if number > FIRST_CHANNELS}
     header = Header(profile="ros2", library=LIBRARY)
     losses: list[Lost] = []
     spans: list[tuple[float, float]] = []
@@ -165,6 +168,7 @@ def _inspect(path: Path, data: bytes) -> _Findings:
     chunks = 0
     hole = False
     mismatches: list[str] = []
+    version = ""
     for item in scan(data):
         if isinstance(item, Lost):
             losses.append(item)
@@ -178,6 +182,8 @@ def _inspect(path: Path, data: bytes) -> _Findings:
         elif isinstance(item.record, Footer) and _is_index_damaged(data, item.offset, item.record):
             mismatches.append("the checksum of the index does not match")
         # Chunks have checksums of their own; the index only fills in what nothing else knows.
+        if isinstance(item.record, Metadata) and item.record.name == METADATA_NAME:
+            version = item.record.metadata.get("format_version", "")
         if isinstance(item.record, Schema):
             schemas.setdefault(item.record.id, item.record)
         elif isinstance(item.record, Channel):
@@ -192,6 +198,9 @@ def _inspect(path: Path, data: bytes) -> _Findings:
             if hole and last_ns is not None:
                 spans.append(((last_ns - first_ns) * 1e-9, (min(stamps) - first_ns) * 1e-9))
             last_ns, hole = max(stamps), False
+    if version != "1":
+        for number, channel in later.items():
+            channels.setdefault(number, channel)
     if not header.library.startswith("deal-hw"):
         raise DatasetError(
             f"{path} was written by {header.library!r}; only recordings of deal-hw can be mended"

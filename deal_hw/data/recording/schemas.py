@@ -3,6 +3,9 @@
 Each type is data, a list of fields; the ros2msg text that goes into the file and the bytes of a message both
 follow from it, so that they cannot disagree. rerun, Foxglove and mcap_ros2 decode the messages from that
 text alone.
+
+Beside our own types stand messages of ROS 2 and Foxglove, so that other programs plot an episode: fields in a
+row, whatever is nested in the definition, since CDR writes nested messages without anything in between.
 """
 
 from __future__ import annotations
@@ -20,7 +23,9 @@ _HEADER = b"\x00\x01\x00\x00"
 """CDR encapsulation, little-endian; alignment counts from its end."""
 _SCALARS = {
     "int64": struct.Struct("<q"),
+    "int32": struct.Struct("<i"),
     "uint32": struct.Struct("<I"),
+    "uint8": struct.Struct("<B"),
     "bool": struct.Struct("<?"),
     "float64": struct.Struct("<d"),
 }
@@ -33,16 +38,20 @@ class RosMessageType:
 
     Attributes:
         name: ROS 2 name.
-        fields: Pairs of ros2msg type (int64, uint32, bool, float64, string, string[], uint8[], float64[]) and
-            name.
+        fields: Pairs of ros2msg type (int64, int32, uint32, uint8, bool, float64, string, string[], uint8[],
+            float64[]) and name.
+        text: The ros2msg text where messages are nested; "" where it follows from the fields.
     """
 
     name: str
     fields: tuple[tuple[str, str], ...]
+    text: str = ""
 
     @property
     def definition(self) -> str:
         """The ros2msg text."""
+        if self.text:
+            return self.text
         return "\n".join(f"{kind} {name}" for kind, name in self.fields) + "\n"
 
     def encode(self, *values: Any) -> bytes:
@@ -210,6 +219,63 @@ BODY = RosMessageType(
 )
 WIRE = RosMessageType("deal_hw_msgs/msg/Wire", (("int64", "stamp_ns"), ("uint8[]", "payload")))
 
+_SECTION = "=" * 80 + "\nMSG: "
+_TIME = f"{_SECTION}builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+_HEADER_TEXT = f"{_SECTION}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n{_TIME}"
+_STAMP = (("int32", "sec"), ("uint32", "nanosec"))
+
+JOINT_STATE = RosMessageType(
+    "sensor_msgs/msg/JointState",
+    (
+        *_STAMP,
+        ("string", "frame_id"),
+        ("string[]", "name"),
+        ("float64[]", "position"),
+        ("float64[]", "velocity"),
+        ("float64[]", "effort"),
+    ),
+    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+    + _HEADER_TEXT,
+)
+LOG = RosMessageType(
+    "foxglove_msgs/msg/Log",
+    (
+        *_STAMP,
+        ("uint8", "level"),
+        *[("string", name) for name in ("message", "name", "file")],
+        ("uint32", "line"),
+    ),
+    "builtin_interfaces/Time timestamp\nuint8 level\nstring message\nstring name\nstring file\n"
+    "uint32 line\n" + _TIME,
+)
+TRANSFORM = RosMessageType(
+    "tf2_msgs/msg/TFMessage",
+    (
+        ("uint32", "count"),
+        *_STAMP,
+        ("string", "frame_id"),
+        ("string", "child_frame_id"),
+        *[("float64", name) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")],
+    ),
+    "geometry_msgs/TransformStamped[] transforms\n"
+    f"{_SECTION}geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/Transform transform\n"
+    f"{_SECTION}geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\n"
+    "geometry_msgs/Quaternion rotation\n"
+    f"{_SECTION}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    f"{_SECTION}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n" + _HEADER_TEXT,
+)
+"""A list of one transform."""
+
+STANDARD: Mapping[str, RosMessageType] = {
+    "/joint_states": JOINT_STATE,
+    "/joint_commands": JOINT_STATE,
+    "/joint_commands/requested": JOINT_STATE,
+    "/log": LOG,
+    "/tf": TRANSFORM,
+}
+"""Topics for other programs; ours read the others, which hold more."""
+
 CHANNELS: Mapping[str, RosMessageType] = {
     "/robot": ROBOT,
     "/state": STATE,
@@ -220,12 +286,16 @@ CHANNELS: Mapping[str, RosMessageType] = {
     "/wire/rx": WIRE,
     "/wire/tx": WIRE,
     "/body": BODY,
+    **STANDARD,
 }
 """Topic -> type, in the order in which a recorder registers them: the n-th has channel id n, from 1.
 
 Repair relies on that order where the part of a file that names the channels is damaged: append, never
 reorder.
 """
+
+FIRST_CHANNELS = 9
+"""So many of them recordings of format version 1 have."""
 
 OLD_TOPICS: Mapping[str, str] = {"/command/asked": "/command/requested"}
 """Topics by the names that recordings of November 2026 have."""

@@ -25,6 +25,7 @@ from deal_hw.types import FloatArray
 
 SPEED_LIMIT_NUMERIC = "deal_hw.speed_limit"
 LATENCY_NUMERIC = "deal_hw.latency_s"
+WITHOUT_VALUE_TEXT = "deal_hw.without_value"
 
 ROUNDS = 4
 """Writing one value may take another out of the compiler's hands (``dampratio``, ``settotalmass``): what then
@@ -41,12 +42,15 @@ def write_calibrated_mjcf(
     path: Path,
     latency_s: float,
     source: str = "",
+    without_value: Sequence[str] = (),
 ) -> tuple[Path, ...]:
     """Write the robot's MJCF with calibrated values.
 
-    What MuJoCo has no field for goes into ``<custom>``: the latency as ``deal_hw.latency_s``, and for each
-    kind of parameter outside MuJoCo (speed limit, encoder bias) one number an element, beside a ``<text>``
-    of the same name that lists the elements.
+    Parameters of which the recordings say nothing are marked: the comment at the top names them with the
+    values that stand in the file, and ``<custom>`` lists them in the ``<text>`` :data:`WITHOUT_VALUE_TEXT`.
+    What MuJoCo has no field for goes into ``<custom>``, too: the latency as ``deal_hw.latency_s``, and for
+    each kind of parameter outside MuJoCo (speed limit, encoder bias) one number an element, beside a
+    ``<text>`` of the same name that lists the elements.
 
     Args:
         robot: The robot's model.
@@ -55,6 +59,7 @@ def write_calibrated_mjcf(
         path: File to write; included files that change are written beside it.
         latency_s: Total latency [s].
         source: What found the values, for the comment at the top.
+        without_value: Names of the parameters without a value.
 
     Returns:
         The files written, ``path`` first.
@@ -64,12 +69,19 @@ def write_calibrated_mjcf(
             calibrated model.
     """
     check_kinds(space)
+    values = dict(zip(space.names, theta, strict=True))
+    remarks = [
+        f"no value: {name}; {values[name]:.5g} {space[name].unit} stands here" for name in without_value
+    ]
     return change_mjcf(
         robot.description.mjcf,
         path,
         model_with(robot, space, theta),
         device_values(space, theta) | {LATENCY_NUMERIC: ([latency_s], [])},
         source,
+        # A file that was calibrated before may have a list: it is replaced, also by none.
+        {WITHOUT_VALUE_TEXT: " ".join(without_value) or "none"},
+        remarks,
     )
 
 
@@ -92,6 +104,8 @@ def change_mjcf(
     want: Any,
     custom: Mapping[str, tuple[Sequence[float], Sequence[str]]],
     source: str = "",
+    texts: Mapping[str, str] | None = None,
+    remarks: Sequence[str] = (),
 ) -> tuple[Path, ...]:
     """Write an MJCF so that it compiles to another model.
 
@@ -101,6 +115,8 @@ def change_mjcf(
         want: The MjModel it is to compile to; the same elements as the file's.
         custom: Numbers for ``<custom>`` and the elements they belong to, by name.
         source: For the comment at the top.
+        texts: Texts for ``<custom>``, by name.
+        remarks: More lines for that comment.
 
     Returns:
         The files written, ``target`` first.
@@ -115,12 +131,12 @@ def change_mjcf(
     changes = MjcfChanges(top.root, have, bool(spec.compiler.degree))
     relocation = Relocation(top, target)
     relocation.adapt()
-    _set_custom(top.root, custom)
+    _set_custom(top.root, custom, texts or {})
     written: dict[Path, SourceFile] = {}
     try:
         for _ in range(ROUNDS):
             open_ = changes.apply(have, want)
-            top.header = _header(path, changes, custom, source)
+            top.header = _header(path, changes, custom, source, remarks)
             written = relocation.files()
             for file, content in written.items():
                 file.write_bytes(content.render())
@@ -174,7 +190,11 @@ def _check(path: Path, written: Any, want: Any) -> None:
 
 
 def _header(
-    path: Path, changes: MjcfChanges, custom: Mapping[str, tuple[Sequence[float], Sequence[str]]], source: str
+    path: Path,
+    changes: MjcfChanges,
+    custom: Mapping[str, tuple[Sequence[float], Sequence[str]]],
+    source: str,
+    remarks: Sequence[str],
 ) -> str:
     lines = [f"Calibrated by deal-hw{': ' + source if source else ''}. A change of {path.name}:"]
     for (_, element, attribute), (old, new) in changes.log.items():
@@ -182,7 +202,7 @@ def _header(
     for name, (data, elements) in custom.items():
         of = f" of {', '.join(elements)}" if elements else ""
         lines.append(f"  custom: {name} {_short(numbers(data))}{of}")
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, *(f"  {remark}" for remark in remarks), ""])
 
 
 def _short(values: str) -> str:
@@ -193,20 +213,23 @@ def _short(values: str) -> str:
         return values
 
 
-def _set_custom(root: Element, custom: Mapping[str, tuple[Sequence[float], Sequence[str]]]) -> None:
+def _set_custom(
+    root: Element, custom: Mapping[str, tuple[Sequence[float], Sequence[str]]], texts: Mapping[str, str]
+) -> None:
     section = Element("custom")
+    wanted = [("text", name, {"data": text}) for name, text in texts.items()]
     for name, (data, elements) in custom.items():
-        # A file that was calibrated before has them already.
-        wanted = [("numeric", name, {"size": str(len(data)), "data": numbers(data)})]
+        wanted.append(("numeric", name, {"size": str(len(data)), "data": numbers(data)}))
         if elements:
             wanted.append(("text", f"{name}.elements", {"data": " ".join(elements)}))
-        for tag, full_name, attributes in wanted:
-            there = [e for e in root.walk() if e.tag == tag and e.get("name") == full_name]
-            element = there[0] if there else Element(tag)
-            if not there:
-                section.last.append(element)
-                element.set("name", full_name)
-            for key, value in attributes.items():
-                element.set(key, value)
+    for tag, full_name, attributes in wanted:
+        # A file that was calibrated before has them already.
+        there = [e for e in root.walk() if e.tag == tag and e.get("name") == full_name]
+        element = there[0] if there else Element(tag)
+        if not there:
+            section.last.append(element)
+            element.set("name", full_name)
+        for key, value in attributes.items():
+            element.set(key, value)
     if section.last:
         root.last.append(section)

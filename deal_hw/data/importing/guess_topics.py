@@ -1,0 +1,172 @@
+"""Guesses a column map from the message types of a ROS 2 bag: which topic measures and which one commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from deal_hw.data.importing.channels import Channels
+from deal_hw.data.importing.columns import ColumnMap, JointColumns, TimeColumn
+from deal_hw.data.importing.guess import is_target, match_joints
+from deal_hw.errors import DatasetError, short
+
+STATES: Mapping[str, str] = {"JointState": "position"}
+"""Message type -> its field with the measured positions."""
+CONTROLLER_STATES: Mapping[str, tuple[str, ...]] = {
+    "JointTrajectoryControllerState": ("reference.positions", "desired.positions"),
+}
+"""Message type -> fields with what a controller really asks of its servos, the newer one first."""
+COMMANDS: Mapping[str, str] = {
+    "JointState": "position",
+    "JointTrajectory": "points.positions",
+    "MultiDOFCommand": "values",
+    "Float64MultiArray": "data",
+    "Float32MultiArray": "data",
+}
+"""Message type -> its field with the commands."""
+
+
+def guess_topics(channels: Channels, joints: Sequence[str] | None = None) -> ColumnMap | None:
+    """Guess which topics of a bag hold what a robot measured and what it was sent.
+
+    Measured: a ``sensor_msgs/JointState`` whose topic has no word for a command. Sent: the reference of a
+    controller's state; else a command topic of one of the types in :data:`COMMANDS`. Commands without names
+    are taken in the order of the measured joints. Times are the headers' where both topics have them, else
+    both the recorder's.
+
+    Args:
+        channels: What the bag holds.
+        joints: Names of the model's joints; None: as the bag names them.
+
+    Returns:
+        None where no topic has a type that is known as a measurement.
+
+    Raises:
+        DatasetError: Several topics would do, or none has commands; it says what to write in a column map.
+    """
+    states = {
+        topic: f"{topic}.{field}"
+        for topic, kind in channels.types.items()
+        if (field := STATES.get(_plain(kind)))
+        and not is_target(topic)
+        and _is_wide(channels, f"{topic}.{field}")
+    }
+    if not states:
+        return None
+    state = _only(channels, states, joints, "measured positions", "position")
+    topic, array = state, states[state]
+    names = list(channels.labels.get(array, ()))
+    commands = _commands(channels, array, names)
+    found = match_joints(channels, names, joints)
+    command = _only(channels, commands, names, "commands", "target")
+    target = commands[command]
+    by_order = target not in channels.labels
+    time, command_time = _times(channels, topic, command)
+    same = channels.arrays[array].shape
+    velocity, effort = (
+        name if name in channels.arrays and channels.arrays[name].shape == same else None
+        for name in (f"{topic}.velocity", f"{topic}.effort")
+    )
+    return ColumnMap(
+        time=time,
+        command_time=command_time,
+        position=array,
+        target=target,
+        velocity=velocity,
+        effort=effort,
+        joints=tuple(
+            JointColumns(name=model, column=name, index=index if by_order else None)
+            for model, name, index in found
+        ),
+        source=("guessed",),
+    )
+
+
+def _plain(kind: str) -> str:
+    return kind.rpartition("/")[2]
+
+
+def _is_wide(channels: Channels, name: str) -> bool:
+    return name in channels.arrays and channels.arrays[name].ndim == 2
+
+
+def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str, str]:
+    """Return the topics that may hold the commands, with the channel of each; of the best kind only."""
+    reference: dict[str, str] = {}
+    others: dict[str, str] = {}
+    segments = []
+    for topic, kind in channels.types.items():
+        for field in CONTROLLER_STATES.get(_plain(kind), ()):
+            if _is_wide(channels, f"{topic}.{field}"):
+                reference.setdefault(topic, f"{topic}.{field}")
+        name = f"{topic}.{COMMANDS.get(_plain(kind), '')}"
+        if _plain(kind) == "JointTrajectory" and name not in channels.arrays:
+            segments.append(topic)
+        named = name in channels.labels and bool(set(channels.labels[name]) & set(names))
+        ordered = _is_wide(channels, name) and name not in channels.labels and is_target(topic)
+        fits = ordered and channels.arrays[name].shape[1] == len(names)
+        if (named and name != state and (is_target(topic) or _plain(kind) != "JointState")) or fits:
+            others[topic] = name
+    if reference or others:
+        return reference or others
+    if segments:
+        raise DatasetError(
+            f"{channels.path}: {short(', '.join(segments), 80)} sends trajectories of several points, which "
+            "the controller interpolates; what the servos were told is in its state. Record that topic too, "
+            "such as /joint_trajectory_controller/controller_state"
+        )
+    listed = ", ".join(f"{topic} ({_plain(kind)})" for topic, kind in channels.types.items())
+    raise DatasetError(
+        f"{channels.path}: no topic holds commands for {short(', '.join(names), 80)}; topics: "
+        f"{short(listed, 120)}. Record the controller's commands too (ros2 bag record ... "
+        f"/position_controller/commands), or name their channel: {_entries(state, '/TOPIC.data')}"
+    )
+
+
+def _only(
+    channels: Channels, found: Mapping[str, str], wanted: Sequence[str] | None, what: str, entry: str
+) -> str:
+    """Return the one topic; of several the one whose joints are wanted."""
+    if len(found) > 1 and wanted is not None:
+        fitting = [topic for topic, name in found.items() if set(channels.labels.get(name, ())) & set(wanted)]
+        if len(fitting) == 1:
+            return fitting[0]
+    if len(found) > 1:
+        listed = "; ".join(
+            f"{name}: {', '.join(channels.labels.get(name, ())) or 'no names'}" for name in found.values()
+        )
+        first = next(iter(found.values()))
+        example = (
+            _entries(first, "/TOPIC.FIELD") if entry == "position" else _entries("/TOPIC.position", first)
+        )
+        raise DatasetError(
+            f"{channels.path}: {len(found)} topics may hold the {what} ({short(listed, 160)}); choose one in "
+            f"a column map, such as {example}"
+        )
+    return next(iter(found))
+
+
+def _entries(position: str, target: str) -> str:
+    """Return the lines of a column map, on one line, for a message."""
+    topics = [name.partition(".")[0] for name in (position, target)]
+    entries = {
+        "time": f"{topics[0]}.log_time",
+        "command_time": f"{topics[1]}.log_time",
+        "position": position,
+        "target": target,
+        "joints": "[NAME, ...]",
+    }
+    return short("{" + ", ".join(f"{key}: {value}" for key, value in entries.items()) + "}", 240)
+
+
+def _times(channels: Channels, state: str, command: str) -> tuple[TimeColumn, TimeColumn]:
+    """Return times on one clock: the headers' where both topics set them and overlap, else the recorder's."""
+    ends = []
+    for topic in (state, command):
+        stamp = channels.arrays.get(f"{topic}.header.stamp", np.zeros(1))
+        ends.append((float(stamp.min()), float(stamp.max())))
+    moving = all(end > begin for begin, end in ends)
+    overlap = min(end for _, end in ends) > max(begin for begin, _ in ends)
+    field = "header.stamp" if moving and overlap else "log_time"
+    return TimeColumn(column=f"{state}.{field}"), TimeColumn(column=f"{command}.{field}")

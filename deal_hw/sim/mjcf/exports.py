@@ -1,0 +1,258 @@
+"""Calibrated values for other simulators: actuator tables, URDF-side values and plain YAML.
+
+Each file lists what its format cannot hold, and which values the recordings say nothing about. Field names
+are those of Isaac Lab's ``ActuatorBaseCfg`` and ``DelayedPDActuatorCfg``, of mjlab's
+``BuiltinPositionActuatorCfg`` (1.6), and of URDF.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import yaml
+
+from deal_hw.calibration import CalibrationResult
+from deal_hw.parameters import Parameter
+from deal_hw.sim.engine.model import RobotModel, model_with
+from deal_hw.sim.parameters.fields import element_id
+
+ACTUATORS = "actuators.yaml"
+URDF = "urdf.yaml"
+VALUES = "values.yaml"
+
+_ACTUATOR_KINDS: Mapping[str, str] = {
+    "servo_stiffness": "stiffness",
+    "servo_damping": "damping",
+    "dof_damping": "damping",
+    "dof_armature": "armature",
+    "dof_frictionloss": "friction",
+    "servo_effort_limit": "effort_limit",
+    "servo_speed_limit": "velocity_limit",
+    "command_delay": "delay_s",
+}
+"""Kind of parameter -> column of the actuator table."""
+_URDF_KINDS = ("dof_damping", "dof_frictionloss", "servo_effort_limit", "rod_length")
+"""Kinds that URDF has a place for, beside those of bodies' masses and inertias."""
+_BODY_KINDS = ("body_mass", "body_inertia", "body_ipos_x", "body_ipos_y", "body_ipos_z", "rod_length")
+
+_ISAAC_LAB = (
+    "damping is the servo's D gain and the joint's own damping together: the table has one field. The "
+    "joint's own is not clipped by effort_limit in the calibrated model",
+    "friction is dry friction [N*m or N]; Isaac Sim before 5.0 takes a coefficient without unit there",
+    "velocity_limit bounds the set-point's speed in the calibrated model, the joint's in Isaac Lab",
+    "min_delay and max_delay are whole physics steps, of the 90 % interval of the latency; delay_s is the "
+    "value",
+)
+_MJLAB = (
+    "velocity_limit has no field: no set-point is limited in speed",
+    "delay_min_lag and delay_max_lag are the latency in whole physics steps: a range would be drawn anew in "
+    "each step",
+)
+_URDF = (
+    "armature has no field: most importers set 0",
+    "stiffness, the servo's D gain and delays have no field: they go into the controller's settings",
+    "damping is the joint's own alone",
+    "contact friction and restitution have no field",
+)
+
+
+def write_exports(folder: Path, robot: RobotModel, result: CalibrationResult) -> list[str]:
+    """Write the values for other programs; return the files' names.
+
+    Args:
+        folder: Where to write.
+        robot: The nominal model.
+        result: What was found.
+    """
+    tables = {
+        ACTUATORS: actuator_tables(robot, result),
+        URDF: urdf_values(robot, result),
+        VALUES: plain_values(result),
+    }
+    for name, values in tables.items():
+        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=110)
+        (folder / name).write_text(text, encoding="utf-8")
+    return list(tables)
+
+
+def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
+    """Return the actuators of the calibrated model as Isaac Lab and mjlab take them.
+
+    A motor that takes efforts has no gains: Isaac Lab's columns do not name it, mjlab's fields are None.
+    Values are at the joint: gears are in.
+    """
+    model = model_with(robot, result.space, result.estimate)
+    rows = {
+        joint: _actuator(robot, model, result, number)
+        for number, joint in enumerate(robot.description.actuated)
+    }
+    columns = ("stiffness", "damping", "armature", "friction", "effort_limit", "velocity_limit")
+    low, high = result.latency_interval_s
+    steps = {"min": math.floor(max(low, 0.0) / robot.step_s), "max": math.ceil(max(high, 0.0) / robot.step_s)}
+    # A joint that is not named keeps what its USD says.
+    isaac = {
+        column: {joint: row[column] for joint, row in rows.items() if row[column] is not None}
+        for column in columns
+    }
+    for joint in isaac["damping"]:
+        isaac["damping"][joint] += rows[joint]["joint_damping"]
+    blind = [result.space[name] for name in result.without_value]
+    untold = {
+        joint: [
+            _ACTUATOR_KINDS[p.kind] for p in blind if p.kind in _ACTUATOR_KINDS and _drives(robot, p, number)
+        ]
+        for number, joint in enumerate(robot.description.actuated)
+    }
+    return {
+        "format": "deal_hw.actuators/1",
+        "physics_step_s": robot.step_s,
+        "delay_s": {joint: row["delay_s"] for joint, row in rows.items()},
+        "without_value": {joint: names for joint, names in untold.items() if names},
+        "isaac_lab": {
+            "class": "DelayedPDActuatorCfg",
+            "joint_names_expr": list(rows),
+            **isaac,
+            "min_delay": steps["min"],
+            "max_delay": steps["max"],
+            "cannot_express": [*_ISAAC_LAB, *_left_out(result, _ACTUATOR_KINDS)],
+        },
+        "mjlab": {
+            "class": "BuiltinPositionActuatorCfg",
+            "actuators": [
+                {
+                    "target_names_expr": [joint],
+                    "stiffness": row["stiffness"],
+                    "damping": row["damping"],
+                    "effort_limit": row["effort_limit"],
+                    "armature": row["armature"],
+                    "frictionloss": row["friction"],
+                    "viscous_damping": row["joint_damping"],
+                    **dict.fromkeys(("delay_min_lag", "delay_max_lag"), round(row["delay_s"] / robot.step_s)),
+                }
+                for joint, row in rows.items()
+            ],
+            "cannot_express": [*_MJLAB, *_left_out(result, _ACTUATOR_KINDS)],
+        },
+    }
+
+
+def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
+    """Return what a URDF holds of the calibrated model: joints, and links whose masses were calibrated."""
+    model = model_with(robot, result.space, result.estimate)
+    description = robot.description
+    joints: dict[str, Any] = {}
+    for joint, qvel in zip(description.joint_names, robot.qvel, strict=True):
+        index = int(model.dof_jntid[qvel])
+        damping, friction = float(model.dof_damping[qvel]), float(model.dof_frictionloss[qvel])
+        limit: dict[str, float | None] = {"lower": None, "upper": None, "effort": None, "velocity": None}
+        if model.jnt_limited[index]:
+            limit["lower"], limit["upper"] = map(float, model.jnt_range[index])
+        if joint in description.actuated:
+            row = _actuator(robot, model, result, description.actuated.index(joint))
+            limit["effort"] = row["effort_limit"]
+        joints[joint] = {"dynamics": {"damping": damping, "friction": friction}, "limit": limit}
+    moved = [p for p in result.space.parameters if p.kind in _BODY_KINDS]
+    bodies = dict.fromkeys(name for parameter in moved for name in parameter.elements)
+    return {
+        "format": "deal_hw.urdf/1",
+        "joints": joints,
+        "links": {name: _inertial(model, element_id(model, "body", name)) for name in bodies},
+        "without_value": list(result.without_value),
+        "cannot_express": [*_URDF, *_left_out(result, (*_URDF_KINDS, *_BODY_KINDS))],
+    }
+
+
+def plain_values(result: CalibrationResult) -> dict[str, Any]:
+    """Return each value with its unit and 90 % interval; None where the recordings say nothing about it."""
+    values: dict[str, Any] = {}
+    for parameter, estimate, (low, high) in zip(result.space, result.estimate, result.interval, strict=True):
+        has = parameter.name not in result.without_value
+        values[parameter.name] = {
+            "kind": parameter.kind,
+            "elements": list(parameter.elements),
+            "unit": parameter.unit,
+            "value": float(estimate) if has else None,
+            "interval": [float(low), float(high)],
+            "nominal": parameter.nominal,
+        }
+    low, high = result.latency_interval_s
+    return {
+        "format": "deal_hw.values/1",
+        "parameters": values,
+        "known": {name: float(value) for name, value in result.space.known.items()},
+        "latency": {"unit": "s", "value": float(result.latency_s), "interval": [float(low), float(high)]},
+        "cannot_express": ["how values depend on each other: distribution.json has their covariance"],
+    }
+
+
+def _actuator(robot: RobotModel, model: Any, result: CalibrationResult, number: int) -> dict[str, Any]:
+    """Return one actuator's values at its joint, in SI."""
+    actuator = robot.actuator[number]
+    joint = robot.description.joint_names.index(robot.description.actuated[number])
+    dof, gear = robot.qvel[joint], abs(float(model.actuator_gear[actuator, 0]))
+    kp, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator]
+    affine = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    servo = affine and bool(np.isclose(kp, -bias[1]))
+    effort = None
+    if model.actuator_forcelimited[actuator]:
+        effort = float(np.abs(model.actuator_forcerange[actuator]).max()) * gear
+    elif not servo and model.actuator_ctrllimited[actuator]:
+        effort = float(np.abs(model.actuator_ctrlrange[actuator]).max()) * kp * gear
+    return {
+        "stiffness": kp * gear**2 if servo else None,
+        "damping": -float(bias[2]) * gear**2 if servo else None,
+        "joint_damping": float(model.dof_damping[dof]),
+        "armature": float(model.dof_armature[dof]),
+        "friction": float(model.dof_frictionloss[dof]),
+        "effort_limit": effort,
+        "velocity_limit": _device_value(robot, result, "servo_speed_limit", number),
+        "delay_s": float(result.latency_s) + (_device_value(robot, result, "command_delay", number) or 0.0),
+    }
+
+
+def _device_value(robot: RobotModel, result: CalibrationResult, kind: str, number: int) -> float | None:
+    """Return what no MuJoCo field holds of an actuator; None where nothing is known of it."""
+    values = dict(zip(result.space.names, result.estimate, strict=True)) | result.space.known
+    for parameter in result.space.parameters:
+        if parameter.kind == kind and _drives(robot, parameter, number):
+            return float(values[parameter.name])
+    limit = robot.description.speed_limit[number] if kind == "servo_speed_limit" else math.inf
+    return float(limit) if math.isfinite(limit) else None
+
+
+def _drives(robot: RobotModel, parameter: Parameter, number: int) -> bool:
+    names = (
+        {robot.actuator_names[number]}
+        if parameter.kind.startswith(("servo_", "command_", "motor_"))
+        else set()
+    )
+    return bool((names or {robot.description.actuated[number]}) & set(parameter.elements))
+
+
+def _inertial(model: Any, body: int) -> dict[str, Any]:
+    """Return mass, centre of mass and inertia of a link, in the link's frame."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, model.body_iquat[body])
+    axes = rotation.reshape(3, 3)
+    inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
+    entries = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
+    return {
+        "mass": float(model.body_mass[body]),
+        "origin_xyz": [float(v) for v in model.body_ipos[body]],
+        "inertia": {name: float(inertia[row, column]) for name, row, column in entries},
+    }
+
+
+def _left_out(result: CalibrationResult, kinds: Sequence[str] | Mapping[str, str]) -> list[str]:
+    """Return the calibrated parameters that a format has no place for, with their values."""
+    values = dict(zip(result.space.names, result.estimate, strict=True)) | result.space.known
+    return [
+        f"{p.name} = {float(values[p.name]):.5g} {p.unit} ({p.kind})"
+        for p in result.space.parameters
+        if p.kind not in kinds
+    ]

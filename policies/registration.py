@@ -1,0 +1,29 @@
+"""Registers the tasks with Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gymnasium.envs import registration
+
+IDS: Mapping[str, str] = {
+    "deal_hw/Ant-v0": "ant",
+    "deal_hw/CartPole-v0": "cartpole",
+    "deal_hw/Go2-v0": "go2",
+}
+"""Gymnasium's name -> robot."""
+
+
+def register(single: str, vector: str) -> None:
+    """Register all tasks, single and vector; those that are there already stay.
+
+    Args:
+        single: Function that makes a single environment, "module:name"; called with ``robot`` and what the
+            user gives to ``gymnasium.make``.
+        vector: The same for ``gymnasium.make_vec``, called with ``num_envs``, too.
+    """
+    for name, robot in IDS.items():
+        if name not in registration.registry:
+            registration.register(
+                name, entry_point=single, vector_entry_point=vector, kwargs={"robot": robot}
+            )

@@ -1,0 +1,227 @@
+"""Reads what deal-hw writes with other people's programs, and prints a table.
+
+    python tools/check_readers.py --environments build/readers
+    python tools/check_readers.py --environments build/readers --only rerun lerobot --out readers.json
+
+Each program gets an environment of its own, which the first call makes (some gigabytes: lerobot and mjlab
+bring torch). LeRobot 0.4.4 wants an older torch and rerun than deal-hw, so no CI runs this. `--pip-args` is
+passed on to pip. The exit code is 1 where a reader fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from measure_recording_size import CYCLE_NS, START_NS, cycles
+
+from deal_hw.bench.rows import write_rows
+from deal_hw.calib.report.page import write_result
+from deal_hw.calibration import CalibrationResult, Identifiability
+from deal_hw.clock import VirtualClock
+from deal_hw.data.export.lerobot import export_lerobot
+from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.data.recording.recorder import EpisodeRecorder
+from deal_hw.drivers import recorded_description
+from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
+from deal_hw.sim.engine.model import load_model
+from deal_hw.training import TrainingFiles
+from deal_hw.types import Event, Trajectory
+from deal_hw.workflows.train import nominal_distribution, train_policy
+
+SCRIPTS = Path(__file__).resolve().parent / "readers"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reader:
+    """A program that reads what deal-hw writes.
+
+    Attributes:
+        name: What the table calls it.
+        packages: What pip installs; none: the environment of deal-hw itself.
+        script: A file of tools/readers.
+        inputs: Which samples it reads, one run each.
+    """
+
+    name: str
+    packages: tuple[str, ...]
+    script: str
+    inputs: tuple[str, ...]
+
+
+_MCAP = ("mcap", "mcap-ros2-support")
+READERS = (
+    Reader(
+        name="mcap",
+        packages=_MCAP,
+        script="read_mcap.py",
+        inputs=("episode_cartpole.mcap", "episode_go2.mcap"),
+    ),
+    Reader(
+        name="foxglove",
+        packages=("foxglove-sdk", "protobuf", *_MCAP),
+        script="read_foxglove.py",
+        inputs=("episode_go2.mcap",),
+    ),
+    Reader(name="rerun", packages=("rerun-sdk",), script="read_rerun.py", inputs=("episode_go2.mcap",)),
+    Reader(
+        name="lerobot",
+        packages=("lerobot==0.4.4",),
+        script="read_lerobot.py",
+        inputs=("lerobot_one_motor", "lerobot_two_motors"),
+    ),
+    Reader(name="environments", packages=(), script="read_environments.py", inputs=("policy_sb3.zip",)),
+    Reader(name="onnx", packages=("onnx", "onnxruntime"), script="read_onnx.py", inputs=("policy.onnx",)),
+    Reader(name="mujoco", packages=("mujoco",), script="read_mujoco.py", inputs=("calibrated.xml",)),
+    Reader(name="mjlab", packages=("mjlab",), script="read_mjlab.py", inputs=("actuators.yaml",)),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What a reader made of an input."""
+
+    reader: str
+    versions: str
+    input: str
+    passed: bool
+    words: str
+
+
+def make_samples(folder: Path) -> None:
+    """Write an episode of two robots, LeRobot exports with lost frames, a policy and a calibration."""
+    for robot in ("cartpole", "go2"):
+        made = cycles(robot, 100, np.random.default_rng(0))
+        _record(folder / f"episode_{robot}.mcap", robot, made)
+    # A cycle that never reached the recorder takes its samples along.
+    made = cycles("cartpole", 100, np.random.default_rng(1))
+    _record(folder / "holes.mcap", "cartpole", [*made[:40], *made[41:]])
+    both = [read_trajectory(folder / name) for name in ("episode_cartpole.mcap", "holes.mcap")]
+    export_lerobot(both, folder / "lerobot_two_motors", "cartpole")
+    export_lerobot([_cart_alone(t) for t in both], folder / "lerobot_one_motor", "cart")
+    train_policy(
+        "cartpole",
+        nominal_distribution("cartpole"),
+        folder / "policy.onnx",
+        steps=1_200,
+        members=8,
+        files=TrainingFiles(checkpoint=folder / "policy.safetensors"),
+    )
+    space = k9_space()
+    estimate = space.nominal * 1.1
+    told: list[Identifiability] = ["identifiable"] * (len(space) - 1)
+    result = CalibrationResult(
+        method="sample",
+        space=space,
+        estimate=estimate,
+        interval=np.stack([0.9 * estimate, 1.1 * estimate], axis=1),
+        verdicts=("not identifiable", *told),
+        latency_s=0.012,
+        latency_interval_s=(0.011, 0.013),
+    )
+    write_result(folder, load_model(DESCRIPTION), result)
+
+
+def _record(path: Path, robot: str, made: list[CycleRecord]) -> None:
+    clock = VirtualClock(START_NS)
+    with EpisodeRecorder(path, recorded_description(robot).to_json(), {}, clock) as recorder:
+        for number, cycle in enumerate(made):
+            clock.sleep_until_ns(cycle.start_ns + CYCLE_NS)
+            events = (Event(cycle.start_ns, "clipped", "too far", {}),) if number == 3 else ()
+            recorder.write(
+                CycleRecord(**{**{n: getattr(cycle, n) for n in cycle.__slots__}, "events": events})
+            )
+
+
+def _cart_alone(trajectory: Trajectory) -> Trajectory:
+    """Return the recording of the driven joint alone."""
+    description = {**trajectory.metadata["description"], "joint_names": ["cart"], "position_units": ["m"]}
+    fields = {name: getattr(trajectory, name) for name in trajectory.__slots__}
+    fields |= {name: fields[name][:, :1] for name in ("position", "velocity", "effort")}
+    metadata = {**trajectory.metadata, "description": description}
+    return Trajectory(**{**fields, "joint_names": ("cart",), "metadata": metadata})
+
+
+def python_of(reader: Reader, folder: Path, pip_args: list[str]) -> Path:
+    """Return the reader's Python, its environment made if need be."""
+    if not reader.packages:
+        return Path(sys.executable)
+    home, ready = folder / reader.name, folder / reader.name / ".ready"
+    python = home / "bin" / "python"
+    if not ready.exists():
+        print(f"{reader.name}: installing {' '.join(reader.packages)}", file=sys.stderr, flush=True)
+        subprocess.run([sys.executable, "-m", "venv", "--clear", str(home)], check=True)
+        call = [str(python), "-m", "pip", "install", "--quiet", *pip_args, *reader.packages]
+        subprocess.run(call, check=True, capture_output=True, text=True)
+        ready.touch()
+    return python
+
+
+def check(reader: Reader, samples: Path, folder: Path, pip_args: list[str]) -> list[Finding]:
+    """Return what a reader makes of its inputs."""
+    try:
+        python = python_of(reader, folder, pip_args)
+    except subprocess.CalledProcessError as error:
+        words = f"not installed: {str(error.stderr or error).strip().splitlines()[-1]}"
+        return [Finding(reader=reader.name, versions="", input="", passed=False, words=words)]
+    names = [name.partition("==")[0] for name in reader.packages] or ["gymnasium", "stable-baselines3"]
+    code = (
+        "import sys, importlib.metadata as m; print(', '.join(f'{n} {m.version(n)}' for n in sys.argv[1:]))"
+    )
+    told = subprocess.run([python, "-c", code, *names], capture_output=True, text=True, check=False)
+    findings = []
+    for name in reader.inputs:
+        call = [str(python), str(SCRIPTS / reader.script), str(samples / name)]
+        done = subprocess.run(call, capture_output=True, text=True, check=False)
+        lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines() or ["no word"]
+        findings.append(
+            Finding(
+                reader=reader.name,
+                versions=told.stdout.strip(),
+                input=name,
+                passed=done.returncode == 0,
+                words=lines[-1],
+            )
+        )
+    return findings
+
+
+def main() -> int:
+    """Print a row a reader and input; return 1 where one fails."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--environments", type=Path, required=True, help="folder for the environments; kept")
+    parser.add_argument("--only", nargs="*", choices=[r.name for r in READERS], help="these readers")
+    parser.add_argument("--pip-args", default="", help="passed on to every `pip install`")
+    parser.add_argument("--out", type=Path, help="a JSON file for the rows")
+    options = parser.parse_args()
+    chosen = [reader for reader in READERS if not options.only or reader.name in options.only]
+    with tempfile.TemporaryDirectory() as folder:
+        samples = Path(folder)
+        make_samples(samples)
+        findings = [
+            finding
+            for reader in chosen
+            for finding in check(
+                reader, samples, options.environments.resolve(), shlex.split(options.pip_args)
+            )
+        ]
+    print("| reader | versions | input | result | what it says |\n|---|---|---|---|---|")
+    for found in findings:
+        verdict = "pass" if found.passed else "FAIL"
+        print(f"| {found.reader} | {found.versions} | `{found.input}` | {verdict} | {found.words} |")
+    if options.out is not None:
+        write_rows(options.out, [asdict(found) for found in findings], program="tools/check_readers.py")
+    return 0 if all(found.passed for found in findings) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
