@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
+from deal_hw.workflows.calibration.recordings import on_grid
 from deal_hw.workflows.options import Checked, Range, given, refuse
+from deal_hw.workflows.robot import load_robot
+from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -29,7 +32,10 @@ class ImportSettings(Checked):
     columns: Path | None = None
     """A column map (YAML); without it the meaning of the channels is guessed from their names and said."""
     model: Path | None = None
-    """The robot's MJCF: joint names, order and limits come from it."""
+    """The robot's MJCF: joint names, order and limits come from it, and the dataset keeps it."""
+    robot: Path | None = None
+    """Instead of --model a robot.yaml (`deal-hw robot new`), which the dataset keeps with its MJCF: later
+    verbs know the robot from it."""
     description: Path | None = None
     """A robot description (JSON, as in dataset.json) to use instead of a minimal one."""
     name: str = ""
@@ -75,13 +81,16 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.importing.load import load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
 
-    if config.description is not None:
-        default = ImportSettings(paths=config.paths, out=config.out)
-        refuse(given(config, default, ("name", "device_periods")), "--description says it")
+    _refuse_ignored(config)
     columns = None if config.columns is None else read_column_map(config.columns)
-    facts = _joint_facts(config.model, say)
+    robot = None if config.robot is None else load_robot(config.robot)
+    facts = _joint_facts(config.model if robot is None else robot.mjcf, say)
     described = None if config.description is None else _description(config.description)
-    joints = described["joint_names"] if described is not None else None if facts is None else facts.names
+    joints = None if facts is None else facts.names
+    if robot is not None:
+        joints = robot.joint_names
+    elif described is not None:
+        joints = described["joint_names"]
     tables = [table for path in config.paths for table in load_tables(path, columns, joints, say)]
     problems = {
         table.name: [
@@ -92,8 +101,15 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         ]
         for table in tables
     }
+    if robot is None and described is None and config.model is not None:
+        robot = derived_robot(config.model, config.name, tables, say)
     period = common_period(tables)
-    recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
+    if robot is None:
+        recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
+    else:
+        simulated, rates = at_recorded_rates(robot, tables, config.device_periods)
+        recordings = [part for table in tables for part in on_grid(table, simulated, rates)]
+        described = simulated.description.to_json()
     for part in recordings:
         how = part.trajectory.metadata["import"]
         stretch = f", stretch {how['stretch'] + 1} of {how['stretches']}" if how["stretches"] > 1 else ""
@@ -111,7 +127,27 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         mjcf=config.model,
         rates_per_sample=config.device_periods,
     )
+    if robot is not None:
+        from deal_hw.data.recording.dataset import Dataset
+        from deal_hw.sim.robots.carried import carry
+
+        with Dataset.create_or_open(config.out, values, say):
+            carry(robot, config.out)
     return write_dataset(config.out, recordings, values, {"plausibility": problems}, say)
+
+
+def _refuse_ignored(config: ImportSettings) -> None:
+    """Refuse options that another one makes needless.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    default = ImportSettings(paths=config.paths, out=config.out)
+    if config.robot is not None:
+        names = ("model", "description", "name", "device_periods")
+        refuse(given(config, default, names), "--robot says it")
+    if config.description is not None:
+        refuse(given(config, default, ("name", "device_periods")), "--description says it")
 
 
 def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
