@@ -66,6 +66,8 @@ FINE_AT_ZERO = {
     "servo_reboot_after_s",
     "servo_overload_after_s",
     "servo_absent_after_s",
+    "truth_seed",
+    "truth_latency",
 }
 FINE_BELOW_ZERO = {"excitation_level", "known", "range", "push"}
 REQUIRED: dict[str, Any] = {
@@ -79,6 +81,7 @@ REQUIRED: dict[str, Any] = {
     "dataset": Path("d"),
     "folder": Path("f"),
     "name": "n",
+    "model": Path("m"),
 }
 
 
