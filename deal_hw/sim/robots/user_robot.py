@@ -251,7 +251,7 @@ def _differs(name: str, joint: str, given: float, own: float) -> str:
 
 
 def _check_one_tree(mjcf: Path, model: Any) -> None:
-    """Check that the driven joints hang together.
+    """Check that the driven joints lie in one tree of bodies.
 
     Raises:
         ConfigurationError: They lie in several trees of bodies.
