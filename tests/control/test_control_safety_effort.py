@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -328,7 +329,8 @@ def test_limits_of_speed_and_effort_may_be_infinite_where_the_robot_has_none(
     field: str, limit: float, value: float, accepted: bool
 ) -> None:
     """A robot without set-point generator, or without a force limit, says so, and so do its commands."""
-    limits = dataclasses.replace(DESCRIPTION.limits, **{field: (limit,)})
+    changed: dict[str, Any] = {field: (limit,)}
+    limits = dataclasses.replace(DESCRIPTION.limits, **changed)
     gate = SafetyFilter(dataclasses.replace(DESCRIPTION, limits=limits))
     asked = command(**{f"{field}_limit": value})
     assert gate.accepts(asked) is accepted
