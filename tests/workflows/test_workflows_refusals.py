@@ -72,6 +72,8 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("train", {"udr": True, "nominal": True}, "--udr and --nominal exclude each other"),
     ("train", {"robot": "go3", "udr": True}, "unknown robot with a training environment 'go3'; known: ant"),
     ("train", {"udr": True, "trainer": "dqn"}, "dqn"),
+    ("train", {"robot": "cartpole", "env": "a:B-v0", "nominal": True}, "--env needs a robot.yaml"),
+    ("train", {"robot": "r.yaml", "env": "a:B-v0", "udr": True}, "--env takes --distribution or --nominal"),
     ("train", {"udr": True, "steps": 0}, "--steps 0: allowed are 1 to"),
     ("train", {"distribution": "none.json"}, "none.json cannot be read"),
     (
