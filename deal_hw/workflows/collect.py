@@ -11,13 +11,16 @@ from deal_hw.calibration import SHORTEST_S
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
-from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settings, given, refuse
-from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import RunOptions, plan_options
-from deal_hw.workflows.running.simulated import SimulationOptions, run_simulated
+from deal_hw.workflows.running.simulated import (
+    SimulationOptions,
+    check_simulation,
+    require_driver,
+    run_simulated,
+)
 from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.shipped import shipped_policy
@@ -98,13 +101,7 @@ def run(config: CollectSettings, view: RunView) -> RunReport:
     _refuse_ignored(config)
     if config.simulation.simulated:
         return _rehearse(config, view)
-    if not config.port:
-        if is_user_robot(config.robot):
-            raise ConfigurationError(
-                f"{config.robot}: a robot of your own has no driver here; record its simulation with "
-                "--simulated, or import recordings of it: deal-hw data import"
-            )
-        raise ConfigurationError("say where the robot is: --port, such as /dev/ttyUSB0")
+    require_driver(config.robot, config.port)
     policy = config.policy or shipped_policy(config.robot)
     excite, seconds = _excitation(config, view)
     if seconds * config.episodes < SHORT_S:
@@ -169,11 +166,9 @@ def _refuse_ignored(config: CollectSettings) -> None:
         ConfigurationError: There is one.
     """
     default = CollectSettings(robot=config.robot, port=config.port)
+    check_simulation(config, default)
     if config.simulation.simulated:
-        refuse(given(config, default, ("link", "legs", "policy")), "--simulated needs no wire and no policy")
-        refuse(["--port"] if config.port else [], "--simulated needs no wire")
-    else:
-        refuse(given(config.simulation, SimulationOptions()), "only with --simulated")
+        refuse(given(config, default, ["policy"]), "--simulated runs no policy")
     if config.excite:
         refuse(given(config, default, ["profile"]), "--excite plays its own motion; leave one of the two out")
     if config.excite or config.profile != "rich":

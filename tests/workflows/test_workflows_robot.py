@@ -106,6 +106,9 @@ def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
     again = tmp_path / "again" / "dataset" / "episodes" / "000000.mcap"
     one, two = (deal_hw.inspect(path).episode.trajectory for path in (report.paths[0], again))
     assert (one.position == two.position).all()
+    replayed = deal_hw.replay(again, simulation=simulation, out=tmp_path / "replayed")
+    repeated = deal_hw.inspect(replayed.paths[0]).episode.trajectory
+    assert (repeated.requested_position[:100] == two.requested_position[:100]).all()
     assert deal_hw.design_excitation(str(dataset), out=tmp_path / "e.json", family="steps").path.is_file()
 
 
@@ -134,7 +137,7 @@ REFUSED: list[tuple[str, str]] = [
     ),
     (
         "collect {made}/robot.yaml --out r",
-        "a robot of your own has no driver here; record its simulation with",
+        "a robot of your own has no driver here (docs/how-to/add.md); record its",
     ),
     (
         "collect {made}/robot.yaml --simulated --out r --excite chirp",
@@ -150,6 +153,9 @@ REFUSED: list[tuple[str, str]] = [
         "--truth-seed would have no effect: only with --simulated",
     ),
     ("collect cartpole --out r", "say where the robot is: --port"),
+    ("replay {made}/run/dataset/episodes/000000.mcap --port p", "a robot of your own has no driver here"),
+    ("replay {made}/run/dataset/episodes/000000.mcap --simulated", "give --out RUN (the episodes go to"),
+    ("deploy {made}/robot.yaml --port p", "a robot of your own has no driver here; docs/how-to/add.md"),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]
 

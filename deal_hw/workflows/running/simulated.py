@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 from deal_hw.clock import VirtualClock
 from deal_hw.control.loop import ControlLoop, LoopConfig
@@ -13,11 +13,11 @@ from deal_hw.control.safety import Safety
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.record import CycleRecord
-from deal_hw.errors import MissingExtraError
+from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.version import __version__
-from deal_hw.workflows.options import Checked, File, Range, Ratio, Seed
-from deal_hw.workflows.robot import default_space, user_robot
+from deal_hw.workflows.options import Checked, File, Range, Ratio, Seed, given, refuse
+from deal_hw.workflows.robot import default_space, is_user_robot, user_robot
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.supervised import play_episodes
@@ -49,6 +49,48 @@ class SimulationOptions(Checked):
 
     reveal_to: File | None = None
     """Simulated: write what was hidden to this JSON file."""
+
+
+class Simulable(Protocol):
+    """Settings of a verb that runs a robot, or its simulation."""
+
+    @property
+    def port(self) -> str:
+        """Where the robot is."""
+        ...
+
+    @property
+    def simulation(self) -> SimulationOptions:
+        """Whether it is simulated."""
+        ...
+
+
+def check_simulation(config: Simulable, default: Simulable) -> None:
+    """Refuse what goes with a wire alone, or with a simulation alone.
+
+    Raises:
+        ConfigurationError: Something would have no effect.
+    """
+    if config.simulation.simulated:
+        refuse(["--port"] if config.port else [], "--simulated needs no wire")
+        refuse(given(config, default, ("link", "legs")), "--simulated needs no wire and has no legs")
+    else:
+        refuse(given(config.simulation, SimulationOptions()), "only with --simulated")
+
+
+def require_driver(robot: str, port: str) -> None:
+    """Check that a robot is one that can be reached, and that it was said where.
+
+    Raises:
+        ConfigurationError: It is a user's, which has no driver, or there is no port.
+    """
+    if is_user_robot(robot):
+        raise ConfigurationError(
+            f"{robot}: a robot of your own has no driver here (docs/how-to/add.md); record its simulation "
+            "with --simulated, or import recordings of it: deal-hw data import"
+        )
+    if not port:
+        raise ConfigurationError("say where the robot is: --port, such as /dev/ttyUSB0")
 
 
 def run_simulated(
