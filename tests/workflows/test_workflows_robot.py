@@ -113,6 +113,7 @@ def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
 
 
 REFUSED: list[tuple[str, str]] = [
+    ("calibrate {made}/run/dataset --method deal-paper", "nor those of a dataset that carries its robot"),
     ("robot new {made}/robot.xml", "robot.yaml exists; name another file with --out, or remove it"),
     ("robot new {made}/robot.xml --out o.yaml --name so101", "'so101' is that of a robot of deal-hw; choose"),
     ("robot new none.xml", "model none.xml does not exist"),

@@ -55,7 +55,7 @@ def prepare_carried(
     dataset = Dataset.open(source.folder)
     description = recorded_robot(dataset.description, source.folder)
     fit, held = choose_episodes(dataset, source.episodes, source.holdout, say)
-    if held and not source.holdout:
+    if held and config.holdout_part is None:
         share = 0.0
     trajectories, verdicts = sound_recordings(
         {i: dataset.read(i).trajectory for i in (*fit, *held)}, source.folder, source.spikes, say

@@ -158,7 +158,8 @@ class CalibrateSettings(Checked):
         if self.latency is not None:
             refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency says the latency")
         check_method(self.method)
-        check_policy(self.method, given=self.policy is not None, model=self.recordings.model is not None)
+        own = self.recordings.model is not None or carries_robot(self.dataset)
+        check_policy(self.method, given=self.policy is not None, model=own)
 
     @property
     def budget(self) -> Budget:
