@@ -33,9 +33,13 @@ if TYPE_CHECKING:
     from deal_hw.workflows.inspect import Inspection as Inspection
     from deal_hw.workflows.inspect import inspect as inspect
     from deal_hw.workflows.replay import replay as replay
+    from deal_hw.workflows.robot import RobotCheck as RobotCheck
+    from deal_hw.workflows.robot import check_robot as check_robot
+    from deal_hw.workflows.robot import new_robot as new_robot
     from deal_hw.workflows.running.report import RunReport as RunReport
     from deal_hw.workflows.running.settings import LegOptions as LegOptions
     from deal_hw.workflows.running.settings import LinkOptions as LinkOptions
+    from deal_hw.workflows.running.simulated import SimulationOptions as SimulationOptions
     from deal_hw.workflows.train import Training as Training
     from deal_hw.workflows.train import train as train
 
@@ -48,8 +52,10 @@ _EXPORTS = {
     "workflows.design_excitation": ("design_excitation",),
     "workflows.inspect": ("inspect", "Inspection"),
     "workflows.replay": ("replay",),
+    "workflows.robot": ("check_robot", "new_robot", "RobotCheck"),
     "workflows.running.report": ("RunReport",),
     "workflows.running.settings": ("LinkOptions", "LegOptions"),
+    "workflows.running.simulated": ("SimulationOptions",),
     "workflows.train": ("train", "Training"),
     "transport": ("WireOptions",),
 }

@@ -131,6 +131,17 @@ TASKS: Final = {
 }
 
 
+OWN_TASK: Final = TrainingTask(
+    environment="deal_hw.policies.own_env:OwnVectorEnv",
+    trainer="sac",
+    members={"ppo": 16, "sac": 8},
+    settings={},
+    udr_ratio=1.0,
+    udr_latency_s=(0.0, 0.0),
+)
+"""A Gymnasium environment that the user names; nothing is known of what suits it."""
+
+
 def training_task(robot: str) -> TrainingTask:
     """Return a robot's task.
 

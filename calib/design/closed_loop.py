@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.control.behaviours import Behaviour
-from deal_hw.control.safety_filter import SafetyFilter, is_finite
+from deal_hw.control.safety_filter import SafetyFilter
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
@@ -201,8 +201,7 @@ class _Loop:
     def _filtered(
         self, n: int, wanted: JointCommand, measured: FloatArray, velocity: FloatArray, time_s: float
     ) -> JointCommand:
-        # The speed limit need not be finite, without a set-point generator.
-        if not is_finite(dataclasses.replace(wanted, speed_limit=np.zeros_like(wanted.speed_limit))):
+        if not self._filters[n].accepts(wanted):
             self.tripped[n] = "the behaviour asked for a command that is not finite"
             return dataclasses.replace(wanted, position_target=self._previous[n])
         share = 1.0

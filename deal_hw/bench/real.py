@@ -21,13 +21,10 @@ from deal_hw.calib.methods import check_method
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.model import HELDOUT_PART, Recordings, prepare_model
-from deal_hw.workflows.calibration.run import (
-    CalibrationInputs,
-    SpaceOverrides,
-    calibrate_episodes,
-    residual_std,
-)
+from deal_hw.workflows.calibration.model import HELDOUT_PART
+from deal_hw.workflows.calibration.run import CalibrationInputs, calibrate_episodes
+from deal_hw.workflows.calibration.settings import CalibrateSettings
+from deal_hw.workflows.calibration.settings import prepare as prepare_recordings
 from deal_hw.workflows.say import aloud, silent
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
@@ -39,52 +36,46 @@ UNTOLD = frozenset({"nominal", "output-error"})
 
 
 def prepare(
-    recordings: Recordings,
-    holdout: Sequence[Path],
-    range_ratio: float | None,
-    std: Sequence[str],
-    *,
-    threads: int | None,
-    quiet: bool,
+    source: CalibrateSettings, range_ratio: float | None, *, quiet: bool = False
 ) -> CalibrationInputs:
-    """Read and check model, recordings and parameters once for all cells.
+    """Read and check recordings and parameters once for all cells.
+
+    Args:
+        source: Model and recordings, or a dataset, and what is held out; as for ``deal-hw calibrate``.
+        range_ratio: Of the search; None: as the parameters say.
+        quiet: Say nothing of what was found.
 
     Raises:
-        ConfigurationError: No model was named, or a setting cannot be used.
+        ConfigurationError: Nothing was named, or a setting cannot be used.
         DatasetError: A recording cannot be used.
     """
-    if recordings.model is None:
+    if source.recordings.model is None and source.dataset is None:
         raise ConfigurationError(
-            "bench real needs --model robot.xml --data rec.csv ... (docs/tutorials/your-robot.md), and "
-            "--holdout other.csv or a part of each recording (--holdout-part)"
+            "bench real needs --model robot.xml --data rec.csv ... (docs/tutorials/your-robot.md) or "
+            "--dataset DIR, and --holdout other.csv (of a dataset episodes) or a part of each recording "
+            "(--holdout-part)"
         )
-    overrides = SpaceOverrides(free=(), known={}, ranges=(), range_ratio=range_ratio)
-    return prepare_model(
-        recordings,
-        holdout,
-        overrides,
-        std=lambda robot: residual_std(std, robot),
-        threads=threads,
-        say=silent if quiet else aloud,
-    )
+    settings = dataclasses.replace(source, range_ratio=range_ratio)
+    settings.check()
+    return prepare_recordings(settings, say=silent if quiet else aloud)
 
 
-def split_name(recordings: Recordings, holdout: Sequence[Path]) -> str:
+def split_name(source: CalibrateSettings) -> str:
     """Return what is held out, in a word or two."""
-    if holdout:
-        return "+".join(path.stem for path in holdout)
-    share = HELDOUT_PART if recordings.holdout_part is None else recordings.holdout_part
+    if source.holdout:
+        return "+".join(Path(str(one)).stem for one in source.holdout)
+    part = source.recordings.holdout_part
+    share = HELDOUT_PART if part is None else part
     return f"last {share:.0%}"
 
 
 def expected_std(
-    work: CalibrationInputs, words: Sequence[str], threads: int | None
+    work: CalibrationInputs, given: FloatArray | None, threads: int | None
 ) -> Callable[[str], FloatArray | None]:
     """Return what tells a method what a prediction may be off, (2 C,): as it is given, or a first fit's."""
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.fit.output_error import expected_residual
 
-    given = residual_std(words, work.robot)
     # Fitted once, before the first cell that needs it.
     fitted = functools.cache(
         lambda: expected_residual(Problem(work.robot, work.space, work.episodes, threads=threads))
@@ -97,17 +88,13 @@ def expected_std(
 
 
 def cells(
-    recordings: Recordings,
-    holdout: Sequence[Path],
+    source: CalibrateSettings,
     *,
     methods: Sequence[str],
     seeds: Sequence[int],
     range_ratio: float,
-    std: Sequence[str],
     refine_all: bool,
     budget: Budget,
-    window_s: float,
-    threads: int | None,
     quiet: bool,
 ) -> Cells:
     """Read and check the recordings and return the cells; see :func:`run_cell`.
@@ -119,11 +106,12 @@ def cells(
     """
     for method in methods:
         check_method(method)
-    task = Path(recordings.model or "").stem
     # A file of parameters has ranges of its own.
-    ratio = range_ratio if recordings.parameters is None else None
-    work = prepare(recordings, holdout, ratio, std, threads=threads, quiet=quiet)
-    split, expected = split_name(recordings, holdout), expected_std(work, std, threads)
+    ratio = range_ratio if source.recordings.parameters is None else None
+    work = prepare(source, ratio, quiet=quiet)
+    model, threads = source.recordings.model, source.threads
+    task = work.robot.description.name if model is None else model.stem
+    split, expected = split_name(source), expected_std(work, source.known_std(work.robot), threads)
 
     def make(method: str, seed: int, refine: bool) -> Callable[[], Row]:
         return lambda: run_cell(
@@ -137,7 +125,7 @@ def cells(
             std=expected(method),
             threads=threads,
             budget=budget,
-            window_s=window_s,
+            window_s=source.heldout_window,
         )
 
     runs = []

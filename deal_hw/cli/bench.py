@@ -53,8 +53,11 @@ class Bench:
 
     recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
 
+    dataset: Path | None = None
+    """real: a dataset instead of --model and --data; of a robot of ours, or one that carries its robot."""
+
     holdout: tuple[Path, ...] = ()
-    """real: recordings that only judge; by default the last part of each."""
+    """real: recordings that only judge, of a dataset episodes by number; by default the last part of each."""
 
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = 5.0
     """real: held-out predictions restart this often [s]."""
@@ -130,7 +133,7 @@ class Bench:
         parse_ratios(self.range_ratio)
         if self.bench != "real":
             options = given(self.recordings, Recordings())
-            options += given(self, Bench, ("holdout", "heldout_window", "residual_std"))
+            options += given(self, Bench, ("dataset", "holdout", "heldout_window", "residual_std"))
             refuse(options, "only `bench real` takes that")
         if self.bench != "first-answer":
             # The class holds the defaults of these.
@@ -344,19 +347,24 @@ def _calibration(config: Bench, out: Path) -> _Table:
 
 def _real(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import real, tables
+    from deal_hw.workflows.calibration.settings import CalibrateSettings
 
     (range_ratio,) = parse_ratios(config.range_ratio)[:1]
+    source = CalibrateSettings(
+        dataset=config.dataset,
+        recordings=config.recordings,
+        holdout=tuple(int(str(one)) if str(one).isdigit() else one for one in config.holdout),
+        heldout_window=config.heldout_window,
+        residual_std=config.residual_std,
+        threads=config.threads,
+    )
     cells = real.cells(
-        config.recordings,
-        config.holdout,
+        source,
         methods=_methods(config, real.METHODS),
         seeds=parse_seeds(config.seeds),
         range_ratio=range_ratio,
-        std=config.residual_std,
         refine_all=config.refine_all,
         budget=_budget(config),
-        window_s=config.heldout_window,
-        threads=config.threads,
         quiet=config.quiet,
     )
     return _Table(cells=cells, line=tables.line, summary=tables.print_real)

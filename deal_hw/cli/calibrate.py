@@ -33,7 +33,8 @@ __all__ = ["Calibrate", "CalibrateReport", "calibrate", "calibrate_or_write_para
 class Calibrate(CalibrateSettings):
     """Find the simulator parameters that explain a recording.
 
-    Of a robot that deal-hw drives:  deal-hw calibrate runs/first/dataset
+    Of a dataset, of a robot that deal-hw drives or that the dataset carries:
+    deal-hw calibrate runs/first/dataset
 
     Of any robot, from its MuJoCo model and recordings of joint positions and commands:
     deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine    (docs/tutorials/your-robot.md)
@@ -73,8 +74,10 @@ def calibrate_or_write_parameters(config: Calibrate) -> CalibrateReport | int:
         DealHwError: A setting, a recording or the data are unusable; nothing long was begun.
     """
     if config.recordings.write_parameters is not None:
-        path = write_parameters(config.recordings)
-        again = f"deal-hw calibrate --model {config.recordings.model} --parameters {path} --data ..."
+        path = write_parameters(config.recordings, config.dataset)
+        model = config.recordings.model
+        source = str(config.dataset) if model is None else f"--model {model} --data ..."
+        again = f"deal-hw calibrate {source} --parameters {path}"
         print(f"written: {path}; edit it, then: {again}")
         return 0
     return calibrate(config)

@@ -20,6 +20,7 @@ from deal_hw.workflows.import_export import (
     export_recordings,
     import_recordings,
 )
+from deal_hw.workflows.robot import carried_problems, carries_robot
 from deal_hw.workflows.say import aloud
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
         print(f"{config.out}: {count} LeRobot episodes of {robot}")
         return EXIT_OK
     reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))
+    errors += carried_problems(config.path)
     if config.json:
         values = [{**asdict(report), "sound": report.sound} for report in reports]
         print(json.dumps({"files": values, "errors": errors}, indent=2, default=str))
@@ -163,6 +165,7 @@ def _info(config: InfoSettings) -> int:
             "folder": str(dataset.folder),
             "robot": dataset.description["name"],
             "digest": dataset.digest,
+            "carries_robot": carries_robot(dataset.folder),
             "episodes": [asdict(episode) for episode in dataset.episodes],
             "notes": notes,
         }
@@ -171,6 +174,10 @@ def _info(config: InfoSettings) -> int:
     for note in notes:
         console.print(note, style="yellow", markup=False)
     console.print(_dataset_table(dataset))
+    if carries_robot(dataset.folder):
+        console.print(f"it carries its robot: {dataset.folder / 'robot' / 'robot.yaml'}", markup=False)
+    for problem in carried_problems(dataset.folder):
+        console.print(problem, style="red", markup=False)
     for episode in dataset.episodes:
         _print_problems(console, episode)
     return EXIT_OK

@@ -137,6 +137,12 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             example="keys make --out keys --robot 192.168.1.20",
             extra="keys",
         ),
+        "robot": _verb(
+            "robot",
+            help="describe a robot of your own by its MJCF (robot.yaml), and check that",
+            example="robot new robot.xml",
+            extra="sim",
+        ),
         "data": _verb(
             "data",
             help="tell about a dataset, verify it, repair it, import and export recordings",

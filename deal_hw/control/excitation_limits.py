@@ -33,6 +33,12 @@ def room(description: RobotDescription) -> FloatArray:
     found = np.maximum(np.minimum(around - low, high - around), 0.0)
     # While a joint does not follow at all, the set-point may be off by the offset.
     found = MARGIN * np.minimum(found, np.array(description.limits.target_distance))
+    if not np.isfinite(found).all():
+        endless = [n for n, width in zip(description.actuated, found, strict=True) if not np.isfinite(width)]
+        raise ConfigurationError(
+            f"how far {', '.join(endless)} of {description.name!r} may go is not known; write its "
+            "position_range into robot.yaml"
+        )
     if not np.any(found > 0):
         raise ConfigurationError(
             f"no joint of {description.name!r} has room around its centre {around.tolist()} within the "

@@ -101,10 +101,13 @@ class SafetyFilter:
         self._effort = None if legs is None else np.asarray(legs.effort)
 
     def accepts(self, command: JointCommand) -> bool:
-        """Return whether every number is finite, but for the speed limit of a robot that has none."""
-        speed = command.speed_limit
-        none = speed == self._maxima["speed_limit"]
-        return is_finite(dataclasses.replace(command, speed_limit=np.where(none, 0.0, speed)))
+        """Return whether every number is finite, but for limits of speed and effort that a robot lacks."""
+        limited = {
+            name: np.where(sent == self._maxima[name], 0.0, sent)
+            for name in ("speed_limit", "effort_limit")
+            for sent in [getattr(command, name)]
+        }
+        return is_finite(dataclasses.replace(command, **limited))
 
     def clip(
         self, wanted: JointCommand, previous: FloatArray, measured: FloatArray, velocity: FloatArray

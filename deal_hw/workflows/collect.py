@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,6 +15,12 @@ from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settin
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import RunOptions, plan_options
+from deal_hw.workflows.running.simulated import (
+    SimulationOptions,
+    check_simulation,
+    require_driver,
+    run_simulated,
+)
 from deal_hw.workflows.running.supervised import dataset_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.shipped import shipped_policy
@@ -29,11 +36,19 @@ class CollectSettings(RunOptions):
     """Settings of :func:`collect`."""
 
     robot: str = field(kw_only=False)
-    """The robot, such as cartpole."""
+    """The robot, such as cartpole; with --simulated a robot.yaml, or a dataset that carries its robot."""
+
+    port: str = ""
+    """Where the robot is: a serial port such as /dev/ttyUSB0, a CAN bus such as can0 or
+    slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
+    tcp/127.0.0.1:7447 (zenoh)."""
+
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    """A robot of your own, in simulation."""
 
     profile: Literal["rich", "chirp", "balance", "hold"] = "rich"
-    """rich: balance, then random set-points; chirp: a sine sweep (for held-out data); balance: the policy all
-    the time; hold: the start pose."""
+    """rich: balance, then random set-points (with --simulated these alone, with the robot's own gains);
+    chirp: a sine sweep (for held-out data); balance: the policy all the time; hold: the start pose."""
 
     excite: str = ""
     """Play this instead of a profile: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
@@ -84,6 +99,9 @@ def collect(settings: CollectSettings) -> RunReport:
 def run(config: CollectSettings, view: RunView) -> RunReport:
     """Record episodes, as :func:`collect`, and show them."""
     _refuse_ignored(config)
+    if config.simulation.simulated:
+        return _rehearse(config, view)
+    require_driver(config.robot, config.port)
     policy = config.policy or shipped_policy(config.robot)
     excite, seconds = _excitation(config, view)
     if seconds * config.episodes < SHORT_S:
@@ -113,6 +131,32 @@ def run(config: CollectSettings, view: RunView) -> RunReport:
     )
 
 
+def _rehearse(config: CollectSettings, view: RunView) -> RunReport:
+    """Record a user's robot in simulation."""
+    folder = dataset_folder(config.out, config.dataset)
+    excite, seconds = _excitation(config, view)
+    plan = RunPlan(
+        robot=config.robot,
+        profile="excite" if excite else config.profile,
+        policy=str(config.policy or ""),
+        seconds=seconds,
+        seed=config.seed,
+        rich=dataclasses.replace(config.rich, balance_s=0.0, segments=()),
+        excitation_level=config.excitation_level,
+        excite=excite,
+    )
+    return run_simulated(
+        plan,
+        config.robot,
+        config.simulation,
+        dataset=folder,
+        episodes=config.episodes,
+        purpose="collect",
+        view=view,
+        attempts=config.attempts,
+    )
+
+
 def _refuse_ignored(config: CollectSettings) -> None:
     """Refuse options that the motion would ignore.
 
@@ -120,6 +164,9 @@ def _refuse_ignored(config: CollectSettings) -> None:
         ConfigurationError: There is one.
     """
     default = CollectSettings(robot=config.robot, port=config.port)
+    check_simulation(config, default)
+    if config.simulation.simulated:
+        refuse(given(config, default, ["policy"]), "--simulated runs no policy")
     if config.excite:
         refuse(given(config, default, ["profile"]), "--excite plays its own motion; leave one of the two out")
     if config.excite or config.profile != "rich":

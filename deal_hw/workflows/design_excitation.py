@@ -18,7 +18,6 @@ from deal_hw.control.excitation_plan import (
     make_plan,
 )
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterDistribution, ParameterSpace
 from deal_hw.workflows.options import (
@@ -32,6 +31,7 @@ from deal_hw.workflows.options import (
     given,
     refuse,
 )
+from deal_hw.workflows.robot import described, described_spaces
 from deal_hw.workflows.shipped import balancer
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class ExcitationSettings:
     """Settings of :func:`design_excitation`."""
 
     robot: str = field(kw_only=False)
-    """The robot, such as cartpole."""
+    """The robot, such as cartpole; or a robot.yaml, or a dataset that carries its robot."""
 
     out: File
     """File to write, FILE.json; `deal-hw collect --excite FILE.json` plays it."""
@@ -172,7 +172,7 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
             given(config, default, SEARCH),
             f"--family {config.family} is not searched; use --family optimal",
         )
-    description = recorded_description(config.robot)
+    description = described(config.robot)
     most_hz = description.control_rate_hz / 2
     if config.family in ("multisine", "chirp", "sway") and config.high_hz > most_hz:
         raise ConfigurationError(
@@ -322,7 +322,7 @@ def _knowledge(config: ExcitationSettings) -> ParameterDistribution:
 
         path = Path(config.calibration)
         return read_distribution(path / "distribution.json" if path.is_dir() else path)
-    table = parameter_spaces(config.robot)
+    table = described_spaces(config.robot)
     name = config.space or next(iter(table))
     if name not in table:
         raise UnknownNameError("parameter set", name, table)

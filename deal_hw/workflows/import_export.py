@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
+from deal_hw.workflows.calibration.recordings import on_grid
 from deal_hw.workflows.options import Checked, Range, given, refuse
+from deal_hw.workflows.robot import load_robot
+from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -31,7 +34,10 @@ class ImportSettings(Checked):
     columns: Path | None = None
     """A column map (YAML); without it the meaning of the channels is guessed from their names and said."""
     model: Path | None = None
-    """The robot's MJCF: joint names, order and limits come from it."""
+    """The robot's MJCF: joint names, order and limits come from it, and the dataset keeps it."""
+    robot: Path | None = None
+    """Instead of --model a robot.yaml (`deal-hw robot new`), which the dataset keeps with its MJCF: later
+    verbs know the robot from it."""
     description: Path | None = None
     """A robot description (JSON, as in dataset.json) to use instead of a minimal one."""
     name: str = ""
@@ -78,14 +84,18 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.importing.store import minimal_description, write_dataset
     from deal_hw.data.importing.table import table_of
 
-    if config.description is not None:
-        default = ImportSettings(paths=config.paths, out=config.out)
-        refuse(given(config, default, ("name", "device_periods")), "--description says it")
+    _refuse_ignored(config)
     columns = None if config.columns is None else read_column_map(config.columns)
-    facts = _joint_facts(config.model, say)
+    robot = None if config.robot is None else load_robot(config.robot)
+    facts = _joint_facts(config.model if robot is None else robot.mjcf, say)
     described = None if config.description is None else _description(config.description)
-    joints = described["joint_names"] if described is not None else None if facts is None else facts.names
-    episodes, foreign = ([], list(config.paths)) if columns or described else _as_recorded(config, facts, say)
+    joints = None if facts is None else facts.names
+    if robot is not None:
+        joints = robot.joint_names
+    elif described is not None:
+        joints = described["joint_names"]
+    told = columns is not None or described is not None or facts is not None
+    episodes, foreign = ([], list(config.paths)) if told else _as_recorded(config, say)
     tables = [table for path in foreign for table in load_tables(path, columns, joints, say)]
     checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
     if episodes:
@@ -99,8 +109,15 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         ]
         for table in checked
     }
+    if robot is None and described is None and config.model is not None:
+        robot = derived_robot(config.model, config.name, tables, say)
     period = common_period(checked)
-    recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
+    if robot is None:
+        recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
+    else:
+        simulated, rates = at_recorded_rates(robot, tables, config.device_periods)
+        recordings = [part for table in tables for part in on_grid(table, simulated, rates)]
+        described = simulated.description.to_json()
     for part in recordings:
         how = part.trajectory.metadata["import"]
         stretch = f", stretch {how['stretch'] + 1} of {how['stretches']}" if how["stretches"] > 1 else ""
@@ -118,18 +135,19 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         mjcf=config.model,
         rates_per_sample=config.device_periods,
     )
+    if robot is not None:
+        from deal_hw.data.recording.dataset import Dataset
+        from deal_hw.sim.robots.carried import carry
+
+        with Dataset.create_or_open(config.out, values, say):
+            carry(robot, config.out)
     return write_dataset(
         config.out, recordings, values, {"plausibility": problems}, say, [e.path for e in episodes]
     )
 
 
-def _as_recorded(
-    config: ImportSettings, facts: JointFacts | None, say: Say
-) -> tuple[list[Episode], list[Path]]:
-    """Return the episodes of ours, which are copied as they are, and the files that are to be interpreted.
-
-    Those whose joints the model does not have are interpreted, too: a column map can name them.
-    """
+def _as_recorded(config: ImportSettings, say: Say) -> tuple[list[Episode], list[Path]]:
+    """Return the episodes of ours, which are copied as they are, and the files that are to be interpreted."""
     from deal_hw.data.importing.load import own_episodes
     from deal_hw.data.recording.reader import read_episode
 
@@ -137,10 +155,8 @@ def _as_recorded(
     foreign: list[Path] = []
     for path in config.paths:
         episodes = [read_episode(episode) for episode in own_episodes(path, say)]
-        names = {name for episode in episodes for name in episode.trajectory.joint_names}
-        if episodes and (facts is None or names <= set(facts.names)):
-            found += episodes
-        else:
+        found += episodes
+        if not episodes:
             foreign.append(path)
     for episode in found:
         if episode.description != found[0].description:
@@ -151,6 +167,20 @@ def _as_recorded(
         default = ImportSettings(paths=config.paths, out=config.out)
         refuse(given(config, default, ("name", "device_periods")), "the episodes' own description says it")
     return found, foreign
+
+
+def _refuse_ignored(config: ImportSettings) -> None:
+    """Refuse options that another one makes needless.
+
+    Raises:
+        ConfigurationError: There is one.
+    """
+    default = ImportSettings(paths=config.paths, out=config.out)
+    if config.robot is not None:
+        names = ("model", "description", "name", "device_periods")
+        refuse(given(config, default, names), "--robot says it")
+    if config.description is not None:
+        refuse(given(config, default, ("name", "device_periods")), "--description says it")
 
 
 def _takes_positions(facts: JointFacts | None, table: Table) -> bool:

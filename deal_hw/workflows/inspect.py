@@ -12,11 +12,11 @@ from typing import Annotated, Protocol
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
-from deal_hw.drivers import recorded_description
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.sim.recordings.overlay import DEFAULT_WINDOW_S, Overlay, compute_overlay
 from deal_hw.workflows.options import Checked, File, Range, from_settings
+from deal_hw.workflows.robot import recorded_robot
 from deal_hw.workflows.say import html_table
 
 
@@ -180,7 +180,7 @@ def inspect(settings: InspectSettings) -> Inspection:
 
 def predicted(settings: InspectSettings, path: Path, episode: Episode) -> Inspection:
     """Return a recording with predictions; see :func:`inspect`."""
-    description = recorded_description(str(episode.description["name"]))
+    description = recorded_robot(episode.description, path.resolve().parent.parent)
     result = _result(settings.calibration)
     overlay, note = _overlay(settings, episode, description, result)
     return Inspection(

@@ -8,10 +8,19 @@ from pathlib import Path
 from deal_hw.control.behaviours import ReplayBehaviour
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.drivers import driver_description
+from deal_hw.errors import ConfigurationError
+from deal_hw.types import Trajectory
 from deal_hw.workflows.options import File, from_settings
+from deal_hw.workflows.robot import carries_robot, user_robot
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import RunOptions, plan_options, refuse_unrecorded
+from deal_hw.workflows.running.simulated import (
+    SimulationOptions,
+    check_simulation,
+    require_driver,
+    run_simulated,
+)
 from deal_hw.workflows.running.supervised import recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
 
@@ -26,8 +35,14 @@ class ReplaySettings(RunOptions):
     robot: str = ""
     """The robot; by default the one that was recorded."""
 
+    port: str = ""
+    """Where the robot is, as for `deal-hw collect`."""
+
     record: bool = True
     """Record what happens; --no-record where nothing is to be kept."""
+
+    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    """A robot of your own, in simulation: by default the one that the episode's dataset carries."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,9 +70,14 @@ def replay(settings: ReplaySettings) -> RunReport:
 
 def run(config: ReplaySettings, view: RunView) -> RunReport:
     """Replay a recording, as :func:`replay`, and show it."""
-    path = Path(config.episode)
-    trajectory = read_trajectory(path)
-    robot = config.robot or str(trajectory.metadata.get("robot", ""))
+    check_simulation(config, ReplaySettings(config.episode))
+    path, trajectory = Path(config.episode), read_trajectory(Path(config.episode))
+    dataset = path.resolve().parent.parent
+    recorded = str(dataset) if carries_robot(dataset) else str(trajectory.metadata.get("robot", ""))
+    robot = config.robot or recorded
+    if config.simulation.simulated:
+        return _rehearse(config, view, robot, trajectory)
+    require_driver(robot, config.port)
     behaviour = ReplayBehaviour(trajectory, driver_description(robot))
     plan = RunPlan(
         **plan_options(robot, config.link, config.legs, walks=False),
@@ -72,4 +92,18 @@ def run(config: ReplaySettings, view: RunView) -> RunReport:
         episodes=1,
         purpose="replay",
         view=view,
+    )
+
+
+def _rehearse(config: ReplaySettings, view: RunView, robot: str, trajectory: Trajectory) -> RunReport:
+    """Replay on a user's robot in simulation."""
+    path = Path(config.episode).resolve()
+    description = user_robot(robot).description()
+    behaviour = ReplayBehaviour(trajectory, description)
+    folder = recording_folder(config.out, config.dataset, "replay", description.name, record=config.record)
+    if folder is None:
+        raise ConfigurationError("--no-record: a rehearsal is there to be recorded; leave the option out")
+    plan = RunPlan(robot=robot, profile="replay", recording=str(path), seconds=behaviour.duration_s)
+    return run_simulated(
+        plan, robot, config.simulation, dataset=folder, episodes=1, purpose="replay", view=view
     )

@@ -18,6 +18,7 @@ from deal_hw.policy import VERDICT
 from deal_hw.reading import read_json, reading
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.workflows.options import Checked, File, Range, Seed, from_settings
+from deal_hw.workflows.robot import described, is_user_robot
 from deal_hw.workflows.say import html_table, text_table
 
 if TYPE_CHECKING:
@@ -49,7 +50,11 @@ class TrainSettings(Checked):
     """Settings of :func:`train`."""
 
     robot: str = field(default="cartpole", kw_only=False)
-    """The robot."""
+    """The robot; with --env a robot.yaml, or a dataset that carries its robot."""
+
+    env: str = ""
+    """A Gymnasium environment of your own, module:ENV_ID, for a robot that is a robot.yaml or a dataset that
+    carries one (docs/how-to/training.md). Parameters are drawn into its MuJoCo model at every reset."""
 
     distribution: File | ParameterDistribution | Calibrated | None = None
     """distribution.json of a calibration: parameters, their uncertainty, latency. From Python also a
@@ -196,6 +201,7 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
             progress=follow,
             files=files,
             verdict=verdict,
+            env=config.env,
         )
     training = Training(
         policy=policy,
@@ -221,6 +227,7 @@ def train_policy(
     progress: TrainingProgress | None = None,
     files: TrainingFiles | None = None,
     verdict: str = "",
+    env: str = "",
 ) -> OnnxPolicy:
     """Train a policy and write it with its training record.
 
@@ -235,6 +242,7 @@ def train_policy(
         progress: Called as the training goes on.
         files: Checkpoint, TensorBoard files, and the word to stop.
         verdict: Colour of the calibration that the distribution is of; "" where it is of none.
+        env: Environment of a user, module:ENV_ID; "" for the robot's own task.
 
     Returns:
         The policy, read back from its file.
@@ -242,13 +250,13 @@ def train_policy(
     import dataclasses
     import inspect
 
-    from deal_hw.drivers import recorded_description
     from deal_hw.policies.onnx_export import export_network
-    from deal_hw.policies.tasks import training_task
+    from deal_hw.policies.tasks import OWN_TASK, training_task
 
-    task = training_task(robot)
+    task = OWN_TASK if env else training_task(robot)
     teacher, config = task.trainer_and_config(trainer, steps)
-    env = task.make(recorded_description(robot), distribution, members or task.members[teacher.name])
+    own = (env,) if env else ()
+    world = task.make(*own, described(robot), distribution, members or task.members[teacher.name])
     # Where it cannot be written that is known now and not after the training.
     path.parent.mkdir(parents=True, exist_ok=True)
     started, cpu = time.monotonic(), time.process_time()
@@ -260,14 +268,14 @@ def train_policy(
             progress(status)
 
     spent = _spent(path.with_suffix(".json")) if files is not None and files.resume else {}
-    policy = teacher.train(env, config, np.random.default_rng(seed), follow, files)
+    policy = teacher.train(world, config, np.random.default_rng(seed), follow, files)
     record = {
         "format": "deal_hw.training/1",
-        "robot": robot,
+        "robot": policy.spec.robot,
         "seed": seed,
         "training": dict(policy.spec.training),
-        "task": dataclasses.asdict(env.task),
-        "reward": inspect.cleandoc(type(env).__doc__ or "").partition("\n\nArgs:")[0],
+        "task": dataclasses.asdict(world.task),
+        "reward": inspect.cleandoc(type(world).__doc__ or "").partition("\n\nArgs:")[0],
         "distribution": distribution.to_json(),
         "distribution_digest": distribution.digest(),
         "spec_digest": policy.spec.digest(),
@@ -307,6 +315,18 @@ def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
             "say under what to train: --distribution FILE (`deal-hw calibrate` writes it), --udr or --nominal"
         )
     source = config.distribution
+    if config.env:
+        if config.udr:
+            raise ConfigurationError(
+                "--env takes --distribution or --nominal, not --udr: what ranges would hold?"
+            )
+        if not is_user_robot(config.robot):
+            raise ConfigurationError(
+                f"--env needs a robot.yaml (`deal-hw robot new robot.xml`) or a dataset that carries its "
+                f"robot, not {config.robot!r}"
+            )
+        if source is None:
+            return ParameterDistribution.point(ParameterSpace([]), np.empty(0), 0.0), ""
     if source is None:
         return udr_distribution(config.robot) if config.udr else nominal_distribution(config.robot), ""
     if isinstance(source, ParameterDistribution):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.bench import Bench, bench
+from deal_hw.cli.main import main
 from deal_hw.errors import ConfigurationError
 from deal_hw.workflows.calibration.model import Recordings
 
@@ -76,6 +77,19 @@ def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
     assert fitted["heldout_rmse_calibrated"] < 0.2 * fitted["heldout_rmse_nominal"]
     assert fitted["at_bound"] == [] and fitted["refined"]
     assert next(iter(fitted["estimate"].values())) == pytest.approx(0.4, rel=0.05)
+
+
+def test_a_dataset_that_carries_its_robot(hinge: Recordings, tmp_path: Path) -> None:
+    """The rows are of its robot, and of the episodes that are fitted and held out."""
+    dataset = tmp_path / "dataset"
+    line = ["data", "import", str(hinge.data[0]), str(hinge.data[0]), "--model", str(hinge.model)]
+    assert main([*line, "--out", str(dataset)]) == 0
+    out = tmp_path / "real.json"
+    words = ["--dataset", str(dataset), "--holdout", "1", "--methods", "nominal", "--seeds", "0", "--quiet"]
+    assert main(["bench", "real", *words, "--heldout-window", "0.5", "--out", str(out)]) == 0
+    (row,) = json.loads(out.read_text())["rows"]
+    assert (row["task"], row["split"], row["error"]) == ("hinge", "1", "")
+    assert row["heldout_rmse_nominal"] > 0
 
 
 def test_recordings_must_be_named(tmp_path: Path) -> None:

@@ -67,6 +67,8 @@ FINE_AT_ZERO = {
     "servo_reboot_after_s",
     "servo_overload_after_s",
     "servo_absent_after_s",
+    "truth_seed",
+    "truth_latency",
 }
 FINE_BELOW_ZERO = {"excitation_level", "known", "range", "push"}
 REQUIRED: dict[str, Any] = {
@@ -80,6 +82,7 @@ REQUIRED: dict[str, Any] = {
     "dataset": Path("d"),
     "folder": Path("f"),
     "name": "n",
+    "model": Path("m"),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -323,14 +324,17 @@ def test_robots_without_legs_know_no_predicted_effort() -> None:
         (math.inf, math.nan, False),
     ],
 )
-def test_a_speed_limit_may_be_infinite_where_the_robot_has_none(
-    limit: float, value: float, accepted: bool
+@pytest.mark.parametrize("field", ["speed", "effort"])
+def test_limits_of_speed_and_effort_may_be_infinite_where_the_robot_has_none(
+    field: str, limit: float, value: float, accepted: bool
 ) -> None:
-    """A robot without set-point generator says so with an infinite limit, and so do its commands."""
-    limits = dataclasses.replace(DESCRIPTION.limits, speed=(limit,))
+    """A robot without set-point generator, or without a force limit, says so, and so do its commands."""
+    changed: dict[str, Any] = {field: (limit,)}
+    limits = dataclasses.replace(DESCRIPTION.limits, **changed)
     gate = SafetyFilter(dataclasses.replace(DESCRIPTION, limits=limits))
-    assert gate.accepts(command(speed_limit=value)) is accepted
-    assert is_finite(command(speed_limit=value)) is math.isfinite(value)
+    asked = command(**{f"{field}_limit": value})
+    assert gate.accepts(asked) is accepted
+    assert is_finite(asked) is math.isfinite(value)
 
 
 @pytest.mark.parametrize(

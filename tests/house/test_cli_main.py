@@ -93,7 +93,8 @@ def test_unknown_verb_lists_the_verbs_and_the_nearest(capsys: pytest.CaptureFixt
     assert out == ""
     assert err == (
         "deal-hw: error: unknown verb 'calibrat'; known: collect, calibrate, train, deploy, inspect, demo, "
-        "design-excitation, emulate, bridge, keys, data, replay, doctor, bench; did you mean 'calibrate'?\n"
+        "design-excitation, emulate, bridge, keys, robot, data, replay, doctor, bench; "
+        "did you mean 'calibrate'?\n"
     )
 
 

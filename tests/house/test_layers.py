@@ -59,7 +59,7 @@ ROOMS = {
         {"fake", "unitree_mujoco"},
     ),
     "data": ({"files"}, {"recording", "run_folder"}, {"importing"}, {"checks", "export"}),
-    "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings"}),
+    "sim": ({"parameters"}, {"engine"}, {"legged", "mjcf"}, {"recordings", "robots"}),
 }
 """Rooms of a package, the lowest first: a room may import rooms of the sets before its own, and itself."""
 

@@ -18,6 +18,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCRIPTS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "calibrate_from_arrays": ([], ("shoulder", "calibrated.xml")),
     "cartpole_loop": (["--steps", "2500"], ("cart.mass", "deployed: ", "truth")),
+    "make_crane": (["crane"], ("crane/crane.xml", "crane/other.csv")),
     "compare_models": ([], ("nominal: position error", "calibrated: position error", "compare.rrd")),
 }
 """Script -> arguments, and what it must have told at its end."""
@@ -62,6 +63,7 @@ def test_a_script_runs(
     arguments, words = SCRIPTS[name]
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
     run(EXAMPLES / f"{name}.py")
     told = capsys.readouterr().out
     assert all(word in told for word in words), told

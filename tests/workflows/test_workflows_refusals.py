@@ -16,7 +16,10 @@ from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.workflows.emulation.process import arguments
 from deal_hw.workflows.options import option
 
-POSITIONAL = ("robot", "episode")
+POSITIONAL = ("robot", "episode", "model")
+LINES = {"new_robot": ["robot", "new"], "check_robot": ["robot", "check"]}
+"""Functions that are part of a verb."""
+REHEARSAL = deal_hw.SimulationOptions(simulated=True)
 CARTPOLE: dict[str, Any] = {"robot": "cartpole", "port": "no-port"}
 COLLECT = {**CARTPOLE, "out": "out"}
 SWEEP = {"robot": "cartpole", "out": "e.json"}
@@ -40,6 +43,26 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("collect", CARTPOLE, "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
     ("collect", {**COLLECT, "dataset": "d"}, "give --out RUN or --dataset DIR, not both"),
     ("collect", COLLECT, "no-port"),
+    ("collect", {"robot": "cartpole", "out": "out"}, "say where the robot is: --port"),
+    (
+        "collect",
+        {**COLLECT, "simulation": REHEARSAL},
+        "--port would have no effect: --simulated needs no wire",
+    ),
+    (
+        "collect",
+        {"robot": "cartpole", "out": "out", "simulation": REHEARSAL},
+        "--simulated takes a robot.yaml (`deal-hw robot new robot.xml` writes one), not 'cartpole'",
+    ),
+    (
+        "collect",
+        {**COLLECT, "simulation": deal_hw.SimulationOptions(truth_seed=3)},
+        "--truth-seed would have no effect: only with --simulated",
+    ),
+    ("collect", {"robot": "r.yaml", "out": "out"}, "a robot of your own has no driver here"),
+    ("new_robot", {"model": "m.xml"}, "model m.xml does not exist"),
+    ("new_robot", {"model": "m.xml", "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 0.001 to"),
+    ("check_robot", {"robot": "r.yaml"}, "r.yaml cannot be read: there is no such file"),
     ("deploy", {**CARTPOLE, "robot": "so101"}, "so101"),
     ("deploy", {**CARTPOLE, "policy": "none.onnx"}, "none.onnx"),
     ("deploy", {**CARTPOLE, "episodes": 0}, "--episodes 0: allowed are 1 to 10000"),
@@ -49,6 +72,8 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("train", {"udr": True, "nominal": True}, "--udr and --nominal exclude each other"),
     ("train", {"robot": "go3", "udr": True}, "unknown robot with a training environment 'go3'; known: ant"),
     ("train", {"udr": True, "trainer": "dqn"}, "dqn"),
+    ("train", {"robot": "cartpole", "env": "a:B-v0", "nominal": True}, "--env needs a robot.yaml"),
+    ("train", {"robot": "r.yaml", "env": "a:B-v0", "udr": True}, "--env takes --distribution or --nominal"),
     ("train", {"udr": True, "steps": 0}, "--steps 0: allowed are 1 to"),
     ("train", {"distribution": "none.json"}, "none.json cannot be read"),
     (
@@ -164,7 +189,7 @@ CALIBRATE: list[tuple[dict[str, Any], str, str]] = [
 
 def as_words(verb: str, given: dict[str, Any]) -> list[str]:
     """Return the command line that says the same as arguments in Python."""
-    words = [verb.replace("_", "-")]
+    words = list(LINES.get(verb, [verb.replace("_", "-")]))
     for name, value in given.items():
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             words += arguments(value, type(value)())
@@ -210,7 +235,7 @@ def test_a_function_takes_the_options_of_its_verb(verb: str) -> None:
     function = getattr(deal_hw, verb)
     names = set(inspect.signature(function).parameters)
     assert names >= {name for row, given, _ in TABLE if row == verb for name in given}
-    assert f"deal-hw {verb.replace('_', '-')}" in function.__doc__
+    assert f"deal-hw {' '.join(as_words(verb, {}))}" in function.__doc__
     with pytest.raises(UnknownNameError, match=f"unknown argument of {verb} 'nosuch'; known: "):
         function(nosuch=1)
 

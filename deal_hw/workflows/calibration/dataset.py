@@ -9,18 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.methods import CLOSED_LOOP_METHODS
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
-from deal_hw.drivers import parameter_spaces, recorded_description
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import parameter_spaces
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 from deal_hw.workflows.calibration.policy import recorded_policy
 from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
 from deal_hw.workflows.calibration.walking import all_walk, weighed, while_walking
+from deal_hw.workflows.robot import recorded_robot
 from deal_hw.workflows.say import Say, silent
 from deal_hw.workflows.shipped import balancer
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.data.recording.telemetry_checks import CheckResult
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
 
@@ -66,31 +69,21 @@ def prepare_dataset(
         DealHwError: A setting or a recording is unusable.
     """
     from deal_hw.data.recording.dataset import Dataset
-    from deal_hw.data.recording.spikes import without_spikes
-    from deal_hw.data.recording.telemetry_checks import Severity, check
 
     dataset = Dataset.open(source.folder)
     robot_name = dataset.description["name"]
+    description = recorded_robot(dataset.description, source.folder)
     fit, holdout = choose_episodes(dataset, source.episodes, source.holdout, say)
     space = overrides.apply(named_space(robot_name, space_name))
     episodes_read = {i: dataset.read(i) for i in (*fit, *holdout)}
     policy = None
     if method in CLOSED_LOOP_METHODS:
         runs = {i: episodes_read[i].metadata for i in fit}
-        policy = recorded_policy(dataset, runs, recorded_description(robot_name), source.policy)
-    recordings = {i: episode.trajectory for i, episode in episodes_read.items()}
-    verdicts = {index: check(trajectory, source.spikes) for index, trajectory in recordings.items()}
-    for index, found in verdicts.items():
-        failed = [v.message for v in found if v.severity is Severity.FAIL]
-        if failed:
-            raise InsufficientDataError(
-                f"episode {index} of {source.folder} cannot be used: {'; '.join(failed)}; "
-                "record again with `deal-hw collect`"
-            )
-        for jump in [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN][:1]:
-            say(f"episode {index}: {jump}")
-    recordings = {i: without_spikes(trajectory, source.spikes) for i, trajectory in recordings.items()}
-    robot, episodes = _simulation(dataset, recordings, source.sample_hz)
+        policy = recorded_policy(dataset, runs, description, source.policy)
+    recordings, verdicts = sound_recordings(
+        {i: episode.trajectory for i, episode in episodes_read.items()}, source.folder, source.spikes, say
+    )
+    robot, episodes = _simulation(description, recordings, source.sample_hz)
     walks = all_walk(robot, recordings.values())
     if walks:
         space = weighed(space, robot, recordings[fit[0]], say)
@@ -113,6 +106,39 @@ def prepare_dataset(
         policy=policy,
         walks=walks,
     )
+
+
+def sound_recordings(
+    trajectories: Mapping[int, Trajectory], folder: Path, spikes: SpikeSettings, say: Say
+) -> tuple[dict[int, Trajectory], dict[int, tuple[CheckResult, ...]]]:
+    """Check episodes of a dataset and leave out their spikes.
+
+    Args:
+        trajectories: By number.
+        folder: The dataset, for messages.
+        spikes: What counts as a spike.
+        say: Called with a sentence on each spike.
+
+    Returns:
+        The episodes without spikes, and what the checks found, by number.
+
+    Raises:
+        InsufficientDataError: An episode cannot be used.
+    """
+    from deal_hw.data.recording.spikes import without_spikes
+    from deal_hw.data.recording.telemetry_checks import Severity, check
+
+    verdicts = {index: check(trajectory, spikes) for index, trajectory in trajectories.items()}
+    for index, found in verdicts.items():
+        failed = [v.message for v in found if v.severity is Severity.FAIL]
+        if failed:
+            raise InsufficientDataError(
+                f"episode {index} of {folder} cannot be used: {'; '.join(failed)}; "
+                "record again with `deal-hw collect`"
+            )
+        for jump in [v.message for v in found if v.name == "spikes" and v.severity is Severity.WARN][:1]:
+            say(f"episode {index}: {jump}")
+    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, verdicts
 
 
 def named_space(robot: str, name: str = "") -> ParameterSpace:
@@ -164,7 +190,7 @@ def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
 
 
 def _simulation(
-    dataset: Dataset, recordings: Mapping[int, Trajectory], sample_hz: float | None
+    description: RobotDescription, recordings: Mapping[int, Trajectory], sample_hz: float | None
 ) -> tuple[RobotModel, dict[int, SampledEpisode]]:
     try:
         from deal_hw.sim.engine.model import load_model
@@ -173,7 +199,7 @@ def _simulation(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
-    robot = load_model(recorded_description(dataset.description["name"]))
+    robot = load_model(description)
     episodes = {}
     for i, trajectory in recordings.items():
         episodes[i] = align(trajectory, robot.description)

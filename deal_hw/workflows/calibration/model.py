@@ -30,11 +30,13 @@ from deal_hw.workflows.calibration.recordings import (
     without,
 )
 from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
-from deal_hw.workflows.options import Checked, Range
+from deal_hw.workflows.options import Checked, File, Range
+from deal_hw.workflows.robot import carries_robot, recorded_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 HELDOUT_PART = 0.25
 DEFAULT = "default"
@@ -87,21 +89,31 @@ class Recordings(Checked):
     """Use recordings although a plausibility check failed."""
 
 
-def write_parameters(config: Recordings) -> Path:
+def write_parameters(config: Recordings, dataset: File | None = None) -> Path:
     """Write a commented parameter file for a model and return its path.
+
+    Args:
+        config: Names the file, and the model.
+        dataset: Carries the robot where no model is named.
 
     Raises:
         ConfigurationError: There is no model, or the file exists.
     """
-    path = config.write_parameters
-    if config.model is None or path is None:
-        raise ConfigurationError("--write-parameters needs --model robot.xml")
+    path, model = config.write_parameters, config.model
+    if model is None and carries_robot(dataset):
+        from deal_hw.data.recording.dataset import Dataset
+
+        model = recorded_robot(Dataset.open(Path(str(dataset))).description, Path(str(dataset))).mjcf
+    if model is None or path is None:
+        raise ConfigurationError(
+            "--write-parameters needs --model robot.xml, or a dataset that carries a robot"
+        )
     if path.exists():
         raise ConfigurationError(f"{path} exists; name another file, or remove it")
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.parameters.template import template
 
-    text = template(compile_mjcf(config.model), config.model.name)
+    text = template(compile_mjcf(model), model.name)
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -144,7 +156,7 @@ def prepare_model(
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
 
-    share = _holdout_share(config, holdout)
+    share = heldout_share(config, holdout)
     data = (*config.data, *data)
     if config.model is None or not data:
         raise ConfigurationError("--model needs recordings to fit: --data rec.csv [more ...]")
@@ -157,7 +169,7 @@ def prepare_model(
         )
 
     model = compile_mjcf(config.model)
-    space = _space(config, overrides, model)
+    space = searched_space(config, overrides, model)
     facts = joint_facts(config.model, model)
     columns = None if config.columns is None else read_column_map(config.columns)
     fitted, held = (
@@ -185,9 +197,9 @@ def prepare_model(
     require_base(robot, config.feet, [*fit_recordings, *held_recordings])
     episodes = [aligned(r, robot, config.feet) for r in fit_recordings]
     judge = [aligned(r, robot, config.feet) for r in held_recordings]
-    episodes, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
-    warn_of_gravity(robot, space, episodes, say)
-    require_sensitive_parameters(robot, space, episodes, std(robot), config.window, threads, say)
+    episodes, judge = parts_to_calibrate(
+        robot, space, episodes, judge, config, share=share, std=std, threads=threads, say=say
+    )
     return CalibrationInputs(
         robot=robot,
         space=space,
@@ -231,7 +243,46 @@ def method_for(work: CalibrationInputs, *, told: bool, real: bool) -> str:
     return "output-error" if real and work.robot.base is None and held else DEFAULT
 
 
-def _holdout_share(config: Recordings, holdout: Sequence[Source]) -> float:
+def parts_to_calibrate(
+    robot: RobotModel,
+    space: ParameterSpace,
+    episodes: Sequence[SampledEpisode],
+    judge: Sequence[SampledEpisode],
+    config: Recordings,
+    *,
+    share: float,
+    std: Callable[[RobotModel], FloatArray | None],
+    threads: int | None,
+    say: Say,
+) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
+    """Return what is fitted and what judges, checked against the parameters.
+
+    Args:
+        robot: The nominal model.
+        space: The parameters.
+        episodes: Recordings to fit.
+        judge: Recordings that only judge.
+        config: How recordings are used.
+        share: Share of each fitted recording, its last part, that judges as well.
+        std: What a prediction may be off.
+        threads: Simulation threads.
+        say: Called with sentences on what looks odd.
+
+    Raises:
+        InsufficientDataError: The recordings are too short, do not move, or show a parameter nowhere.
+    """
+    parts, judge = divide(episodes, judge, share, config.fit_seconds, config.window, say)
+    warn_of_gravity(robot, space, parts, say)
+    require_sensitive_parameters(robot, space, parts, std(robot), config.window, threads, say)
+    return parts, judge
+
+
+def heldout_share(config: Recordings, holdout: Sequence[object]) -> float:
+    """Return which last share of each recording only judges.
+
+    Raises:
+        ConfigurationError: Recordings to judge by are named as well.
+    """
     if holdout and config.holdout_part:
         raise ConfigurationError("give --holdout or --holdout-part, not both")
     if holdout:
@@ -240,7 +291,12 @@ def _holdout_share(config: Recordings, holdout: Sequence[Source]) -> float:
     return share
 
 
-def _space(config: Recordings, overrides: SpaceOverrides, model: Any) -> ParameterSpace:
+def searched_space(config: Recordings, overrides: SpaceOverrides, model: Any) -> ParameterSpace:
+    """Return the parameters to search of a user's model.
+
+    Raises:
+        ConfigurationError: The file of parameters, or what is changed about them, cannot be used.
+    """
     from deal_hw.sim.parameters import check_space
     from deal_hw.sim.parameters.template import template
     from deal_hw.sim.parameters.yaml_space import parse_space, read_space

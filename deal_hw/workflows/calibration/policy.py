@@ -23,7 +23,7 @@ def check_policy(method: str, *, given: bool, model: bool) -> None:
     Args:
         method: Name of the method.
         given: Whether a policy was named.
-        model: Whether the recordings are of a robot that the user's own MJCF describes.
+        model: Whether the recordings are of a robot that the user's own MJCF describes, named or carried.
 
     Raises:
         ConfigurationError: A policy would have no effect, or the method needs one that nobody knows.
@@ -33,7 +33,7 @@ def check_policy(method: str, *, given: bool, model: bool) -> None:
     elif model:
         raise ConfigurationError(
             f"--method {method} runs the policy that moved the robot, which recordings of --model do not "
-            "name; use eki, deal or deal-paper-replay"
+            "name, nor those of a dataset that carries its robot; use eki, deal or deal-paper-replay"
         )
 
 

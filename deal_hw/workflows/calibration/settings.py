@@ -15,6 +15,7 @@ from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.carried import prepare_carried
 from deal_hw.workflows.calibration.dataset import DatasetRecordings, prepare_dataset
 from deal_hw.workflows.calibration.model import DEFAULT, Recordings, method_for, prepare_model
 from deal_hw.workflows.calibration.policy import check_policy
@@ -29,6 +30,7 @@ from deal_hw.workflows.calibration.run import (
 )
 from deal_hw.workflows.calibration.walking import WALK_TELLS
 from deal_hw.workflows.options import Checked, File, Range, Ratio, Seed, Threads, given, refuse
+from deal_hw.workflows.robot import carries_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
 
 OF_DATASETS = ("episodes", "space", "sample_hz")
 """Settings that only datasets take."""
+FROM_FILES = ("data", "columns", "feet", "leave_out", "force")
+"""Settings that say how files are read, which a dataset that carries its robot has behind it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +142,12 @@ class CalibrateSettings(Checked):
         """
         check_source(dataset=self.dataset is not None, model=self.recordings.model is not None)
         if self.recordings.model is None:
-            foreign = given(self.recordings, Recordings())
+            carries = carries_robot(self.dataset)
+            foreign = given(self.recordings, Recordings(), FROM_FILES if carries else ())
+            if carries:
+                refuse(
+                    given(self, CalibrateSettings(), ("space",)), "this robot has one set; use --parameters"
+                )
             foreign += ["--data"] if data and "--data" not in foreign else []
             refuse(foreign, "a dataset says it; that goes with --model and --data")
         else:
@@ -149,7 +158,8 @@ class CalibrateSettings(Checked):
         if self.latency is not None:
             refuse(given(self, CalibrateSettings(), ("latency_range",)), "--latency says the latency")
         check_method(self.method)
-        check_policy(self.method, given=self.policy is not None, model=self.recordings.model is not None)
+        own = self.recordings.model is not None or carries_robot(self.dataset)
+        check_policy(self.method, given=self.policy is not None, model=own)
 
     @property
     def budget(self) -> Budget:
@@ -249,6 +259,15 @@ def prepare(
         sample_hz=settings.sample_hz,
         spikes=spikes,
     )
+    if carries_robot(settings.dataset):
+        return prepare_carried(
+            source,
+            settings.recordings,
+            settings.overrides,
+            std=settings.known_std,
+            threads=settings.threads,
+            say=say,
+        )
     return prepare_dataset(source, settings.space, settings.overrides, settings.method, say)
 
 
@@ -257,7 +276,8 @@ def usual_method(settings: CalibrateSettings, work: CalibrationInputs, say: Say 
     if settings.method != DEFAULT:
         return settings.method
     told = settings.residual_std not in ((), None) or not settings.refine
-    method = method_for(work, told=told, real=settings.recordings.model is not None)
+    real = settings.recordings.model is not None or carries_robot(settings.dataset)
+    method = method_for(work, told=told, real=real)
     if work.walks and not told:
         say(WALK_TELLS)
     if method != DEFAULT:

@@ -8,8 +8,10 @@ from typing import Any, Literal
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
+from deal_hw.errors import ConfigurationError
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import Checked, File, given, option, refuse
+from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.say import Say, silent
 
 
@@ -114,6 +116,10 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
         UnknownNameError: There is no such robot.
         ConfigurationError: It has a description, but no driver; or an option would be ignored.
     """
+    if is_user_robot(robot):
+        raise ConfigurationError(
+            f"{robot}: a robot of your own has no driver here; docs/how-to/add.md says how to write one"
+        )
     description = driver_description(robot)
     stands = _stands(description) if legs.stand is None else legs.stand
     if not description.rest_position:

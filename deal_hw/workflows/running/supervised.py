@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,31 +150,54 @@ def run_episodes(
     ):
         if store is not None and plan.policy_digest:
             store.keep_policy(Path(plan.policy), plan.policy_digest)
-        for number in range(episodes):
-            # The robot's own controller gets it back after the last episode only.
-            last = number == episodes - 1
-            episode = dataclasses.replace(plan, seed=plan.seed + number, hand_back=plan.hand_back and last)
-            title = f"{purpose} {plan.robot} {number + 1}/{episodes}"
-            search = ExcitationLevelSearch(plan.excitation_level, attempts, rearm=False)
-            again = True
-            while again:
-                episode = dataclasses.replace(episode, excitation_level=search.level)
-                run = EpisodeRun(
-                    episode, robot, port, store, purpose, task, len(search.attempts), claim, view.warn
-                )
-                with view.progress(title, plan.total_s) as show:
-                    reports.append(run.run(_both(show, on_beat)))
-                view.ended(reports[-1])
-                if run.signal:
-                    report = RunReport(dataset=dataset, episodes=tuple(reports))
-                    raise InterruptedRunError(report, run.signal)
-                again = _to_repeat(search, episode, reports[-1], robot.description)
-                if search.words:
-                    view.warn(f"warning: {search.words}")
-            if reports[-1].outcome is not Outcome.FINISHED:
-                break
+
+        def run_one(episode: RunPlan, number: int, attempt: int) -> EpisodeReport:
+            run = EpisodeRun(episode, robot, port, store, purpose, task, attempt, claim, view.warn)
+            with view.progress(f"{purpose} {plan.robot} {number + 1}/{episodes}", plan.total_s) as show:
+                reports.append(run.run(_both(show, on_beat)))
+            view.ended(reports[-1])
+            if run.signal:
+                report = RunReport(dataset=dataset, episodes=tuple(reports))
+                raise InterruptedRunError(report, run.signal)
+            return reports[-1]
+
+        play_episodes(plan, episodes, attempts, robot.description, view, run_one)
     reports[-1].raise_error()
     return RunReport(dataset=dataset, episodes=tuple(reports))
+
+
+def play_episodes(
+    plan: RunPlan,
+    episodes: int,
+    attempts: int,
+    description: RobotDescription,
+    view: RunView,
+    run_one: Callable[[RunPlan, int, int], EpisodeReport],
+) -> None:
+    """Run episodes, those of the profile `rich` again and stronger until they move enough.
+
+    Args:
+        plan: What to do; each episode adds its number to the seed.
+        episodes: How many; none follows one that did not finish.
+        attempts: How often one is recorded at most.
+        description: The robot.
+        view: What is told.
+        run_one: Runs an episode, of the given number (from 0) and attempt.
+    """
+    for number in range(episodes):
+        # The robot's own controller gets it back after the last episode only.
+        last = number == episodes - 1
+        episode = dataclasses.replace(plan, seed=plan.seed + number, hand_back=plan.hand_back and last)
+        search = ExcitationLevelSearch(plan.excitation_level, attempts, rearm=False)
+        again = True
+        while again:
+            episode = dataclasses.replace(episode, excitation_level=search.level)
+            report = run_one(episode, number, len(search.attempts))
+            again = _to_repeat(search, episode, report, description)
+            if search.words:
+                view.warn(f"warning: {search.words}")
+        if report.outcome is not Outcome.FINISHED:
+            break
 
 
 @contextlib.contextmanager

@@ -1,0 +1,54 @@
+"""``deal-hw robot``: describe a robot of your own, and check the description."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deal_hw.workflows.robot import CheckRobotSettings, NewRobotSettings, RobotCheck, check_robot, new_robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class New(NewRobotSettings):
+    """Write a robot.yaml with what an MJCF tells: joints, units, gains, ranges, effort limits."""
+
+    model: tyro.conf.Positional[Path]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(CheckRobotSettings):
+    """Compare a robot.yaml with its MJCF, list what is missing, and simulate a second of holding."""
+
+    robot: tyro.conf.Positional[Path]
+
+
+Robot = Annotated[New, tyro.conf.subcommand("new")] | Annotated[Check, tyro.conf.subcommand("check")]
+
+
+def robot(config: New | Check) -> int | RobotCheck:
+    """Run the verb.
+
+    Returns:
+        0, or what was found; its exit code is 1 where something does not work.
+
+    Raises:
+        ConfigurationError: A file cannot be used, or robot.yaml and MJCF contradict each other.
+    """
+    if isinstance(config, Check):
+        found = check_robot(config.robot)
+        print(found.table())
+        return found
+    path = new_robot(
+        config.model,
+        out=config.out,
+        name=config.name,
+        control_rate=config.control_rate,
+        state_rate=config.state_rate,
+        feet=config.feet,
+        several_trees=config.several_trees,
+    )
+    print(f"written: {path}; look at the rates and limits in it, then: deal-hw robot check {path}")
+    return 0

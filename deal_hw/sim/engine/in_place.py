@@ -1,0 +1,59 @@
+"""Parameters in a model that somebody else simulates, such as a Gymnasium environment of a user."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.parameters import KINDS, apply_parameters, check_space
+from deal_hw.sim.parameters.fields import ModelFields, element_id
+from deal_hw.types import FloatArray
+
+_SERVO: Final = ("servo_stiffness", "servo_damping", "servo_effort_limit")
+"""Gains and limits that the model itself holds where nobody sends others."""
+
+
+class ModelInPlace:
+    """Writes parameters into a model, again and again from its first values.
+
+    Args:
+        model: An MjModel; what it holds now is nominal.
+        space: The parameters.
+
+    Raises:
+        ConfigurationError: A parameter acts where no model can, such as an encoder's bias.
+        UnknownNameError: The model lacks an element.
+    """
+
+    def __init__(self, model: Any, space: ParameterSpace) -> None:
+        outside = [p.name for p in space.parameters if p.kind not in KINDS and p.kind not in _SERVO]
+        if outside:
+            raise ConfigurationError(
+                f"parameters {', '.join(outside)} act on what is sent and sensed, not in the model of an "
+                "environment; calibrate without them (--parameters), or train with --nominal"
+            )
+        check_space(model, space)
+        self._model, self._space = model, space
+        self._fields = ModelFields(model, copy.copy(model))
+
+    def apply(self, theta: FloatArray) -> None:
+        """Write free parameters, (K,), and the known ones; states of the model's simulations stay."""
+        apply_parameters(self._fields, self._space, theta[None])
+        values = {**self._space.known, **dict(zip(self._space.names, map(float, theta), strict=True))}
+        model = self._model
+        for p in self._space.parameters:
+            for name in p.elements if p.kind in _SERVO else ():
+                index, value = element_id(model, "actuator", name), values[p.name]
+                if p.kind == "servo_stiffness":
+                    model.actuator_gainprm[index, 0], model.actuator_biasprm[index, 1] = value, -value
+                elif p.kind == "servo_damping":
+                    model.actuator_biasprm[index, 2] = -value
+                else:
+                    model.actuator_forcerange[index] = np.array([-value, value])
+        # Derives the constants that depend on masses; the environment's own data stay as they are.
+        mujoco.mj_setConst(model, mujoco.MjData(model))

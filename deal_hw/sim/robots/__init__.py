@@ -1,0 +1,1 @@
+"""Robots of users: a robot.yaml beside an MJCF, and both inside a dataset."""

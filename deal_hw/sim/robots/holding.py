@@ -1,0 +1,82 @@
+"""Does a robot stand still when it is told to: the first thing that wrong gains or a long timestep break."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from deal_hw.sim.robots.user_robot import UserRobot
+from deal_hw.types import FloatArray
+
+_DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldSettings:
+    """How long a robot holds its start pose, and what counts as unstable."""
+
+    seconds: float = 1.0
+    """Length [s]."""
+    growth: float = 1.5
+    """Driven joints that move so many times faster in the last quarter than in the second are unstable."""
+    least_speed: float = 0.05
+    """Slower ones never are [rad/s or m/s]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Holding:
+    """What happened.
+
+    Attributes:
+        seconds: How long it was simulated [s].
+        diverged: Whether the simulation broke down.
+        unstable: Driven joints whose speed grows.
+        sag: How far each driven joint is from its start pose at the end, (A,) [rad or m].
+        speed: Root mean square of each driven joint's speed in the last quarter, (A,) [rad/s or m/s].
+    """
+
+    seconds: float
+    diverged: bool
+    unstable: tuple[str, ...]
+    sag: FloatArray
+    speed: FloatArray
+
+
+def hold(robot: UserRobot, settings: HoldSettings | None = None) -> Holding:
+    """Simulate a robot that is told to hold its start pose; motors get no effort."""
+    settings = settings or HoldSettings()
+    model: Any = robot.model
+    description = robot.description()
+    data = mujoco.MjData(model)
+    driven = [model.joint(name) for name in description.actuated]
+    for name, position in zip(description.joint_names, description.default_position, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = position
+    start = np.array([description.default_position[i] for i in description.actuated_index])
+    if description.actuation == "position":
+        for actuator in range(model.nu):
+            joint = model.joint(int(model.actuator_trnid[actuator, 0])).name
+            data.ctrl[actuator] = start[description.actuated.index(joint)]
+    at, moving = [int(j.qposadr[0]) for j in driven], [int(j.dofadr[0]) for j in driven]
+    steps = max(round(settings.seconds / model.opt.timestep), 4)
+    speed = np.empty((steps, len(driven)))
+    for step in range(steps):
+        mujoco.mj_step(model, data)
+        speed[step] = data.qvel[moving]
+    # MuJoCo starts again from the reference pose where it diverged: the warning is what remains.
+    diverged = any(data.warning[getattr(mujoco.mjtWarning, name)].number for name in _DIVERGED)
+    quarter = steps // 4
+    second, last = (
+        np.sqrt(np.mean(np.square(speed[a : a + quarter]), axis=0)) for a in (quarter, steps - quarter)
+    )
+    grows = (last > settings.growth * second) & (last > settings.least_speed)
+    grows &= description.actuation == "position"
+    return Holding(
+        seconds=steps * float(model.opt.timestep),
+        diverged=diverged,
+        unstable=tuple(name for name, found in zip(description.actuated, grows, strict=True) if found),
+        sag=np.asarray(data.qpos[at] - start),
+        speed=last,
+    )

@@ -1,0 +1,227 @@
+"""robot.yaml: what an MJCF does not say of a robot, and what of it the rest of deal-hw goes by.
+
+A joint has the names, units and gains of the MJCF. The file may be stricter than the MJCF, never looser:
+:mod:`deal_hw.sim.robots.user_robot` compares both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Final, Literal
+
+import yaml
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.reading import NAMES, read_yaml, reading
+from deal_hw.schema import FINITE, from_values, refusal
+
+SUFFIXES: Final = (".yaml", ".yml")
+FILE_NAME: Final = "robot.yaml"
+ADVICE: Final = "`deal-hw robot new robot.xml` writes one"
+_LONGEST_NAME: Final = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActuatorEntry:
+    """What drives a joint.
+
+    Attributes:
+        stiffness: kp of a position servo [N·m/rad or N/m]; 0 for a motor.
+        damping: kd of a position servo [N·m·s/rad or N·s/m]; 0 for a motor.
+        effort_limit: Largest effort [N·m or N]; None: no limit. Of a motor, what a command of 1 is.
+    """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
+
+    stiffness: float = 0.0
+    damping: float = 0.0
+    effort_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping"):
+            if getattr(self, name) < 0:
+                raise refusal(name, getattr(self, name), "0 or more")
+        if self.effort_limit is not None and self.effort_limit <= 0:
+            raise refusal("effort_limit", self.effort_limit, "a number above 0, or null for no limit")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointEntry:
+    """One joint.
+
+    Attributes:
+        name: As in the MJCF.
+        unit: Of its position: "rad" (hinge) or "m" (slide).
+        default_position: Start pose, and the middle of excitations [rad or m].
+        position_range: Lowest and highest position target [rad or m]; None: free.
+        velocity_limit: Faster trips; targets change by no more in a second [rad/s or m/s]. None: free.
+        sensor_noise: Standard deviation of a reported position [rad or m].
+        sensor_resolution: Step of a reported position [rad or m]; 0 for none.
+        actuator: None for a joint that nothing drives.
+    """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
+
+    name: str
+    unit: Literal["rad", "m"]
+    default_position: float = 0.0
+    position_range: tuple[float, float] | None = None
+    velocity_limit: float | None = None
+    sensor_noise: float = 0.0
+    sensor_resolution: float = 0.0
+    actuator: ActuatorEntry | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise refusal("name", self.name, "the name of a joint of the MJCF")
+        for name in ("sensor_noise", "sensor_resolution"):
+            if getattr(self, name) < 0:
+                raise refusal(name, getattr(self, name), "0 or more")
+        if self.velocity_limit is not None and self.velocity_limit <= 0:
+            raise refusal("velocity_limit", self.velocity_limit, "a number above 0, or null for no limit")
+        low, high = self.position_range or (-math.inf, math.inf)
+        if not low < high:
+            raise refusal("position_range", [low, high], "two numbers, the lower one first, or null")
+        if not low <= self.default_position <= high:
+            raise refusal("default_position", self.default_position, f"{low:g} to {high:g} (position_range)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotFile:
+    """A robot.yaml.
+
+    Attributes:
+        version: Of this format.
+        name: The robot's name; datasets, excitations and results carry it.
+        mjcf: Its MuJoCo model, relative to this file.
+        actuation: "position": commands are set-points [rad, m]; "motor": commands are efforts.
+        floating_base: Name of the free joint that carries the robot; None for a fixed base.
+        feet: Sphere geoms of the feet of a robot whose base floats.
+        control_rate_hz: Commands a second.
+        state_rate_hz: State samples a second; a whole multiple of ``control_rate_hz``.
+        joints: The joints, in the order that every array follows.
+    """
+
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
+
+    version: Literal[1]
+    name: str
+    mjcf: str
+    actuation: Literal["position", "motor"]
+    control_rate_hz: float
+    state_rate_hz: float
+    joints: tuple[JointEntry, ...]
+    floating_base: str | None = None
+    feet: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.name) <= _LONGEST_NAME or not self.name.isprintable() or "/" in self.name:
+            raise refusal("name", self.name, f"1 to {_LONGEST_NAME} printable characters without /")
+        if not self.mjcf:
+            raise refusal("mjcf", self.mjcf, "the path of the MJCF, relative to this file")
+        for name in ("control_rate_hz", "state_rate_hz"):
+            if not 1e-3 <= getattr(self, name) <= 1e6:
+                raise refusal(name, getattr(self, name), "0.001 to 1000000 Hz")
+        ratio = self.state_rate_hz / self.control_rate_hz
+        if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+            raise refusal(
+                "state_rate_hz",
+                self.state_rate_hz,
+                f"whole multiples of control_rate_hz {self.control_rate_hz:g}",
+            )
+        names = [joint.name for joint in self.joints]
+        if not 0 < len(names) <= NAMES or len(set(names)) != len(names):
+            raise refusal("joints", names, "each joint once, at least one")
+        if all(joint.actuator is None for joint in self.joints):
+            raise ConfigurationError(
+                "no joint has an actuator; write `actuator: {...}` for those that take commands"
+            )
+
+
+def read_robot_file(path: Path) -> RobotFile:
+    """Read a robot.yaml.
+
+    Raises:
+        ConfigurationError: It cannot be read, or a field is wrong; names the fields.
+    """
+    with reading(path, "a robot (YAML)", ADVICE, error=ConfigurationError):
+        return from_values(RobotFile, read_yaml(path))
+
+
+_HEAD: Final = """\
+# A robot for deal-hw, beside its MJCF; `deal-hw robot check` compares both. null: no limit, or none.
+# The MJCF says names, units, gains and effort limits: change them there, then here.
+# It does not say rates, velocity limits and sensors: write your robot's.
+"""
+_JOINT_HEAD: Final = """\
+# In the order that every array follows.
+# default_position: start pose, middle of excitations.  position_range: where targets may be.
+# velocity_limit: faster trips, and targets change by no more in a second.  sensor_noise: standard deviation.
+"""
+
+
+def write_robot_file(robot: RobotFile) -> str:
+    """Return the YAML text of a robot, with a comment and the unit at each field."""
+    lines = [
+        _HEAD,
+        _line("version", robot.version, "of this format"),
+        _line("name", robot.name, "datasets and results carry it"),
+        _line("mjcf", robot.mjcf, "the MuJoCo model, relative to this file"),
+        _line(
+            "actuation",
+            robot.actuation,
+            "position: commands are set-points [rad, m]; motor: efforts [N·m, N]",
+        ),
+        _line(
+            "floating_base", robot.floating_base, "the free joint that carries the robot; null: a fixed base"
+        ),
+        _line("feet", list(robot.feet), "sphere geoms of the feet of a robot whose base floats"),
+        _line("control_rate_hz", robot.control_rate_hz, "commands a second [Hz]"),
+        _line("state_rate_hz", robot.state_rate_hz, "states a second, a multiple of control_rate_hz [Hz]"),
+        _JOINT_HEAD,
+        "joints:\n",
+    ]
+    for joint in robot.joints:
+        lines += _joint_lines(joint)
+    return "".join(lines)
+
+
+def _joint_lines(joint: JointEntry) -> list[str]:
+    unit, effort = joint.unit, "N·m" if joint.unit == "rad" else "N"
+    fields = [
+        ("unit", unit, "rad: hinge; m: slide"),
+        ("default_position", joint.default_position, f"[{unit}]"),
+        ("position_range", None if joint.position_range is None else list(joint.position_range), f"[{unit}]"),
+        ("velocity_limit", joint.velocity_limit, f"[{unit}/s]"),
+        ("sensor_noise", joint.sensor_noise, f"[{unit}]"),
+        ("sensor_resolution", joint.sensor_resolution, f"[{unit}]"),
+    ]
+    lines = [_line("- name", joint.name, "as in the MJCF", indent=2)]
+    lines += [_line(name, value, comment, indent=4) for name, value, comment in fields]
+    if joint.actuator is None:
+        return [*lines, _line("actuator", None, "nothing drives it", indent=4)]
+    gains = [
+        ("stiffness", joint.actuator.stiffness, f"kp [{effort}/{unit}]"),
+        ("damping", joint.actuator.damping, f"kd [{effort}·s/{unit}]"),
+        ("effort_limit", joint.actuator.effort_limit, f"[{effort}]"),
+    ]
+    return [*lines, "    actuator:\n", *(_line(name, value, text, indent=6) for name, value, text in gains)]
+
+
+def _line(name: str, value: Any, comment: str, indent: int = 0) -> str:
+    return f"{' ' * indent}{name}: {_dumped(value)}  # {comment}\n"
+
+
+def _dumped(value: Any) -> str:
+    # The dumper quotes what would not be text again, and writes 1.0e-05, which stays a number.
+    def dump(style: str | None) -> str:
+        return yaml.safe_dump(
+            [value], default_style=style, default_flow_style=True, allow_unicode=True, width=math.inf
+        )
+
+    text = dump(None)
+    # Text with line breaks: only quotes of this kind keep it on one line.
+    return (dump('"') if text.count("\n") > 1 else text).strip()[1:-1]

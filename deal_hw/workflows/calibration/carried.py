@@ -1,0 +1,109 @@
+"""Calibration of a dataset that carries a user's robot."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.dataset import DatasetRecordings, choose_episodes, sound_recordings
+from deal_hw.workflows.calibration.model import Recordings, heldout_share, parts_to_calibrate, searched_space
+from deal_hw.workflows.calibration.recordings import aligned
+from deal_hw.workflows.calibration.run import CalibrationInputs, SpaceOverrides
+from deal_hw.workflows.robot import recorded_robot
+from deal_hw.workflows.say import Say, silent
+
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.model import RobotModel
+
+
+def prepare_carried(
+    source: DatasetRecordings,
+    config: Recordings,
+    overrides: SpaceOverrides,
+    *,
+    std: Callable[[RobotModel], FloatArray | None],
+    threads: int | None = None,
+    say: Say = silent,
+) -> CalibrationInputs:
+    """Read a dataset that carries its robot; what is done with the recordings is that of any user's robot.
+
+    Args:
+        source: The recordings.
+        config: How they are used.
+        overrides: What the command line changes about the parameters.
+        std: What a prediction may be off, as in :class:`deal_hw.calib.data.problem.Problem`.
+        threads: Simulation threads.
+        say: Called with sentences on what was found.
+
+    Raises:
+        DealHwError: A setting, the robot or a recording is unusable.
+    """
+    try:
+        from deal_hw.data.importing.grid import Recording
+        from deal_hw.data.recording.dataset import Dataset
+        from deal_hw.sim.engine.compiling import compile_mjcf
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
+        from deal_hw.sim.recordings.episode import thin
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "calib") from err
+
+    share = heldout_share(config, source.holdout)
+    dataset = Dataset.open(source.folder)
+    description = recorded_robot(dataset.description, source.folder)
+    fit, held = choose_episodes(dataset, source.episodes, source.holdout, say)
+    if held and config.holdout_part is None:
+        share = 0.0
+    trajectories, verdicts = sound_recordings(
+        {i: dataset.read(i).trajectory for i in (*fit, *held)}, source.folder, source.spikes, say
+    )
+    model = compile_mjcf(description.mjcf)
+    space = searched_space(config, overrides, model)
+    timestep = float(model.opt.timestep) if config.physics_step is None else config.physics_step
+    rates = sampling(1.0 / description.state_rate_hz, timestep, config.window)
+    description = dataclasses.replace(
+        description,
+        device_rate_hz=1.0 / rates.step_s,
+        control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
+    )
+    robot = load_model(with_speed_limits(description, model, space), rates.step_s)
+    if robot.base is not None:
+        raise ConfigurationError(
+            f"the base of robot {description.name!r} floats, and the dataset holds no IMU of it; give "
+            "its files themselves: --model robot.xml --data rec.csv --feet ..."
+        )
+    episodes = {
+        i: aligned(Recording(trajectory, None, None), robot, ()) for i, trajectory in trajectories.items()
+    }
+    if source.sample_hz is not None:
+        episodes = {i: thin(episode, source.sample_hz) for i, episode in episodes.items()}
+    parts, judge = parts_to_calibrate(
+        robot,
+        space,
+        [episodes[i] for i in fit],
+        [episodes[i] for i in held],
+        config,
+        share=share,
+        std=std,
+        threads=threads,
+        say=say,
+    )
+    return CalibrationInputs(
+        robot=robot,
+        space=space,
+        episodes=parts,
+        holdout=judge,
+        shown=trajectories[fit[0]],
+        telemetry=[f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found],
+        provenance={
+            "dataset": str(source.folder),
+            "description_digest": dataset.digest,
+            "episodes": list(fit),
+            "holdout": list(held) or f"last {share:.0%} of each recording",
+            "sampling": dataclasses.asdict(rates),
+        },
+        advice="import recordings of other motion, and name their episodes with --holdout",
+    )

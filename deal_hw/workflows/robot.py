@@ -1,0 +1,332 @@
+"""Robots of users: ``deal-hw robot new`` and ``check``, and who a robot is that a verb is told of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from deal_hw.data.files import write_bytes
+from deal_hw.description import RobotDescription
+from deal_hw.drivers import DESCRIPTIONS, ROBOTS, parameter_spaces, recorded_description
+from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
+from deal_hw.findings import Finding, Level
+from deal_hw.parameters import ParameterSpace
+from deal_hw.workflows.options import Checked, File, Range, from_settings
+from deal_hw.workflows.say import html_table
+
+if TYPE_CHECKING:
+    from deal_hw.sim.robots.user_robot import UserRobot
+
+_HEAD = ("", "what", "found", "do")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewRobotSettings(Checked):
+    """Settings of :func:`new_robot`."""
+
+    model: File = field(kw_only=False)
+    """The robot's MJCF."""
+
+    out: File | None = None
+    """The file to write; by default robot.yaml beside the MJCF."""
+
+    name: str = ""
+    """The robot's name; by default that of the MJCF's file."""
+
+    control_rate: Annotated[float, Range(0.001, 1e5, "Hz")] = 50.0
+    """Commands a second [Hz]; no MJCF says it."""
+
+    state_rate: Annotated[float | None, Range(0.001, 1e5, "Hz")] = None
+    """State samples a second [Hz], a whole multiple of the control rate; by default as many as commands."""
+
+    feet: tuple[str, ...] = ()
+    """Sphere geoms of the feet of a robot whose base floats."""
+
+    several_trees: bool = False
+    """Driven joints in several trees of bodies, such as two arms, are one robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRobotSettings:
+    """Settings of :func:`check_robot`."""
+
+    robot: File = field(kw_only=False)
+    """The robot.yaml."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotCheck:
+    """What an examination of a robot.yaml found.
+
+    Attributes:
+        robot: The robot.
+        findings: What was looked at.
+    """
+
+    robot: UserRobot
+    findings: tuple[Finding, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """For the shell: 0, or 1 where something does not work."""
+        return int(any(finding.level is Level.FAIL for finding in self.findings))
+
+    def table(self) -> str:
+        """Return a line a finding, as text."""
+        return "\n".join(
+            f"{level:<4} {area}: {'; '.join(filter(None, words))}" for level, area, *words in self._cells()
+        )
+
+    def _repr_html_(self) -> str:
+        return html_table(_HEAD, self._cells())
+
+    def _cells(self) -> list[tuple[str, ...]]:
+        return [(f.level.value, f.area, f.message, f.remedy) for f in self.findings]
+
+
+@from_settings(NewRobotSettings)
+def new_robot(settings: NewRobotSettings) -> Path:
+    """Write a robot.yaml with what an MJCF tells; what ``deal-hw robot new`` does.
+
+    The arguments are those of :class:`NewRobotSettings`, which has a text under each:
+    ``new_robot("robot.xml", control_rate=100.0)``.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigurationError: The MJCF cannot be used, the name is that of a robot of deal-hw, or the file
+            exists.
+    """
+    user_robot = _sim()
+    from deal_hw.sim.robots.robot_file import FILE_NAME, write_robot_file
+
+    model = Path(settings.model)
+    out = model.parent / FILE_NAME if settings.out is None else Path(settings.out)
+    if out.exists():
+        raise ConfigurationError(f"{out} exists; name another file with --out, or remove it")
+    robot = user_robot.derive_robot(
+        model,
+        name=settings.name,
+        control_rate_hz=settings.control_rate,
+        state_rate_hz=settings.state_rate,
+        feet=settings.feet,
+        several_trees=settings.several_trees,
+        mjcf_entry=_relative(model, out.parent),
+    )
+    _check_name(robot.file.name, "--name")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(out, write_robot_file(robot.file).encode())
+    return out
+
+
+@from_settings(CheckRobotSettings)
+def check_robot(settings: CheckRobotSettings) -> RobotCheck:
+    """Compare a robot.yaml with its MJCF and simulate a second of holding; what ``deal-hw robot check`` does.
+
+    The arguments are those of :class:`CheckRobotSettings`: ``check_robot("robot.yaml")``.
+
+    Returns:
+        What was found.
+
+    Raises:
+        ConfigurationError: A file cannot be used, or both contradict each other.
+    """
+    robot = load_robot(Path(settings.robot))
+    return RobotCheck(robot=robot, findings=(*_agreement(robot), *_missing(robot), *_held(robot)))
+
+
+def load_robot(path: Path) -> UserRobot:
+    """Read a robot.yaml; errors as :func:`check_robot`."""
+    robot: UserRobot = _sim().read_robot(path)
+    _check_name(robot.file.name, f"{path}: name")
+    return robot
+
+
+def is_ours(name: str) -> bool:
+    """Say whether a name is that of a robot of deal-hw."""
+    return name in ROBOTS or name in DESCRIPTIONS
+
+
+def is_user_robot(robot: str) -> bool:
+    """Say whether a verb's robot is a file or a folder, and no robot of deal-hw by its name."""
+    return not is_ours(robot) and (Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir())
+
+
+def user_robot(robot: str) -> UserRobot:
+    """Return the robot of a robot.yaml, or the one that a dataset carries.
+
+    Raises:
+        ConfigurationError: It is neither, or cannot be used.
+        DatasetError: The dataset's robot is gone or changed.
+    """
+    if not is_user_robot(robot):
+        raise ConfigurationError(
+            f"--simulated takes a robot.yaml (`deal-hw robot new robot.xml` writes one), not {robot!r}; "
+            "robots of deal-hw have emulators on their wire: deal-hw emulate"
+        )
+    if not Path(robot).is_dir():
+        return load_robot(Path(robot))
+    described(robot)
+    return load_robot(Path(robot) / "robot" / "robot.yaml")
+
+
+def described(robot: str) -> RobotDescription:
+    """Return the description of a robot of deal-hw by its name, of a robot.yaml, or of a dataset's robot.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        ConfigurationError: The robot.yaml or its MJCF cannot be used.
+        DatasetError: The dataset cannot be read, or its robot is gone or changed.
+    """
+    if not is_user_robot(robot):
+        return recorded_description(robot)
+    if Path(robot).is_dir():
+        from deal_hw.data.recording.dataset import Dataset
+
+        return recorded_robot(Dataset.open(Path(robot)).description, Path(robot))
+    return load_robot(Path(robot)).description()
+
+
+def described_spaces(robot: str) -> Mapping[str, Callable[[], ParameterSpace]]:
+    """Return a robot's parameter sets by name, the first is the default; errors as :func:`described`."""
+    if not is_user_robot(robot):
+        return parameter_spaces(robot)
+    return {"default": lambda: default_space(described(robot))}
+
+
+def default_space(description: RobotDescription) -> ParameterSpace:
+    """Return what is searched of a user's robot: friction, damping, armature and gains of the MJCF."""
+    from deal_hw.sim.engine.compiling import compile_mjcf
+    from deal_hw.sim.parameters.template import template
+    from deal_hw.sim.parameters.yaml_space import parse_space
+
+    model = compile_mjcf(description.mjcf)
+    return parse_space(template(model), model, "the default parameters (see --write-parameters)")
+
+
+def carries_robot(dataset: File | None) -> bool:
+    """Say whether a dataset carries a user's robot."""
+    # As deal_hw.sim.robots.carried, which needs mujoco; this is asked where nothing is simulated, too.
+    return dataset is not None and (Path(dataset) / "robot" / "files.json").is_file()
+
+
+def carried_problems(dataset: Path) -> list[str]:
+    """Return what is wrong with the robot that a dataset carries; nothing where it carries none."""
+    if not carries_robot(dataset) or not (Path(dataset) / "dataset.json").is_file():
+        return []
+    from deal_hw.data.recording.dataset import Dataset
+
+    try:
+        recorded_robot(Dataset.open(Path(dataset), lambda text: None).description, Path(dataset))
+    except DatasetError as error:
+        return [str(error)]
+    return []
+
+
+def recorded_robot(values: Mapping[str, Any], dataset: Path) -> RobotDescription:
+    """Return the robot that recordings are of: the one that their dataset carries, or one of deal-hw's own.
+
+    Args:
+        values: The description in the dataset's index, or in an episode.
+        dataset: The dataset's folder.
+
+    Raises:
+        DatasetError: The robot is none of ours, and the dataset's is not there or was changed.
+    """
+    if not carries_robot(dataset) and is_ours(str(values["name"])):
+        return recorded_description(str(values["name"]))
+    try:
+        from deal_hw.sim.robots.carried import carried_description
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "sim") from err
+    return carried_description(dataset, values)
+
+
+def _sim() -> Any:
+    try:
+        from deal_hw.sim.robots import user_robot
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "sim") from err
+    return user_robot
+
+
+def _check_name(name: str, where: str) -> None:
+    if is_ours(name):
+        raise ConfigurationError(f"{where} {name!r} is that of a robot of deal-hw; choose another name")
+
+
+def _relative(model: Path, folder: Path) -> str:
+    import os
+
+    return os.path.relpath(os.path.abspath(model), os.path.abspath(folder))
+
+
+def _agreement(robot: UserRobot) -> list[Finding]:
+    driven = sum(joint.actuator is not None for joint in robot.file.joints)
+    base = "floating" if robot.file.floating_base else "fixed"
+    message = (
+        f"{len(robot.file.joints)} joints, {driven} of them driven, {base} base; robot.yaml and MJCF agree"
+    )
+    return [Finding(robot.mjcf.name, Level.OK, message)]
+
+
+def _missing(robot: UserRobot) -> list[Finding]:
+    """Return what robot.yaml leaves open, and which verbs would want it."""
+    joints = robot.file.joints
+    driven = [joint for joint in joints if joint.actuator is not None]
+    rows = (
+        (
+            "position_range",
+            [j.name for j in driven if j.position_range is None and robot.file.actuation == "position"],
+            "collect and design-excitation need it: how far targets may go",
+        ),
+        (
+            "velocity_limit",
+            [j.name for j in driven if j.velocity_limit is None],
+            "excitations may be too fast",
+        ),
+        (
+            "effort_limit",
+            [j.name for j in driven if j.actuator and j.actuator.effort_limit is None],
+            "the simulated motor is endlessly strong; give the MJCF a forcerange",
+        ),
+        (
+            "sensor_noise",
+            [j.name for j in joints if j.sensor_noise == 0],
+            "collect --simulated is noise-free",
+        ),
+    )
+    return [
+        Finding(name, Level.NOTE, f"not said for {', '.join(found)}", f"{why}")
+        for name, found, why in rows
+        if found
+    ]
+
+
+def _held(robot: UserRobot) -> list[Finding]:
+    from deal_hw.sim.robots.holding import hold
+
+    found = hold(robot)
+    what = f"holding for {found.seconds:g} s"
+    if found.diverged:
+        return [Finding(what, Level.FAIL, "the simulation diverges", "reduce timestep or gains of the MJCF")]
+    if found.unstable:
+        return [
+            Finding(
+                what,
+                Level.FAIL,
+                f"{', '.join(found.unstable)} moves faster and faster",
+                "reduce stiffness, or raise damping or armature, in the MJCF and here",
+            )
+        ]
+    names = robot.description().actuated
+    worst = int(np.argmax(np.abs(found.sag)))
+    unit = robot.file.joints[robot.joint_names.index(names[worst])].unit
+    moved = "moved, without effort, by" if robot.file.actuation == "motor" else "is off by"
+    message = f"stable; {names[worst]} {moved} {found.sag[worst]:.3g} {unit}, more than the others"
+    return [Finding(what, Level.OK, message)]

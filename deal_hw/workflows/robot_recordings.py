@@ -1,0 +1,87 @@
+"""A user's robot and its recordings: who it is, and at which rates it was recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.calibration.recordings import common_rates
+from deal_hw.workflows.robot import is_ours
+from deal_hw.workflows.say import Say
+
+if TYPE_CHECKING:
+    from deal_hw.data.importing.table import Table
+    from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.mjcf.describe import Sampling
+    from deal_hw.sim.robots.user_robot import UserRobot
+
+
+def derived_robot(model: Path, name: str, tables: Sequence[Table], say: Say) -> UserRobot | None:
+    """Return the robot that a model tells; None, and say why, where no later verb could use it.
+
+    Args:
+        model: The MJCF.
+        name: The robot's name; "" for that of the file.
+        tables: Its recordings.
+        say: Called with the reason.
+    """
+    from deal_hw.data.importing.grid import common_period
+    from deal_hw.sim.robots.user_robot import derive_robot
+
+    if is_ours(name or model.stem):
+        return None
+    rate_hz = 1 / common_period(tables)
+    try:
+        robot = derive_robot(model, name=name, control_rate_hz=rate_hz, several_trees=True)
+        for table in tables:
+            _check_joints(robot, table)
+    except ConfigurationError as err:
+        say(f"the dataset keeps no robot, so that `inspect` and `calibrate` cannot use it: {err}")
+        return None
+    return robot
+
+
+def _check_joints(robot: UserRobot, table: Table) -> None:
+    """Check that a recording has the joints of a robot, and commands of those that are driven.
+
+    Raises:
+        ConfigurationError: It has not.
+    """
+    driven = tuple(joint.name for joint in robot.file.joints if joint.actuator is not None)
+    for what, has, wants in (
+        ("positions", table.joint_names, robot.joint_names),
+        ("commands", table.actuated, driven),
+    ):
+        if has != wants:
+            raise ConfigurationError(
+                f"{table.name} has {what} of {', '.join(has) or 'no joint'}, robot {robot.file.name!r} of "
+                f"{', '.join(wants)}; name its columns in a column map (--columns)"
+            )
+
+
+def at_recorded_rates(
+    robot: UserRobot, tables: Sequence[Table], device_periods: int = 1
+) -> tuple[RobotModel, Sampling]:
+    """Return the robot's model at the rates of recordings, and these.
+
+    Args:
+        robot: The robot.
+        tables: The recordings.
+        device_periods: Physics steps between two samples; 1: as the MJCF's timestep has it.
+
+    Raises:
+        ConfigurationError: The recordings have other joints than the robot.
+    """
+    from deal_hw.sim.engine.model import load_model
+    from deal_hw.sim.mjcf.describe import WINDOW_TICKS
+
+    for table in tables:
+        _check_joints(robot, table)
+    own = robot.rates
+    rates = common_rates(tables, robot.model, None, own.period_s * own.samples_per_tick * WINDOW_TICKS)
+    if device_periods > 1:
+        rates = dataclasses.replace(rates, substeps=device_periods)
+    return load_model(robot.description(rates), rates.step_s), rates

@@ -1,0 +1,202 @@
+"""Episodes of a user's robot in simulation: the same loop, safety filter and recorder, in virtual time."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Protocol
+
+from deal_hw.clock import VirtualClock
+from deal_hw.control.loop import ControlLoop, LoopConfig
+from deal_hw.control.safety import Safety
+from deal_hw.data.files import write_json
+from deal_hw.data.recording.excitation import Excitation
+from deal_hw.data.recording.record import CycleRecord
+from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.parameters import LONGEST_LATENCY_S
+from deal_hw.version import __version__
+from deal_hw.workflows.options import Checked, File, Range, Ratio, Seed, given, refuse
+from deal_hw.workflows.robot import default_space, is_user_robot, user_robot
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
+from deal_hw.workflows.running.report import EpisodeReport, RunReport
+from deal_hw.workflows.running.supervised import play_episodes
+from deal_hw.workflows.running.view import RunView
+
+if TYPE_CHECKING:
+    from deal_hw.data.recording.dataset import Dataset
+    from deal_hw.sim.robots.simulated import SimulatedRobot
+
+_START_NS = 1_000_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions(Checked):
+    """What a simulated robot hides; its sensors' noise and step are those of robot.yaml."""
+
+    simulated: bool = False
+    """Record the robot of a robot.yaml in simulation, in virtual time, with hidden parameters: a rehearsal
+    without a robot and without --port."""
+
+    truth_seed: Seed = 0
+    """Simulated: decides the hidden parameters and the noise."""
+
+    truth_ratio: Annotated[float, Ratio] = 1.5
+    """Simulated: hidden parameters lie within this ratio of the MJCF's."""
+
+    truth_latency: Annotated[float, Range(0, LONGEST_LATENCY_S, "s")] = 0.005
+    """Simulated: a command acts so much later [s]."""
+
+    reveal_to: File | None = None
+    """Simulated: write what was hidden to this JSON file."""
+
+
+class Simulable(Protocol):
+    """Settings of a verb that runs a robot, or its simulation."""
+
+    @property
+    def port(self) -> str:
+        """Where the robot is."""
+        ...
+
+    @property
+    def simulation(self) -> SimulationOptions:
+        """Whether it is simulated."""
+        ...
+
+
+def check_simulation(config: Simulable, default: Simulable) -> None:
+    """Refuse what goes with a wire alone, or with a simulation alone.
+
+    Raises:
+        ConfigurationError: Something would have no effect.
+    """
+    if config.simulation.simulated:
+        refuse(["--port"] if config.port else [], "--simulated needs no wire")
+        refuse(given(config, default, ("link", "legs")), "--simulated needs no wire and has no legs")
+    else:
+        refuse(given(config.simulation, SimulationOptions()), "only with --simulated")
+
+
+def require_driver(robot: str, port: str) -> None:
+    """Check that a robot is one that can be reached, and that it was said where.
+
+    Raises:
+        ConfigurationError: It is a user's, which has no driver, or there is no port.
+    """
+    if is_user_robot(robot):
+        raise ConfigurationError(
+            f"{robot}: a robot of your own has no driver here (docs/how-to/add.md); record its simulation "
+            "with --simulated, or import recordings of it: deal-hw data import"
+        )
+    if not port:
+        raise ConfigurationError("say where the robot is: --port, such as /dev/ttyUSB0")
+
+
+def run_simulated(
+    plan: RunPlan,
+    robot: str,
+    options: SimulationOptions,
+    *,
+    dataset: Path,
+    episodes: int,
+    purpose: str,
+    view: RunView,
+    attempts: int = 1,
+) -> RunReport:
+    """Run episodes on a simulated robot and record them in a dataset that carries it.
+
+    Args:
+        plan: What to do; each episode adds its number to the seed.
+        robot: A robot.yaml, or a dataset that carries its robot.
+        options: What is hidden.
+        dataset: Folder of the dataset, made or extended.
+        episodes: How many.
+        purpose: For the metadata.
+        view: What is told.
+        attempts: How often an episode of the profile `rich` is recorded at most.
+
+    Raises:
+        DealHwError: The robot cannot be used, or an episode failed.
+    """
+    try:
+        from deal_hw.data.recording.dataset import Dataset
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.robots.carried import carry
+        from deal_hw.sim.robots.simulated import SimulatedRobot, draw_truth
+    except ModuleNotFoundError as err:
+        raise MissingExtraError(str(err.name), "sim") from err
+
+    own = user_robot(robot)
+    description = own.description()
+    space = default_space(description)
+    truth = draw_truth(space, options.truth_seed, options.truth_ratio, options.truth_latency)
+    # Whatever is wrong with robot or motion should be said before anything is written.
+    SimulatedRobot(load_model(description), space, truth, VirtualClock(_START_NS))
+    make_behaviour(plan, description)
+    reports: list[EpisodeReport] = []
+    with Dataset.create_or_open(dataset, description, view.warn) as store:
+        carry(own, dataset)
+
+        def run_one(episode: RunPlan, number: int, attempt: int) -> EpisodeReport:
+            clock = VirtualClock(_START_NS)
+            fresh = dataclasses.replace(truth, seed=truth.seed + 1000 * number + attempt)
+            device = SimulatedRobot(load_model(description), space, fresh, clock)
+            reports.append(_record(episode, device, clock, store, purpose, attempt))
+            view.ended(reports[-1])
+            return reports[-1]
+
+        play_episodes(plan, episodes, attempts, description, view, run_one)
+    if options.reveal_to is not None:
+        write_json(Path(options.reveal_to), truth.to_json())
+    reports[-1].raise_error()
+    return RunReport(dataset=dataset, episodes=tuple(reports))
+
+
+def _record(
+    plan: RunPlan, robot: SimulatedRobot, clock: VirtualClock, store: Dataset, purpose: str, attempt: int
+) -> EpisodeReport:
+    from deal_hw.data.recording.recorder import EpisodeRecorder
+
+    description = robot.description
+    path = store.next_episode_path()
+    metadata = {
+        "robot": description.name,
+        "description_digest": description.digest(),
+        "purpose": purpose,
+        "profile": plan.profile,
+        "excite": plan.excite,
+        "seed": plan.seed,
+        "seconds": plan.seconds,
+        "excitation_level": plan.excitation_level,
+        "attempt": attempt,
+        "simulated": True,
+        "deal_hw": __version__,
+    }
+    states = 0
+    with EpisodeRecorder(path, description.to_json(), metadata, clock) as recorder:
+
+        def sink(record: CycleRecord) -> bool:
+            nonlocal states
+            states += len(record.states)
+            recorder.write(record)
+            return True
+
+        config = LoopConfig(duration_s=plan.seconds, record_wire=False)
+        behaviour = make_behaviour(plan, description)
+        end = ControlLoop(robot, behaviour, Safety(description), clock, sink, config).run()
+    kept = {name: metadata[name] for name in ("profile", "excitation_level", "simulated")}
+    report = EpisodeReport(
+        path=path,
+        outcome=end.outcome,
+        reason=end.reason,
+        passive_confirmed=end.passive_confirmed,
+        loop_timing=None,
+        clipped=end.clipped,
+        cycles_sent=end.cycles_sent,
+        states_recorded=states,
+        warnings=(),
+        error=end.error,
+    )
+    moved = store.note_episode(path, {**kept, **report.to_json()}).excitation
+    return report if moved is None else dataclasses.replace(report, motion=Excitation(**moved))
