@@ -126,7 +126,7 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: train_policy("so101", udr_distribution("cartpole"), Path("p.onnx")),
         UnknownNameError,
-        "unknown robot with a training environment 'so101'; known: ant, cartpole, go2",
+        "unknown robot with a training environment 'so101'; known: allegro, ant, cartpole, go2, humanoid",
     ),
     (lambda: make_behaviour(PLAN, DESCRIPTION), PolicyError, "give --policy FILE"),
     (lambda: EmulatorProcess("cartpole").pid, TransportError, "the emulator is not running"),

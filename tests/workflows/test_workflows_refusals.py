@@ -70,7 +70,11 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("replay", {"episode": "none.mcap", "port": "no-port"}, "none.mcap"),
     ("train", {}, "say under what to train: --distribution FILE"),
     ("train", {"udr": True, "nominal": True}, "--udr and --nominal exclude each other"),
-    ("train", {"robot": "go3", "udr": True}, "unknown robot with a training environment 'go3'; known: ant"),
+    (
+        "train",
+        {"robot": "go3", "udr": True},
+        "unknown robot with a training environment 'go3'; known: allegro, ant",
+    ),
     ("train", {"udr": True, "trainer": "dqn"}, "dqn"),
     ("train", {"robot": "cartpole", "env": "a:B-v0", "nominal": True}, "--env needs a robot.yaml"),
     ("train", {"robot": "r.yaml", "env": "a:B-v0", "udr": True}, "--env takes --distribution or --nominal"),

@@ -155,7 +155,7 @@ REFUSED: list[tuple[str, str]] = [
     ),
     ("collect cartpole --out r", "say where the robot is: --port"),
     ("replay {made}/run/dataset/episodes/000000.mcap --port p", "a robot of your own has no driver here"),
-    ("replay {made}/run/dataset/episodes/000000.mcap --simulated", "give --out RUN (the episodes go to"),
+    ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a rehearsal is"),
     ("deploy {made}/robot.yaml --port p", "a robot of your own has no driver here; docs/how-to/add.md"),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]
