@@ -129,7 +129,7 @@ class Go2Rig(Rig):
 
 def second_controller(rig: Rig) -> None:
     """Another program sends stiff commands, too."""
-    options = WireOptions(domain=_DOMAIN + rig.slot)
+    options = WireOptions(domain=_DOMAIN + rig.slot) if rig.wire == "dds" else WireOptions()
     transport = make_topic_transport(rig.wire, rig.port, MonotonicClock(), options)
     transport.declare(publish=[LOW_COMMAND])
     pose = list(DRIVER.rest_position)

@@ -15,9 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
 
 import tyro
+from rich.markup import escape
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import CalibrateReport
@@ -26,6 +27,9 @@ from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.options import Checked, Range, Seed, given, refuse
 from deal_hw.workflows.running.report import RunReport
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,12 +98,10 @@ class Measure:
     Attributes:
         name: Key in the summary; ends with the unit.
         unit: As names write it.
-        heading: Of its column.
         values: By policy, one a deployment, (E,).
     """
 
     name: str
-    heading: str
     values: Mapping[str, FloatArray]
     unit: str = ""
 
@@ -119,7 +121,8 @@ class Demonstrated:
         truth: True values of its parameters, by name.
         latency_s: The true latency [s].
         measures: What is compared of the policies.
-        comparison: Title of that table.
+        sentence: What came of the loop, with what was measured alone.
+        episode: The recording to look at.
         run: The last deployment of the retrained policy.
         paths: Files to look at.
         beside: Estimates of another calibration, by parameter; its name is ``beside_name``.
@@ -130,7 +133,8 @@ class Demonstrated:
     truth: Mapping[str, float]
     latency_s: float
     measures: Sequence[Measure]
-    comparison: str
+    sentence: str
+    episode: Path
     run: RunReport
     paths: Mapping[str, str]
     beside: CalibrationResult | None = None
@@ -225,12 +229,16 @@ def read_truth(path: Path) -> dict[str, Any]:
     return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8")))
 
 
-def show_first_episode(folder: RunFolder, dataset: Path | None = None) -> Path:
-    """Write a first recording, of this run by default, beside what both models predict; return the file."""
+def first_episode(dataset: Path) -> Path:
+    """Return a dataset's first recording."""
+    return dataset / "episodes" / "000000.mcap"
+
+
+def show_episode(folder: RunFolder, episode: Path) -> Path:
+    """Write a recording beside what both models predict; return the file."""
     from deal_hw.cli.inspect_ import Inspect, inspect
 
     rrd = folder.path / "inspect.rrd"
-    episode = (dataset or folder.dataset) / "episodes" / "000000.mcap"
     inspect(Inspect(episode=episode, calibration=folder.calibration, save=rrd))
     return rrd
 
@@ -276,62 +284,39 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
 
 
 def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
+    """Say in a sentence what came of it, show what was found beside the truth, and how to look at it."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console(width=110)
+    console.print(f"\n{done.sentence}", markup=False)
     table = Table(title="what the calibrator found of a robot it could not look inside")
-    beside = [f"{done.beside_name} alone"] if done.beside is not None else []
-    for name in ("parameter", "unit", "nominal", *beside, "estimate", "90 % interval", "truth"):
+    for name in ("parameter", "unit", "nominal", "estimate", "90 % interval", "truth"):
         table.add_column(name, justify="left" if name in ("parameter", "unit") else "right")
-    for name, row in summary["parameters"].items():
-        inside = row["low"] <= row["truth"] <= row["high"]
-        table.add_row(
-            name,
-            row["unit"],
-            f"{row['nominal']:.4g}",
-            *(f"{row[done.beside_name]:.4g}" for _ in beside),
-            f"{row['estimate']:.4g}",
-            f"{row['low']:.4g} .. {row['high']:.4g}",
-            f"{row['truth']:.4g}" + ("" if inside else " (outside)"),
-        )
-    latency = summary["latency_s"]
-    table.add_row(
-        "latency",
-        "ms",
-        "0",
-        *("" for _ in beside),
-        f"{1e3 * latency['found']:.1f}",
-        "",
-        f"{1e3 * latency['true']:.1f}",
-    )
-    console.print(table)
-    for name, row in summary["known"].items():
-        console.print(f"{name}, not fitted: {row['value']:.4g}, truth {row['truth']:.4g}")
     result = done.found.result
-    for words in result.null_directions:
-        console.print(f"the data cannot tell: {words}")
-    for alarm in result.alarms:
-        console.print(f"alarm: {alarm}")
-
-    table = Table(title=done.comparison)
-    table.add_column("policy")
-    for measure in done.measures:
-        table.add_column(measure.heading, justify="right")
-    for policy in done.measures[0].values:
-        cells = []
-        for m in done.measures:
-            spread = f" ± {summary[m.std_name][policy]:.4f}" if len(m.values[policy]) > 1 else ""
-            cells.append(f"{summary[m.name][policy]:.4f}{spread}")
-        table.add_row(policy, *cells)
+    for k, (name, row) in enumerate(summary["parameters"].items()):
+        found = (
+            "no value" if result.verdicts[k : k + 1] == ("not identifiable",) else f"{row['estimate']:.4g}"
+        )
+        _add(
+            table, name, row["unit"], f"{row['nominal']:.4g}", found, (row["low"], row["high"]), row["truth"]
+        )
+    for name, row in summary["known"].items():
+        table.add_row(name, "", "", f"{row['value']:.4g}", "not fitted", f"{row['truth']:.4g}")
+    latency = summary["latency_s"]
+    low, high = (1e3 * end for end in result.latency_interval_s)
+    _add(table, "latency", "ms", "0", f"{1e3 * latency['found']:.1f}", (low, high), 1e3 * latency["true"])
     console.print(table)
-    errors = summary["heldout_nrmse"]
-    console.print(f"held-out error: nominal {errors['nominal']:.4f}, calibrated {errors['calibrated']:.4f}")
-    console.print(
-        "seconds: " + ", ".join(f"{name} {value:.0f}" for name, value in summary["seconds"].items())
-    )
-    for name, path in summary["paths"].items():
-        console.print(f"{name}: {path}", soft_wrap=True)
-    console.print(
-        f"summary: {folder / 'summary.json'}; look at it with: deal-hw inspect --help", soft_wrap=True
-    )
+    for command in (
+        f"deal-hw inspect {done.episode} --calibration {folder / 'calibration'}",
+        f"python3 -m webbrowser {folder / 'calibration' / 'report.html'}",
+    ):
+        console.print(command, markup=False, soft_wrap=True)
+
+
+def _add(
+    table: Table, name: str, unit: str, nominal: str, found: str, interval: tuple[float, float], truth: float
+) -> None:
+    low, high = interval
+    mark = "" if low <= truth <= high else " (outside)"
+    table.add_row(name, escape(unit), nominal, found, f"{low:.4g} .. {high:.4g}", f"{truth:.4g}{mark}")

@@ -14,7 +14,15 @@ import numpy as np
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.cli.calibrate import Calibrate, CalibrateReport, calibrate
 from deal_hw.cli.collect import Collect, collect
-from deal_hw.cli.demo import Demo, Demonstrated, Measure, Stages, read_truth, show_first_episode
+from deal_hw.cli.demo import (
+    Demo,
+    Demonstrated,
+    Measure,
+    Stages,
+    first_episode,
+    read_truth,
+    show_episode,
+)
 from deal_hw.cli.deploy import Deploy, deploy
 from deal_hw.cli.train import Train, train
 from deal_hw.control.loop import Outcome
@@ -89,15 +97,17 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
             with stages.stage(f"walk {name}", "the same velocities again"):
                 walks[name] = robot.walk(policy, profile, PROFILE_S, out / f"walk_{name}", episodes)
     with stages.stage("inspect", "real, nominal and calibrated on one screen"):
-        rrd = show_first_episode(folder, out / "dataset_on_stand" if config.on_stand else None)
+        episode = first_episode(out / "dataset_on_stand" if config.on_stand else folder.dataset)
+        rrd = show_episode(folder, episode)
     truth = read_truth(out / "truth_after.json")
     true = truth["parameters_at_kp20_kd1.5" if config.on_stand else "walk_parameters"]
     return Demonstrated(
         found=found,
         truth=true,
         latency_s=1e-3 * truth["latency_ms"],
-        measures=_measures(walks),
-        comparison="policies on the robot, mean ± std over walks, by the emulator's truth",
+        measures=(measures := _measures(walks)),
+        sentence=_sentence(measures),
+        episode=episode,
         run=walks["calibrated"].report,
         paths={
             "rrd": str(rrd),
@@ -290,20 +300,33 @@ def _measures(walks: Mapping[str, _Walked]) -> list[Measure]:
         Measure(
             name="velocity_error_m_s",
             unit="m_s",
-            heading="velocity error [m/s]",
             values=each(judged, "velocity_m_s"),
         ),
         Measure(
             name="yaw_error_rad_s",
             unit="rad_s",
-            heading="yaw rate error [rad/s]",
             values=each(judged, "yaw_rad_s"),
         ),
         Measure(
             name="estimated_velocity_error_m_s",
             unit="m_s",
-            heading="its own estimate [m/s]",
             values=each(own, "velocity_m_s"),
         ),
-        Measure(name="falls", heading="falls", values=falls),
+        Measure(name="falls", values=falls),
     ]
+
+
+def _sentence(measures: Sequence[Measure]) -> str:
+    """Return how well the policies followed, by what was measured of the walks."""
+    by_name = {measure.name: measure.values for measure in measures}
+
+    def walked(policy: str) -> str:
+        errors, falls = by_name["velocity_error_m_s"][policy], by_name["falls"][policy]
+        seen = errors[np.isfinite(errors)]
+        missed = f"missed the velocity by {seen.mean():.3f} m/s" if seen.size else "was not judged"
+        return f"{missed} in {seen.size} of {errors.size} walks, {falls.sum():.0f} of which ended early"
+
+    return (
+        f"Fine-tuned under the calibration the policy {walked('calibrated')}; fine-tuned as long without it "
+        f"{walked('udr more')}; as shipped it {walked('udr')}."
+    )

@@ -44,7 +44,16 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     assert Path(summary["paths"]["rrd"]).stat().st_size > 10_000
     assert json.loads((folder / "run.json").read_text())["status"] == "finished"
     printed = capsys.readouterr().out
-    assert "cart.mass" in printed and "retrained" in printed and "held-out error" in printed
+    end = printed[printed.rindex("== inspect") :]
+    words = " ".join(end.split())
+    assert "The policy that was trained under the calibration held the pole up for" in words
+    assert words.count("in 1 deployment") == 2 and "\u00b1" not in end
+    assert "cart.mass" in end and "latency" in end and end.count("what the calibrator found") == 1
+    inspect, page = end.strip().splitlines()[-2:]
+    assert (
+        inspect == f"deal-hw inspect {folder}/dataset/episodes/000000.mcap --calibration {folder}/calibration"
+    )
+    assert Path(inspect.split()[2]).is_file() and Path(page.removeprefix("python3 -m webbrowser ")).is_file()
 
 
 @pytest.mark.slow
@@ -72,7 +81,8 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     assert (folder / "truth_track_before.csv").exists()
     assert not list((folder / "dataset").rglob("*truth*"))
     printed = capsys.readouterr().out
-    assert "FL_hip_joint.stiffness" in printed and "its own estimate" in printed
+    assert "FL_hip_joint.stiffness" in printed and "base.mass" in printed
+    assert "Fine-tuned under the calibration the policy missed the velocity by" in " ".join(printed.split())
 
 
 def test_a_walk_with_a_clock_jump_is_walked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

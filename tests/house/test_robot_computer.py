@@ -59,7 +59,7 @@ from deal_hw.errors import DealHwError
 from deal_hw.transport import WireOptions
 
 transport, port, domain = sys.argv[1], sys.argv[2], int(sys.argv[3])
-options = WireOptions(domain=domain, listen=transport == "zenoh")
+options = WireOptions(listen=True) if transport == "zenoh" else WireOptions(domain=domain)
 
 def loaded():
     return sorted({name.partition(".")[0] for name in sys.modules})
