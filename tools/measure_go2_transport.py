@@ -114,9 +114,9 @@ def measure(settings: TransportBench) -> tuple[dict[str, Any], dict[str, Any]]:
         "rate_hz": settings.rate,
         "cycles": round(settings.seconds * settings.rate),
     }
-    wire = settings.wire.to_json()
-    # Zenoh needs one side that waits, and a client cannot; DDS does not care.
-    robot_wire, wire = {**wire, "listen": True, "mode": "peer"}, {**wire, "listen": False}
+    wire = {**settings.wire.to_json(), "listen": False}
+    # Zenoh needs one side that waits, and a client cannot; DDS has no sides.
+    robot_wire = {**wire, "listen": True, "mode": "peer"} if settings.transport == "zenoh" else wire
     with (
         _monitored() as seen,
         SideProcess("robot", {**orders, "wire": robot_wire}) as robot,
