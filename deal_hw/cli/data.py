@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from deal_hw.data.recording.dataset import INDEX_NAME, Dataset
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.repair import RepairReport, repair, verify
+from deal_hw.data.run_folder import INDEX_NAME, dataset_of
 from deal_hw.errors import DatasetError
 from deal_hw.workflows.import_export import (
     ExportSettings,
@@ -94,7 +95,7 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
         DatasetError: The path is neither a dataset nor an episode, or cannot be read or written.
     """
     if isinstance(config, InfoSettings):
-        return _info(config)
+        return _info(replace(config, path=dataset_of(config.path)))
     if isinstance(config, Import):
         dataset = import_recordings(config, aloud)
         if dataset is not None:
@@ -104,6 +105,7 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
         count, robot = export_recordings(config, aloud)
         print(f"{config.out}: {count} LeRobot episodes of {robot}")
         return EXIT_OK
+    config = replace(config, path=dataset_of(config.path))
     reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))
     errors += carried_problems(config.path)
     if config.json:

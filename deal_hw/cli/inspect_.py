@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from deal_hw.data.recording.reader import read_episode
+from deal_hw.data.run_folder import episode_of
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
 from deal_hw.workflows.inspect import InspectSettings, predicted
@@ -78,11 +79,12 @@ def inspect(config: Inspect) -> InspectReport:
         ConfigurationError: A setting cannot be used, or this machine cannot show it; the message says what
             would do.
     """
-    episode = read_episode(config.episode)
+    path = episode_of(config.episode)
+    episode = read_episode(path)
     window = not (config.save or config.screenshot or config.web)
     if window:
         check_display()
-    found = predicted(config, config.episode, episode)
+    found = predicted(config, path, episode)
     with found.saved(None if config.save is None else found.save(config.save)) as rrd:
         if config.screenshot:
             found.screenshot(config.screenshot, config.at, rrd=rrd)

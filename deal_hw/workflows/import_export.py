@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from deal_hw.data.run_folder import dataset_of
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
@@ -210,7 +211,7 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
     from deal_hw.data.recording.reader import read_trajectory
 
     if config.path.is_dir():
-        dataset = Dataset.open(config.path, say)
+        dataset = Dataset.open(dataset_of(config.path), say)
         paths = [dataset.path(index) for index in range(len(dataset.episodes))]
     else:
         paths = [config.path]

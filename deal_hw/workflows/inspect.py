@@ -11,6 +11,7 @@ from typing import Annotated, Protocol
 
 from deal_hw.calibration import CalibrationResult, read_result
 from deal_hw.data.recording.reader import Episode, read_episode
+from deal_hw.data.run_folder import episode_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
@@ -174,7 +175,7 @@ def inspect(settings: InspectSettings) -> Inspection:
         DatasetError: The recording cannot be read.
         ConfigurationError: A setting cannot be used.
     """
-    path = Path(settings.episode)
+    path = episode_of(settings.episode)
     return predicted(settings, path, read_episode(path))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from deal_hw.control.behaviours import ReplayBehaviour
 from deal_hw.data.recording.reader import read_trajectory
+from deal_hw.data.run_folder import episode_of
 from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import Trajectory
@@ -71,12 +72,13 @@ def replay(settings: ReplaySettings) -> RunReport:
 def run(config: ReplaySettings, view: RunView) -> RunReport:
     """Replay a recording, as :func:`replay`, and show it."""
     check_simulation(config, ReplaySettings(config.episode))
-    path, trajectory = Path(config.episode), read_trajectory(Path(config.episode))
+    path = episode_of(config.episode)
+    trajectory = read_trajectory(path)
     dataset = path.resolve().parent.parent
     recorded = str(dataset) if carries_robot(dataset) else str(trajectory.metadata.get("robot", ""))
     robot = config.robot or recorded
     if config.simulation.simulated:
-        return _rehearse(config, view, robot, trajectory)
+        return _rehearse(config, view, robot, path, trajectory)
     require_driver(robot, config.port)
     behaviour = ReplayBehaviour(trajectory, driver_description(robot))
     plan = RunPlan(
@@ -95,15 +97,16 @@ def run(config: ReplaySettings, view: RunView) -> RunReport:
     )
 
 
-def _rehearse(config: ReplaySettings, view: RunView, robot: str, trajectory: Trajectory) -> RunReport:
+def _rehearse(
+    config: ReplaySettings, view: RunView, robot: str, path: Path, trajectory: Trajectory
+) -> RunReport:
     """Replay on a user's robot in simulation."""
-    path = Path(config.episode).resolve()
     description = user_robot(robot).description()
     behaviour = ReplayBehaviour(trajectory, description)
     folder = recording_folder(config.out, config.dataset, "replay", description.name, record=config.record)
     if folder is None:
         raise ConfigurationError("--no-record: a rehearsal is there to be recorded; leave the option out")
-    plan = RunPlan(robot=robot, profile="replay", recording=str(path), seconds=behaviour.duration_s)
+    plan = RunPlan(robot=robot, profile="replay", recording=str(path.resolve()), seconds=behaviour.duration_s)
     return run_simulated(
         plan, robot, config.simulation, dataset=folder, episodes=1, purpose="replay", view=view
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from deal_hw.data.files import write_bytes
+from deal_hw.data.run_folder import dataset_of
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import DESCRIPTIONS, ROBOTS, parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
@@ -172,7 +173,7 @@ def user_robot(robot: str) -> UserRobot:
     if not Path(robot).is_dir():
         return load_robot(Path(robot))
     described(robot)
-    return load_robot(Path(robot) / "robot" / "robot.yaml")
+    return load_robot(dataset_of(robot) / "robot" / "robot.yaml")
 
 
 def described(robot: str) -> RobotDescription:
@@ -188,7 +189,8 @@ def described(robot: str) -> RobotDescription:
     if Path(robot).is_dir():
         from deal_hw.data.recording.dataset import Dataset
 
-        return recorded_robot(Dataset.open(Path(robot)).description, Path(robot))
+        folder = dataset_of(robot)
+        return recorded_robot(Dataset.open(folder).description, folder)
     return load_robot(Path(robot)).description()
 
 

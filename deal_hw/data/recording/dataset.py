@@ -19,13 +19,13 @@ from deal_hw.data.files import write_bytes, write_json
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.reader import Episode, check_description, read_episode
 from deal_hw.data.recording.repair import repair
+from deal_hw.data.run_folder import INDEX_NAME
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
 from deal_hw.reading import MIB, read_json
 from deal_hw.schema import STRICT
 
 SCHEMA_VERSION = 1
-INDEX_NAME = "dataset.json"
 POLICY_FOLDER = "policies"
 _WHAT = "the index of a dataset"
 _INDEX_BYTES = 64 * MIB

@@ -12,6 +12,7 @@ import numpy as np
 from deal_hw.calib.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, Budget, CalibrationResult, ProgressCallback
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
+from deal_hw.data.run_folder import dataset_of
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
@@ -141,6 +142,8 @@ class CalibrateSettings(Checked):
             UnknownNameError: There is no such method.
         """
         check_source(dataset=self.dataset is not None, model=self.recordings.model is not None)
+        if self.dataset is not None:
+            object.__setattr__(self, "dataset", dataset_of(self.dataset))
         if self.recordings.model is None:
             carries = carries_robot(self.dataset)
             foreign = given(self.recordings, Recordings(), FROM_FILES if carries else ())
