@@ -34,6 +34,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.model import load_model
 from deal_hw.training import TrainingFiles
 from deal_hw.types import Event, Trajectory
+from deal_hw.workflows.import_export import ExportSettings, export_recordings
 from deal_hw.workflows.train import nominal_distribution, train_policy
 
 SCRIPTS = Path(__file__).resolve().parent / "readers"
@@ -68,7 +69,7 @@ READERS = (
         name="foxglove",
         packages=("foxglove-sdk", "protobuf", *_MCAP),
         script="read_foxglove.py",
-        inputs=("episode_go2.mcap",),
+        inputs=("episode_go2.mcap", "scene/episode_cartpole.mcap"),
     ),
     Reader(name="rerun", packages=("rerun-sdk",), script="read_rerun.py", inputs=("episode_go2.mcap",)),
     Reader(
@@ -100,6 +101,9 @@ def make_samples(folder: Path) -> None:
     for robot in ("cartpole", "go2"):
         made = cycles(robot, 100, np.random.default_rng(0))
         _record(folder / f"episode_{robot}.mcap", robot, made)
+    export_recordings(
+        ExportSettings(path=folder / "episode_cartpole.mcap", out=folder / "scene", format="foxglove")
+    )
     # A cycle that never reached the recorder takes its samples along.
     made = cycles("cartpole", 100, np.random.default_rng(1))
     _record(folder / "holes.mcap", "cartpole", [*made[:40], *made[41:]])

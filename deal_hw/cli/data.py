@@ -103,7 +103,8 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
         return EXIT_OK
     if isinstance(config, Export):
         count, robot = export_recordings(config, aloud)
-        print(f"{config.out}: {count} LeRobot episodes of {robot}")
+        layout = {"lerobot": "LeRobot", "foxglove": "Foxglove"}[config.format]
+        print(f"{config.out}: {count} {layout} episodes of {robot}")
         return EXIT_OK
     config = replace(config, path=dataset_of(config.path))
     reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -59,10 +60,11 @@ class ExportSettings(Checked):
     """A dataset (DIR), or an episode (DIR/episodes/000000.mcap)."""
     out: Path
     """The folder to write."""
-    format: Literal["lerobot"] = "lerobot"
-    """The layout: LeRobot v3.0 (Parquet; needs the extra lerobot)."""
+    format: Literal["lerobot", "foxglove"] = "lerobot"
+    """The layout: LeRobot v3.0 (Parquet; needs the extra lerobot), or episodes (MCAP) with the robot in 3D
+    for Foxglove (needs the extra sim)."""
     task: str = "deal-hw"
-    """What the robot did, in words."""
+    """What the robot did, in words; of LeRobot."""
 
 
 def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | None:
@@ -215,12 +217,44 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
         paths = [dataset.path(index) for index in range(len(dataset.episodes))]
     else:
         paths = [config.path]
+    if config.format == "foxglove":
+        refuse(
+            given(config, ExportSettings(path=config.path, out=config.out), ("task",)),
+            "--format lerobot has it",
+        )
+        return len(paths), _with_scene(paths, config.out, say)
     trajectories = [read_trajectory(path) for path in paths]
     robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
     frames, filled = export_lerobot(trajectories, config.out, robot, config.task)
     if filled:
         say(f"{filled} of {frames} frames stand for lost samples: interpolated, and `filled` is true there")
     return len(trajectories), robot
+
+
+def _with_scene(paths: Sequence[Path], folder: Path, say: Say) -> str:
+    """Write episodes with the robot in 3D; return its name."""
+    import numpy as np
+
+    from deal_hw.data.export.foxglove import export_foxglove
+    from deal_hw.data.recording.reader import read_episode
+    from deal_hw.drivers import recorded_description
+    from deal_hw.sim.engine.model import load_model
+    from deal_hw.sim.engine.scene import body_poses, read_scene
+    from deal_hw.sim.recordings.standing import sensed_base
+
+    folder.mkdir(parents=True, exist_ok=True)
+    name = ""
+    for path in paths:
+        episode = read_episode(path)
+        name = str(episode.description["name"])
+        robot = load_model(recorded_description(name))
+        trajectory = episode.trajectory
+        poses = body_poses(robot, trajectory.position, sensed_base(robot, trajectory))
+        scene = read_scene(robot)
+        stamps_ns = episode.start_ns + np.round(trajectory.receive_s * 1e9).astype(np.int64)
+        moments = export_foxglove(path, folder / path.name, scene.bodies, stamps_ns, poses, scene.shapes)
+        say(f"{folder / path.name}: {len(scene.shapes)} shapes at {moments} moments")
+    return name
 
 
 def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:

@@ -17,9 +17,11 @@ from deal_hw.cli.data import Import, data
 from deal_hw.data.importing import mcap_source
 from deal_hw.data.importing.columns import parse_column_map
 from deal_hw.data.importing.load import load_tables
+from deal_hw.data.importing.table import table_of
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import parse_yaml
+from deal_hw.types import Trajectory
 
 LINE = "=" * 80 + "\nMSG: "
 TIME = LINE + "builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -266,6 +268,13 @@ def test_our_own_episode_reads_as_any_file(write_episode: Callable[..., Path]) -
     )
     (renamed,) = load_tables(path, columns)
     np.testing.assert_allclose(renamed.position[:, 0], -table.position[:, 0])
+
+
+def test_efforts_that_nobody_measured_are_no_channel(make_trajectory: Callable[..., Trajectory]) -> None:
+    """An import without efforts has NaN there; importing that again must not warn of it."""
+    measured = make_trajectory()
+    nothing = make_trajectory(effort=np.full(measured.effort.shape, np.nan))
+    assert table_of(nothing).effort is None and table_of(measured).effort is not None
 
 
 def test_our_own_episodes_are_taken_in_as_they_are(

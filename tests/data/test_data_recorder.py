@@ -131,7 +131,7 @@ def test_mcap_ros2_reads_the_whole_file(write_episode: WriteEpisode) -> None:
     assert states[10].position == [0.01, 0.1]
 
 
-WALL_NS = 1_760_000_000_123_456_789
+WALL_NS = 1_760_000_000_123_456_000
 
 
 def standard_messages(path: Path) -> dict[str, list[tuple[int, Any]]]:

@@ -230,10 +230,11 @@ class EpisodeRecorder:
             self._oldest_ns = min(max(stamp_ns, 0), self._clock.now_ns())
 
     def _preamble(self) -> dict[str, str]:
-        host_ns, wall_ns = self._clock.now_ns(), self._read_wall_ns()
+        # Whole microseconds, as wall_utc has them: the difference can be taken from the file again.
+        host_ns, wall_ns = self._clock.now_ns(), self._read_wall_ns() // 1000 * 1000
         # One difference for the whole episode: a wall clock that is set meanwhile must not bend its times.
         self._wall_minus_host_ns = wall_ns - host_ns
-        wall = datetime.datetime.fromtimestamp(wall_ns // 1000 / 1e6, datetime.timezone.utc)
+        wall = datetime.datetime.fromtimestamp(wall_ns / 1e9, datetime.timezone.utc)
         return {
             "format_version": str(FORMAT_VERSION),
             "host_ns": str(host_ns),
