@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from gymnasium.envs import registration
 
 IDS: Mapping[str, str] = {
+    "deal_hw/Allegro-v0": "allegro",
     "deal_hw/Ant-v0": "ant",
     "deal_hw/CartPole-v0": "cartpole",
     "deal_hw/Go2-v0": "go2",
+    "deal_hw/Humanoid-v0": "humanoid",
 }
 """Gymnasium's name -> robot."""
 
