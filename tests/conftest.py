@@ -13,6 +13,16 @@ settings.load_profile("deal_hw")
 REAL_TIME = {"cli", "contracts", "control", "drivers", "tools", "workflows"}
 """Folders of tests with processes that run in real time; two of these at once would disturb each other."""
 
+COMPUTING = (
+    "test_cli_calibrate_",
+    "test_tools_check_readers",
+    "test_tools_compare_rows",
+    "test_tools_convert_so101",
+    "test_tools_measure_size",
+    "test_tools_structure",
+)
+"""Files of these folders that compute and nothing else, by how their names begin: they go to any worker."""
+
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
@@ -22,6 +32,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class Scheduling(LoadScopeScheduling):  # type: ignore[misc, unused-ignore]
         def _split_scope(self, nodeid: str) -> str:
             file = nodeid.partition("::")[0]
-            return "real time" if PurePosixPath(file).parts[1] in REAL_TIME else file
+            path = PurePosixPath(file)
+            real_time = path.parts[1] in REAL_TIME and not path.name.startswith(COMPUTING)
+            return "real time" if real_time else file
 
     return Scheduling(config, log)

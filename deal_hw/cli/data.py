@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from deal_hw.data.files import INDEX_NAME, dataset_of
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.repair import RepairReport, repair, verify
-from deal_hw.data.run_folder import INDEX_NAME, dataset_of
 from deal_hw.errors import DatasetError
 from deal_hw.workflows.import_export import (
     ExportSettings,

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import tyro
 
+from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_episode
-from deal_hw.data.run_folder import episode_of
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
 from deal_hw.workflows.inspect import InspectSettings, predicted

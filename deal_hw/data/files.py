@@ -1,4 +1,4 @@
-"""Writes files so that a crash leaves no half of them; reads episodes up to a size."""
+"""Writes files so that a crash leaves no half of them; finds episodes, and reads them up to a size."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from mcap.writer import MCAP0_MAGIC
 from deal_hw.errors import DatasetError, EmptyRecordingError
 from deal_hw.reading import read_bytes, reading
 
+INDEX_NAME = "dataset.json"
+"""Of a dataset's index, in its folder."""
 MAX_EPISODE_BYTES = 4 << 30
 """An episode is read into memory as a whole; a Go2 with its raw bytes records 0.7 MB/s at most [B]."""
 
@@ -138,3 +140,26 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def dataset_of(folder: Path | str) -> Path:
+    """Return the dataset's folder, where a dataset or a run that holds one is named; else what was named."""
+    folder = Path(folder)
+    inside = folder / "dataset"
+    return inside if not (folder / INDEX_NAME).exists() and (inside / INDEX_NAME).is_file() else folder
+
+
+def episode_of(path: Path | str) -> Path:
+    """Return the recording, where it, or a dataset or a run with this one episode, is named.
+
+    Raises:
+        DatasetError: It is a folder of another number of episodes.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return path
+    files = sorted((dataset_of(path) / "episodes").glob("*.mcap"))
+    if len(files) == 1:
+        return files[0]
+    example = files[0] if files else dataset_of(path) / "episodes" / "000000.mcap"
+    raise DatasetError(f"{path} is a folder with {len(files)} episodes; name one of them, such as {example}")

@@ -19,7 +19,6 @@ from deal_hw.data.files import write_json
 from deal_hw.errors import DatasetError
 from deal_hw.reading import read_json
 
-INDEX_NAME = "dataset.json"
 _PACKAGES = (
     "deal-hw",
     "numpy",
@@ -31,29 +30,6 @@ _PACKAGES = (
     "mcap",
     "rerun-sdk",
 )
-
-
-def dataset_of(folder: Path | str) -> Path:
-    """Return the dataset's folder, where a dataset or a run that holds one is named; else what was named."""
-    folder = Path(folder)
-    inside = folder / "dataset"
-    return inside if not (folder / INDEX_NAME).exists() and (inside / INDEX_NAME).is_file() else folder
-
-
-def episode_of(path: Path | str) -> Path:
-    """Return the recording, where it, or a dataset or a run with this one episode, is named.
-
-    Raises:
-        DatasetError: It is a folder of another number of episodes.
-    """
-    path = Path(path)
-    if not path.is_dir():
-        return path
-    files = sorted((dataset_of(path) / "episodes").glob("*.mcap"))
-    if len(files) == 1:
-        return files[0]
-    example = files[0] if files else dataset_of(path) / "episodes" / "000000.mcap"
-    raise DatasetError(f"{path} is a folder with {len(files)} episodes; name one of them, such as {example}")
 
 
 class RunFolder:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from deal_hw.data.run_folder import dataset_of
+from deal_hw.data.files import dataset_of
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording

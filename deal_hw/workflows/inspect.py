@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Annotated, Protocol
 
 from deal_hw.calibration import CalibrationResult, read_result
+from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import Episode, read_episode
-from deal_hw.data.run_folder import episode_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from deal_hw.control.behaviours import ReplayBehaviour
+from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_trajectory
-from deal_hw.data.run_folder import episode_of
 from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import Trajectory

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from deal_hw.data.files import write_bytes
-from deal_hw.data.run_folder import dataset_of
+from deal_hw.data.files import dataset_of, write_bytes
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import DESCRIPTIONS, ROBOTS, parameter_spaces, recorded_description
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.data.run_folder import dataset_of, episode_of
+from deal_hw.data.files import dataset_of, episode_of
 from deal_hw.errors import DatasetError
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mcap.records import Chunk, Metadata
 
+from deal_hw.data.files import INDEX_NAME
 from deal_hw.data.importing.channels import Channels
 from deal_hw.data.importing.columns import ColumnMap
 from deal_hw.data.importing.csv_source import read_csv
@@ -22,7 +23,6 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.mcap_scan import FoundRecord, scan
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder import METADATA_NAME
-from deal_hw.data.run_folder import INDEX_NAME
 from deal_hw.errors import DatasetError
 from deal_hw.reading import reading
 

@@ -15,11 +15,10 @@ from typing import Any, ClassVar
 
 from typing_extensions import Self
 
-from deal_hw.data.files import write_bytes, write_json
+from deal_hw.data.files import INDEX_NAME, write_bytes, write_json
 from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
 from deal_hw.data.recording.reader import Episode, check_description, read_episode
 from deal_hw.data.recording.repair import repair
-from deal_hw.data.run_folder import INDEX_NAME
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
 from deal_hw.reading import MIB, read_json

@@ -11,8 +11,8 @@ import numpy as np
 
 from deal_hw.calib.methods import check_method, usual_budget
 from deal_hw.calibration import LATENCY_RANGE_S, Budget, CalibrationResult, ProgressCallback
+from deal_hw.data.files import dataset_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
-from deal_hw.data.run_folder import dataset_of
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.types import FloatArray
