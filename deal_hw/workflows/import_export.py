@@ -13,7 +13,7 @@ from deal_hw.reading import number, read_json, reading
 from deal_hw.workflows.calibration.checks import examine_recording
 from deal_hw.workflows.calibration.recordings import on_grid
 from deal_hw.workflows.options import Checked, Range, given, refuse
-from deal_hw.workflows.robot import load_robot
+from deal_hw.workflows.robot import load_robot, recorded_robot
 from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
@@ -237,7 +237,6 @@ def _with_scene(paths: Sequence[Path], folder: Path, say: Say) -> str:
 
     from deal_hw.data.export.foxglove import export_foxglove
     from deal_hw.data.recording.reader import read_episode
-    from deal_hw.drivers import recorded_description
     from deal_hw.sim.engine.model import load_model
     from deal_hw.sim.engine.scene import body_poses, read_scene
     from deal_hw.sim.recordings.standing import sensed_base
@@ -247,7 +246,7 @@ def _with_scene(paths: Sequence[Path], folder: Path, say: Say) -> str:
     for path in paths:
         episode = read_episode(path)
         name = str(episode.description["name"])
-        robot = load_model(recorded_description(name))
+        robot = load_model(recorded_robot(episode.description, path.resolve().parent.parent))
         trajectory = episode.trajectory
         poses = body_poses(robot, trajectory.position, sensed_base(robot, trajectory))
         scene = read_scene(robot)

@@ -85,6 +85,15 @@ def test_a_dataset_of_an_mjcf_alone_carries_its_robot(made: Path, tmp_path: Path
     assert load_robot(tmp_path / "d" / "robot" / "robot.yaml").file.name == "robot"
 
 
+def test_a_carried_robot_leaves_with_its_shapes(made: Path, tmp_path: Path) -> None:
+    """Foxglove's 3D panel gets the robot that the dataset carries, as inspect does."""
+    words = ["data", "export", str(made / "run"), "--format", "foxglove", "--out", str(tmp_path / "out")]
+    assert main(words) == EXIT_OK
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == sorted(path.name for path in (made / "run" / "dataset" / "episodes").iterdir())
+    assert b"/scene" in (tmp_path / "out" / written[0]).read_bytes()
+
+
 def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
     """A simulated robot is recorded, again and by its dataset; what it hides is the seed's."""
     yaml = tmp_path / "robot.yaml"
