@@ -78,29 +78,24 @@ class TrainingTask:
         return made, made.config(**settings)
 
 
+def _simulated(environment: str, motors: int, udr_ratio: float) -> TrainingTask:
+    """Return the task of a robot that exists in simulators only."""
+    return TrainingTask(
+        environment=f"deal_hw.policies.{environment}",
+        trainer="sac",
+        members={"ppo": 200, "sac": 64},
+        settings={
+            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
+            "sac": {**_LEGGED_SAC, "target_entropy": -float(motors)},
+        },
+        udr_ratio=udr_ratio,
+        udr_latency_s=(0.0, 0.02),
+    )
+
+
 TASKS: Final = {
-    "allegro": TrainingTask(
-        environment="deal_hw.policies.hand_env:HandEnv",
-        trainer="sac",
-        members={"ppo": 200, "sac": 64},
-        settings={
-            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
-            "sac": {**_LEGGED_SAC, "target_entropy": -16.0},
-        },
-        udr_ratio=1.75,
-        udr_latency_s=(0.0, 0.02),
-    ),
-    "ant": TrainingTask(
-        environment="deal_hw.policies.run_env:RunEnv",
-        trainer="sac",
-        members={"ppo": 200, "sac": 64},
-        settings={
-            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
-            "sac": {**_LEGGED_SAC, "target_entropy": -8.0},
-        },
-        udr_ratio=5.0,
-        udr_latency_s=(0.0, 0.02),
-    ),
+    "allegro": _simulated("hand_env:HandEnv", motors=16, udr_ratio=1.75),
+    "ant": _simulated("run_env:RunEnv", motors=8, udr_ratio=5.0),
     "cartpole": TrainingTask(
         environment="deal_hw.policies.cartpole_env:CartPoleEnv",
         trainer="sac",
@@ -117,17 +112,7 @@ TASKS: Final = {
         udr_ratio=1.75,
         udr_latency_s=(0.0, 0.012),
     ),
-    "humanoid": TrainingTask(
-        environment="deal_hw.policies.run_env:HumanoidEnv",
-        trainer="sac",
-        members={"ppo": 200, "sac": 64},
-        settings={
-            "ppo": {"steps": 3_000_000, "reward_scale": 0.05},
-            "sac": {**_LEGGED_SAC, "target_entropy": -21.0},
-        },
-        udr_ratio=1.75,
-        udr_latency_s=(0.0, 0.02),
-    ),
+    "humanoid": _simulated("run_env:HumanoidEnv", motors=21, udr_ratio=1.75),
 }
 
 

@@ -242,18 +242,20 @@ def _with_scene(paths: Sequence[Path], folder: Path, say: Say) -> str:
     from deal_hw.sim.recordings.standing import sensed_base
 
     folder.mkdir(parents=True, exist_ok=True)
-    name = ""
+    if not paths:
+        return ""
+    # The episodes of a dataset are of one robot.
+    description = recorded_robot(read_episode(paths[0]).description, paths[0].resolve().parent.parent)
+    robot = load_model(description)
+    scene = read_scene(robot)
     for path in paths:
         episode = read_episode(path)
-        name = str(episode.description["name"])
-        robot = load_model(recorded_robot(episode.description, path.resolve().parent.parent))
         trajectory = episode.trajectory
         poses = body_poses(robot, trajectory.position, sensed_base(robot, trajectory))
-        scene = read_scene(robot)
         stamps_ns = episode.start_ns + np.round(trajectory.receive_s * 1e9).astype(np.int64)
         moments = export_foxglove(path, folder / path.name, scene.bodies, stamps_ns, poses, scene.shapes)
         say(f"{folder / path.name}: {len(scene.shapes)} shapes at {moments} moments")
-    return name
+    return description.name
 
 
 def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:

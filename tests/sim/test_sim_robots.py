@@ -18,7 +18,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.errors import ConfigurationError, DatasetError, TransportTimeoutError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.robots.carried import FOLDER, carried_description, carries, carry
+from deal_hw.sim.robots.carried import FOLDER, carried_description, carry
 from deal_hw.sim.robots.holding import hold
 from deal_hw.sim.robots.robot_file import (
     ActuatorEntry,
@@ -30,7 +30,7 @@ from deal_hw.sim.robots.robot_file import (
 from deal_hw.sim.robots.simulated import SimulatedRobot, SimulatedTruth, draw_truth
 from deal_hw.sim.robots.user_robot import derive_robot, read_robot
 from deal_hw.types import JointCommand, Status
-from deal_hw.workflows.robot import default_space
+from deal_hw.workflows.robot import carries_robot, default_space
 
 LINK = """
 <body name="{name}">
@@ -280,10 +280,10 @@ def test_a_dataset_keeps_what_the_model_needs(spread: Path, tmp_path: Path) -> N
     robot = read_robot(spread)
     dataset = tmp_path / "dataset"
     dataset.mkdir()
-    assert not carries(dataset)
+    assert not carries_robot(dataset)
     carry(robot, dataset)
     carry(robot, dataset)
-    assert carries(dataset) and not [path for path in dataset.iterdir() if path.name != FOLDER]
+    assert carries_robot(dataset) and not [path for path in dataset.iterdir() if path.name != FOLDER]
     kept = sorted(str(p.relative_to(dataset / FOLDER)) for p in (dataset / FOLDER).rglob("*") if p.is_file())
     assert kept == ["files.json", "meshes/lump.obj", "mjcf/arm.xml", "mjcf/more.xml", "robot.yaml"]
     description = robot.description()

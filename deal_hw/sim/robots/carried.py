@@ -54,11 +54,6 @@ def carry(robot: UserRobot, dataset: Path) -> None:
         raise DatasetError(f"{dataset / FOLDER} cannot be written: {error.strerror}") from error
 
 
-def carries(dataset: Path) -> bool:
-    """Say whether a folder carries a robot."""
-    return (Path(dataset) / FOLDER / INDEX).is_file()
-
-
 def carried_description(dataset: Path, values: Mapping[str, Any]) -> RobotDescription:
     """Return the description of a dataset's recordings, with the MJCF that the dataset carries.
 
