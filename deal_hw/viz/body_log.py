@@ -21,7 +21,10 @@ def log_body(log: Log, trajectory: Trajectory, body: BodyTrajectory, description
     def traces(
         group: str, names: tuple[str, ...], values: FloatArray, colors: tuple[tuple[int, int, int], ...]
     ) -> None:
-        for i, name in enumerate(names):
+        # An imported recording has of all this the IMU alone.
+        for i, name in enumerate(names[: values.shape[1]]):
+            if not np.isfinite(values[:, i]).any():
+                continue
             path = f"/body/{group}/{name.replace(' ', '_')}"
             log.line(path, name, colors[i % len(colors)])
             log.scalars(path, *clocks, values[:, i])

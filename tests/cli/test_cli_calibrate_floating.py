@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.drivers.go2.motions import FEET, sway
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -80,3 +81,25 @@ def test_stiffness_is_found_from_joints_and_imu(folder: Path) -> None:
     rmse = found["provenance"]["heldout_rmse"]
     assert rmse["mean"]["calibrated"] < rmse["mean"]["nominal"]
     assert len(rmse["by_coordinate"]["null"]) == 15
+
+
+def test_a_dataset_keeps_the_base_of_a_floating_robot(folder: Path, tmp_path: Path) -> None:
+    """IMU, feet and MJCF come with it: the same stiffness as from the file itself, and inspect shows it."""
+    yaml, dataset = tmp_path / "robot.yaml", tmp_path / "run" / "dataset"
+    new = ["robot", "new", str(DESCRIPTION.mjcf), "--out", str(yaml), "--name", "dog", "--feet", *FEET]
+    assert main([*new, "--control-rate", "50", "--state-rate", "250"]) == EXIT_OK
+    words = ["data", "import", str(folder / "rec.npz"), "--columns", str(folder / "columns.yaml")]
+    assert main([*words, "--robot", str(yaml), "--out", str(dataset)]) == EXIT_OK
+    episode = Dataset.open(dataset).read(0).trajectory
+    with np.load(folder / "rec.npz") as recorded:
+        assert episode.body is not None
+        assert np.allclose(episode.body.angular_velocity, recorded["gyro"])
+        assert np.allclose(np.abs(np.sum(episode.body.orientation * recorded["quaternion"], axis=1)), 1)
+    words = command(folder, "--fit-seconds", "2.5", "--window", "0.2")
+    at = words.index("--model")
+    words[at : words.index("--parameters")] = [str(dataset)]
+    assert main([*words, "--out", str(tmp_path / "run")]) == EXIT_OK
+    found = json.loads((tmp_path / "run" / "calibration" / "result.json").read_text())
+    assert found["parameters"]["k"]["estimate"] == pytest.approx(48.0, rel=0.03)
+    recording = str(dataset / "episodes" / "000000.mcap")
+    assert main(["inspect", recording, "--save", str(tmp_path / "a.rrd"), "--quiet"]) == EXIT_OK

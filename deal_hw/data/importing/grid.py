@@ -11,7 +11,7 @@ import numpy as np
 
 from deal_hw.data.importing.table import Table
 from deal_hw.errors import DatasetError
-from deal_hw.types import FloatArray, IntArray, Status, Trajectory
+from deal_hw.types import BodyTrajectory, FloatArray, IntArray, Status, Trajectory
 
 EVEN = 0.02
 """Steps between samples that differ by no more than this from a whole number of periods count as even."""
@@ -41,14 +41,23 @@ class Recording:
     """An uninterrupted stretch of a recording on a uniform grid.
 
     Attributes:
-        trajectory: What calibration reads; ``metadata["import"]`` says where it comes from.
-        orientation: Base orientation at its samples, quaternion w x y z, (T, 4); None where there is none.
-        gyro: Angular velocity of the base in its own frame at its samples, (T, 3) [rad/s]; None: none.
+        trajectory: What calibration reads; ``metadata["import"]`` says where it comes from. Its body holds
+            the base's orientation and angular velocity, where the recording has one of them.
     """
 
     trajectory: Trajectory
-    orientation: FloatArray | None
-    gyro: FloatArray | None
+
+    @property
+    def orientation(self) -> FloatArray | None:
+        """Base orientation at its samples, quaternion w x y z, (T, 4); None where there is none."""
+        body = self.trajectory.body
+        return None if body is None or np.isnan(body.orientation).all() else body.orientation
+
+    @property
+    def gyro(self) -> FloatArray | None:
+        """Angular velocity of the base in its own frame at its samples, (T, 3) [rad/s]; None: none."""
+        body = self.trajectory.body
+        return None if body is None or np.isnan(body.angular_velocity).all() else body.angular_velocity
 
 
 def period_of(table: Table) -> float:
@@ -203,15 +212,13 @@ def _recording(
     even = not uneven.any()
     put = _keep if even else _interpolate
     placed = put(clock, index, period, values, table.command_s)
-    orientation = placed.values.pop("orientation", None)
-    gyro = placed.values.pop("gyro", None)
     metadata = {
         "purpose": purpose,
         "import": {**facts, "method": placed.method, "largest_shift_s": placed.shift_s},
     }
     device_s = np.asarray(placed.index * period, dtype=np.float64)
     trajectory = _trajectory(table, device_s, placed.sent_s, placed.values, gains, metadata)
-    return Recording(trajectory=trajectory, orientation=orientation, gyro=gyro)
+    return Recording(trajectory=trajectory)
 
 
 def _keep(
@@ -265,6 +272,26 @@ def _velocity(table: Table, rows: IntArray, clock: FloatArray) -> FloatArray:
     return np.where(np.isfinite(table.velocity[rows]), table.velocity[rows], difference)
 
 
+def _body(measured: dict[str, FloatArray], T: int, J: int) -> BodyTrajectory | None:
+    """Return the base's orientation and angular velocity, and nothing else; None where there is neither."""
+    if not {"orientation", "gyro"} & set(measured):
+        return None
+    nothing = np.full(T, np.nan)
+    return BodyTrajectory(
+        orientation=measured.get("orientation", np.full((T, 4), np.nan)),
+        angular_velocity=measured.get("gyro", np.full((T, 3), np.nan)),
+        acceleration=np.full((T, 3), np.nan),
+        foot_force=np.empty((T, 0)),
+        temperature=np.full((T, J), np.nan),
+        lost=np.zeros((T, J)),
+        battery=nothing,
+        voltage=nothing,
+        current=nothing,
+        sticks=np.full((T, 4), np.nan),
+        buttons=np.full(T, -1),
+    )
+
+
 def _trajectory(
     table: Table,
     device_s: FloatArray,
@@ -305,6 +332,7 @@ def _trajectory(
         command_age_s=age,
         sent_s=sent_s,
         sent_sequence=np.arange(C),
+        body=_body(measured, device_s.size, len(table.joint_names)),
         requested_position=target,
         position_target=target,
         stiffness=each(servo.stiffness),

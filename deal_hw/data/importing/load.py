@@ -135,7 +135,7 @@ def load_recordings(
     tables: list[Table] = []
     for path in map(Path, paths):
         episodes = own_episodes(path, say)
-        own += [Recording(read_trajectory(episode), None, None) for episode in episodes]
+        own += [Recording(read_trajectory(episode)) for episode in episodes]
         if not episodes:
             tables += load_tables(path, columns, joints, say)
     if not tables:

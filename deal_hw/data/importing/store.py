@@ -18,7 +18,7 @@ from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
-from deal_hw.types import JointCommand, RobotState, Status, Trajectory
+from deal_hw.types import BodyState, BodyTrajectory, JointCommand, RobotState, Status, Trajectory
 
 START_NS = 1_000_000_000_000
 """Where the clocks of an imported episode start: its file had none that means anything here."""
@@ -188,6 +188,23 @@ def _state(trajectory: Trajectory, row: int, stamp_ns: int, number: int) -> Robo
         command_sequence=sequence,
         command_age_ns=round(age_s * 1e9) if sequence >= 0 else -1,
         status=Status(int(trajectory.status[row])),
+        body=None if trajectory.body is None else _body(trajectory.body, row),
+    )
+
+
+def _body(body: BodyTrajectory, row: int) -> BodyState:
+    return BodyState(
+        orientation=body.orientation[row],
+        angular_velocity=body.angular_velocity[row],
+        acceleration=body.acceleration[row],
+        foot_force=body.foot_force[row],
+        temperature=body.temperature[row],
+        lost=body.lost[row].astype(np.int64),
+        battery=float(body.battery[row]),
+        voltage=float(body.voltage[row]),
+        current=float(body.current[row]),
+        sticks=body.sticks[row],
+        buttons=int(body.buttons[row]),
     )
 
 

@@ -6,8 +6,9 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.checks import require_base
 from deal_hw.workflows.calibration.dataset import DatasetRecordings, choose_episodes, sound_recordings
 from deal_hw.workflows.calibration.model import Recordings, heldout_share, parts_to_calibrate, searched_space
 from deal_hw.workflows.calibration.recordings import aligned
@@ -70,14 +71,10 @@ def prepare_carried(
         control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
     )
     robot = load_model(with_speed_limits(description, model, space), rates.step_s)
-    if robot.base is not None:
-        raise ConfigurationError(
-            f"the base of robot {description.name!r} floats, and the dataset holds no IMU of it; give "
-            "its files themselves: --model robot.xml --data rec.csv --feet ..."
-        )
-    episodes = {
-        i: aligned(Recording(trajectory, None, None), robot, ()) for i, trajectory in trajectories.items()
-    }
+    recordings = {i: Recording(trajectory) for i, trajectory in trajectories.items()}
+    feet = config.feet or description.feet
+    require_base(robot, feet, list(recordings.values()))
+    episodes = {i: aligned(recording, robot, feet) for i, recording in recordings.items()}
     if source.sample_hz is not None:
         episodes = {i: thin(episode, source.sample_hz) for i, episode in episodes.items()}
     parts, judge = parts_to_calibrate(
