@@ -84,23 +84,15 @@ def options(parser: argparse.ArgumentParser) -> Sections:
             if type(action).__name__ in {"_HelpAction", "_SubParsersAction"}:  # tyro has its own argparse.
                 continue
             text = action.help or ""
-            match = re.search(r"\s*\((required|default: .*)\)\s*$", text, flags=re.S)
+            match = re.search(r"\s*\((required|on by default|default: .*)\)\s*$", text, flags=re.S)
             default = match[1].removeprefix("default: ") if match else ""
-            # tyro shows an empty string, tuple or None as '', nothing or None.
-            default = "" if default in {"None", "''"} else default
             name = max(action.option_strings, key=len, default=action.dest.upper())
-            name = f"{name} {metavar(action)}".strip() if action.option_strings else name
+            name = f"{name} {action.metavar or ''}".strip() if action.option_strings else name
             title = "" if group.title in {"positional arguments", "options"} else str(group.title)
             sections.setdefault(title.removesuffix(" options"), []).append(
                 (name, text[: match.start()] if match else text, default)
             )
     return sections
-
-
-def metavar(action: argparse.Action) -> str:
-    """Return what an option takes, without tyro's word for None."""
-    shown = str(action.metavar or "")
-    return re.sub(r"\{None\}\|", "", shown)
 
 
 def sub_verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
@@ -116,10 +108,12 @@ def verb_parser(settings: Any, prog: str) -> argparse.ArgumentParser:
     """Return the parser of a dataclass of settings, as the command line builds it."""
     import tyro
 
+    from deal_hw.cli.parsing import Rules
+
     with warnings.catch_warnings():
         # tyro warns that this function will go; constraints.txt pins the version that has it.
         warnings.simplefilter("ignore", DeprecationWarning)
-        found: Any = tyro.extras.get_parser(settings, prog=prog, config=(tyro.conf.FlagCreatePairsOff,))
+        found: Any = tyro.extras.get_parser(settings, prog=prog, registry=Rules().registry)
     return cast(argparse.ArgumentParser, found)
 
 

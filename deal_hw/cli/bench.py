@@ -14,12 +14,18 @@ from deal_hw.calibration import Budget
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.workflows.calibration.model import Recordings
-from deal_hw.workflows.options import Range, Ratio, Threads, check_ranges, given, refuse
+from deal_hw.workflows.options import Only, Range, Ratio, Threads, check_ranges, refuse_others
 
 if TYPE_CHECKING:
     from deal_hw.bench.rows import Cells, Row
 
 MOST_SEEDS = 10_000
+ROBOTS = Only(("fixed-range", "mismatch", "paper"))
+TASKS = Only((*ROBOTS.names, "speed"))
+METHODS = Only((*TASKS.names, "loop", "real"))
+SEARCHES = Only((*TASKS.names, "real", "verdict", "first-answer"))
+ROWS = Only((*SEARCHES.names, "loop", "go2-loop"))
+REAL = Only(("real",))
 Seeds = Range(0, 2**32 - 1 - MOST_SEEDS)
 
 
@@ -51,77 +57,79 @@ class Bench:
     search costs beside bare physics and DEAL's Table 3. go2-codec: what the Go2's messages cost to write
     and read."""
 
-    recordings: tyro.conf.OmitArgPrefixes[Recordings] = field(default_factory=Recordings)
+    recordings: Annotated[tyro.conf.OmitArgPrefixes[Recordings], REAL] = field(default_factory=Recordings)
 
-    dataset: Path | None = None
-    """real: a dataset instead of --model and --data; of a robot of ours, or one that carries its robot."""
+    dataset: Annotated[Path | None, REAL] = None
+    """A dataset instead of --model and --data; of a robot of ours, or one that carries its robot."""
 
-    holdout: tuple[Path, ...] = ()
-    """real: recordings that only judge, of a dataset episodes by number; by default the last part of each."""
+    holdout: Annotated[tuple[Path, ...], REAL] = ()
+    """Recordings that only judge, of a dataset episodes by number; by default the last part of each."""
 
-    heldout_window: Annotated[float, Range(1e-3, 600, "s")] = 5.0
-    """real: held-out predictions restart this often [s]."""
+    heldout_window: Annotated[float, Range(1e-3, 600, "s"), REAL] = 5.0
+    """Held-out predictions restart this often [s]."""
 
-    residual_std: tuple[str, ...] = ()
-    """real: what a prediction may be off, as for `deal-hw calibrate`; by default the residual of a first
+    residual_std: Annotated[tuple[str, ...], REAL] = ()
+    """What a prediction may be off, as for `deal-hw calibrate`; by default the residual of a first
     fit to the recordings that are fitted."""
 
-    real: Path | None = None
-    """first-answer: folder with so101/ and go2_suspended/, the recordings and columns.yaml of each as
+    real: Annotated[Path | None, Only(("first-answer",))] = None
+    """Folder with so101/ and go2_suspended/, the recordings and columns.yaml of each as
     docs/results/example-so101.md and docs/results/example-go2-suspended.md make them; without it these two
     are skipped."""
 
-    problems: str = ""
-    """first-answer, verdict: robots, comma separated; by default all. first-answer: double-pendulum,
+    problems: Annotated[str, Only(("first-answer", "verdict"))] = ""
+    """Robots, comma separated; by default all. first-answer: double-pendulum,
     cart-pole, torque-arm, so101, go2-suspended; verdict: pendulum, double-pendulum, arm, cart-pole, leg."""
 
-    faults: str = ""
-    """verdict: faults, comma separated (none, friction, backlash, jitter, mass, sign); by default all."""
+    faults: Annotated[str, Only(("verdict",))] = ""
+    """Faults, comma separated (none, friction, backlash, jitter, mass, sign); by default all."""
 
-    task: str = "cartpole"
-    """Tasks, comma separated: cartpole, ant, humanoid, go2, allegro (loop: the cart-pole only)."""
+    task: Annotated[str, TASKS] = "cartpole"
+    """Tasks, comma separated: cartpole, ant, humanoid, go2, allegro."""
 
-    space: str = ""
+    space: Annotated[str, TASKS] = ""
     """Parameter set of the task; its default where nothing is named."""
 
-    profile: Literal["ideal", "sensor", "realistic"] = "sensor"
+    profile: Annotated[
+        Literal["ideal", "sensor", "realistic"], Only(("loop", "go2-loop", "fixed-range", "paper", "speed"))
+    ] = "sensor"
     """Profile of the emulated robots."""
 
-    seeds: str = "0,1"
+    seeds: Annotated[str, ROWS] = "0,1"
     """Seeds, comma separated; ranges as 1000-1009. 0-99 are for tuning, 1000 and up for reporting."""
 
-    methods: str = ""
+    methods: Annotated[str, METHODS] = ""
     """Methods, comma separated; by default the default with training, and each search without refinement."""
 
-    range_ratio: str = "5"
-    """Ratios of the search range, comma separated (loop: one)."""
+    range_ratio: Annotated[str, METHODS] = "5"
+    """Ratios of the search range, comma separated; for loop, speed and real one."""
 
-    refine_all: bool = False
+    refine_all: Annotated[bool, Only(("fixed-range", "mismatch", "paper", "real"))] = False
     """Refine every method; by default only `default` is."""
 
-    demonstration: Literal["excite", "policy"] = "excite"
+    demonstration: Annotated[Literal["excite", "policy"], ROBOTS] = "excite"
     """How robots are demonstrated: by motions that excite, or by their shipped policies, which methods of the
     paper need."""
 
-    demonstration_seconds: Annotated[float, Range(1, 600, "s")] = 4.0
-    """fixed-range, mismatch, paper: length of the demonstration [s]."""
+    demonstration_seconds: Annotated[float, Range(1, 600, "s"), ROBOTS] = 4.0
+    """Length of the demonstration [s]."""
 
-    population: Annotated[int | None, Range(2, 100_000)] = None
+    population: Annotated[int | None, Range(2, 100_000), SEARCHES] = None
     """Members of a search; by default 100, for methods of the paper 200."""
 
-    generations: Annotated[int, Range(1, 100_000)] = 50
+    generations: Annotated[int, Range(1, 100_000), SEARCHES] = 50
     """Most generations of a search."""
 
-    train: bool = True
-    """Train and deploy policies with the default method; --no-train leaves both out."""
+    train: Annotated[bool, Only(("loop", "go2-loop"))] = True
+    """Train and deploy policies with the default method."""
 
-    steps: Annotated[int, Range(1, 10**9)] = 300_000
-    """go2-loop: steps of each fine-tune."""
+    steps: Annotated[int, Range(1, 10**9), Only(("go2-loop",))] = 300_000
+    """Steps of each fine-tune."""
 
     out: Path | None = None
     """File of the rows, by default BENCH.json; the CSV and the figure lie beside it."""
 
-    threads: Threads = None
+    threads: Annotated[Threads, ROWS] = None
     """Simulation threads; by default all CPUs."""
 
     quiet: bool = False
@@ -131,25 +139,11 @@ class Bench:
         check_ranges(self)
         parse_seeds(self.seeds)
         parse_ratios(self.range_ratio)
-        if self.bench != "real":
-            options = given(self.recordings, Recordings())
-            options += given(self, Bench, ("dataset", "holdout", "heldout_window", "residual_std"))
-            refuse(options, "only `bench real` takes that")
-        if self.bench != "first-answer":
-            # The class holds the defaults of these.
-            refuse(given(self, Bench, ("real",)), "only `bench first-answer` takes that")
-        if self.bench not in ("first-answer", "verdict"):
-            refuse(given(self, Bench, ("problems",)), "only `bench first-answer` and `verdict` take that")
-        if self.bench != "go2-loop":
-            refuse(given(self, Bench, ("steps",)), "only `bench go2-loop` takes that")
-        if self.bench == "speed":
-            options = given(self, Bench, ("demonstration", "refine_all"))
-            refuse(options, "`bench speed` times searches alone, on what a policy demonstrates")
-        if self.bench not in ("fixed-range", "mismatch", "paper"):
-            options = given(self, Bench, ("demonstration_seconds",))
-            refuse(options, "only `bench fixed-range`, `mismatch` and `paper` take that")
-        if self.bench != "verdict":
-            refuse(given(self, Bench, ("faults",)), "only `bench verdict` takes that")
+        refuse_others(self, "bench", self.bench)
+        if self.bench in ("loop", "speed", "real") and "," in self.range_ratio:
+            raise ConfigurationError(
+                f"--range-ratio {self.range_ratio}: `bench {self.bench}` takes one ratio"
+            )
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
@@ -276,7 +270,7 @@ def _draw(out: Path, rows: Sequence[Row]) -> None:
 def _loop(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import loop, tables
 
-    (range_ratio,) = parse_ratios(config.range_ratio)[:1]
+    (range_ratio,) = parse_ratios(config.range_ratio)
     cells = loop.cells(
         config.profile,
         _methods(config, ("default", *loop.SEARCHES)),
@@ -292,7 +286,7 @@ def _loop(config: Bench, out: Path) -> _Table:
 def _speed(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import speed
 
-    (range_ratio,) = parse_ratios(config.range_ratio)[:1]
+    (range_ratio,) = parse_ratios(config.range_ratio)
     cells = speed.cells(
         _names(config.task),
         _methods(config, speed.METHODS),
@@ -349,7 +343,7 @@ def _real(config: Bench, out: Path) -> _Table:
     from deal_hw.bench import real, tables
     from deal_hw.workflows.calibration.settings import CalibrateSettings
 
-    (range_ratio,) = parse_ratios(config.range_ratio)[:1]
+    (range_ratio,) = parse_ratios(config.range_ratio)
     source = CalibrateSettings(
         dataset=config.dataset,
         recordings=config.recordings,

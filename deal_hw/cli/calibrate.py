@@ -58,10 +58,10 @@ class Calibrate(CalibrateSettings):
     """Write that view to a file, FILE.rrd."""
 
     report: bool = True
-    """Write report.html, one page with everything; --no-report saves some seconds."""
+    """Write report.html, one page with everything; off saves some seconds."""
 
     advise: bool = True
-    """Compute what to record next where a parameter stayed weak or open; --no-advise saves some seconds."""
+    """Compute what to record next where a parameter stayed weak or open; off saves some seconds."""
 
     quiet: bool = False
     """Print nothing but errors."""

@@ -25,7 +25,7 @@ from deal_hw.cli.calibrate import CalibrateReport
 from deal_hw.data.run_folder import RunFolder
 from deal_hw.errors import ConfigurationError, DealHwError, MissingExtraError
 from deal_hw.types import FloatArray
-from deal_hw.workflows.options import Checked, Range, Seed, given, refuse
+from deal_hw.workflows.options import CARTPOLE, Checked, Only, Range, Seed, refuse_others
 from deal_hw.workflows.running.report import RunReport
 
 if TYPE_CHECKING:
@@ -55,11 +55,11 @@ class Demo(Checked):
     episodes: Annotated[int | None, Range(1, 1000)] = None
     """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s."""
 
-    firmware: Literal["python", "host", "avr"] = "python"
+    firmware: Annotated[Literal["python", "host", "avr"], CARTPOLE] = "python"
     """What runs the firmware of the emulated cart-pole; see emulate --firmware."""
 
-    on_stand: bool = False
-    """Go2: calibrate from a recording with its body on a stand instead of from its walk."""
+    on_stand: Annotated[bool, Only(("go2",))] = False
+    """Calibrate from a recording with its body on a stand instead of from its walk."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps. Cart-pole: by default those of the shipped UDR policy. Go2: 300,000, from the shipped
@@ -67,10 +67,7 @@ class Demo(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        own = {"cartpole": ("firmware",), "go2": ("on_stand",)}
-        for robot, options in own.items():
-            if robot != self.robot:
-                refuse(given(self, Demo, options), f"only the demo of {robot} takes that")
+        refuse_others(self, "demo", self.robot)
 
     @property
     def folder(self) -> Path:

@@ -13,7 +13,7 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TextIO, cast
@@ -222,17 +222,20 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
 
     import tyro
 
+    from deal_hw.cli.parsing import Rules
+
     module = importlib.import_module(verb.module)
+    rules = Rules(arguments)
 
     def read(speak: bool) -> Any:
         return tyro.cli(
             getattr(module, verb.config),
             prog=f"deal-hw {name}",
-            description=_description(verb, getattr(module, verb.config)),
+            description=_description(verb, getattr(module, verb.config), rules.hidden),
             args=list(arguments),
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed),
             console_outputs=speak,
-            registry=_rules(),
+            registry=rules.registry,
         )
 
     try:
@@ -249,53 +252,17 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     return settings, getattr(module, verb.function)
 
 
-def _description(verb: Verb, config: Any) -> str:
-    """Return what a verb's help says above its options: what it does, and a line that runs."""
+def _description(verb: Verb, config: Any, hidden: Iterable[str]) -> str:
+    """Return what a verb's help says above its options: what it does, an example, what is not shown."""
     text = inspect.cleandoc(config.__doc__) if isinstance(config, type) and config.__doc__ else verb.help
-    example = f"Example:  deal-hw {verb.example}"
-    return text if f"deal-hw {verb.example}" in text else f"{text}\n\n{example}"
-
-
-def _rules() -> Any:
-    """Return how words become values where settings say more than the parser knows.
-
-    Files and folders, which Python may also name by a string, are paths. Choices are left to the settings,
-    which refuse wrong ones with the same words from Python.
-    """
-    from pathlib import Path
-    from typing import Literal, get_args, get_origin
-
-    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
-
-    registry = ConstructorRegistry()
-
-    @registry.primitive_rule
-    def choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
-        choices = get_args(info.type)
-        if get_origin(info.type) is not Literal or not all(isinstance(one, str) for one in choices):
-            return None
-        return PrimitiveConstructorSpec(
-            nargs=1,
-            metavar=f"{{{','.join(choices)}}}",
-            instance_from_str=lambda words: words[0],
-            is_instance=lambda value: isinstance(value, str),
-            str_from_instance=lambda value: [value],
+    lines = [text]
+    if f"deal-hw {verb.example}" not in text:
+        lines.append(f"Example:  deal-hw {verb.example}")
+    if hidden:
+        lines.append(
+            f"There are more options for {', '.join(sorted(hidden))}: write one of these before --help."
         )
-
-    @registry.primitive_rule
-    def path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path | str | None] | None:
-        optional = info.type == Path | str | None
-        if not optional and info.type != Path | str:
-            return None
-        return PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="{None}|PATH" if optional else "PATH",
-            instance_from_str=lambda words: None if optional and words[0] == "None" else Path(words[0]),
-            is_instance=lambda value: isinstance(value, Path | str) or (optional and value is None),
-            str_from_instance=lambda value: [str(value)],
-        )
-
-    return registry
+    return "\n\n".join(lines)
 
 
 def run(name: str, arguments: Sequence[str]) -> int:

@@ -11,7 +11,7 @@ from deal_hw.calibration import SHORTEST_S
 from deal_hw.control.excitation import RichConfig
 from deal_hw.control.excitation_level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.control.excitation_plan import FAMILIES, read_plan
-from deal_hw.workflows.options import File, Range, RunSeconds, Seed, from_settings, given, refuse
+from deal_hw.workflows.options import OWN_ROBOT, File, Range, RunSeconds, Seed, from_settings, given, refuse
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import RunOptions, plan_options
@@ -43,7 +43,7 @@ class CollectSettings(RunOptions):
     slcan:/dev/ttyACM0?bitrate=500000&node=1, a network interface (dds) or an endpoint such as
     tcp/127.0.0.1:7447 (zenoh)."""
 
-    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    simulation: Annotated[SimulationOptions, OWN_ROBOT] = field(default_factory=SimulationOptions)
     """A robot of your own, in simulation."""
 
     profile: Literal["rich", "chirp", "balance", "hold"] = "rich"

@@ -40,7 +40,7 @@ class DeploySettings(RunOptions):
     """Run a policy that was trained under a calibration whose verdict is red, without asking."""
 
     record: bool = True
-    """Record the episodes; --no-record where nothing is to be kept."""
+    """Record the episodes."""
 
     dry_run: bool = False
     """Compute everything and send nothing: the robot is neither homed nor armed. Recorded only with --out or

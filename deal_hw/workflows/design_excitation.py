@@ -38,7 +38,15 @@ if TYPE_CHECKING:
     from deal_hw.calib.design.excitation_search import Optimum
 
 BALANCE_S = 0.6
-GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
+_SINES = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
+DESIGNS = {
+    "multisine": (*_SINES, "seed"),
+    "chirp": _SINES,
+    "steps": ("amplitude", "effort", "speed", "split", "seed"),
+    "sway": ("amplitude", "low_hz", "high_hz", "seed"),
+}
+"""What each family that is not searched can be told."""
+GIVEN_DESIGN = _SINES
 Notify = Callable[[int, int, str], None]
 SEARCH = ("calibration", "space", "range_ratio", "criterion", "draws", "confirm", "candidates", "rounds")
 
@@ -64,10 +72,10 @@ class ExcitationSettings:
     """Not for optimal: share of the largest amplitude that the safety limits allow."""
 
     low_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 0.3
-    """Not for optimal: least frequency of multisine, chirp and sway."""
+    """Least frequency of multisine, chirp and sway."""
 
     high_hz: Annotated[float, Range(1e-3, 1000, "Hz")] = 5.0
-    """Not for optimal: greatest frequency of multisine, chirp and sway."""
+    """Greatest frequency of multisine, chirp and sway."""
 
     effort: Annotated[float, Range(1e-3, 1000)] = 1.0
     """Not for optimal: factor on the effort limit that is sent from SPLIT on."""
@@ -169,9 +177,13 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
             refuse(given(config, default, ("space", "range_ratio")), "--calibration says what is known")
     else:
         refuse(
-            given(config, default, SEARCH),
+            given(config, default, (*SEARCH, "threads")),
             f"--family {config.family} is not searched; use --family optimal",
         )
+        others = [name for name in (*_SINES, "seed") if name not in DESIGNS[config.family]]
+        refuse(given(config, default, others), f"--family {config.family} has nothing of it")
+        if config.effort == default.effort and config.speed == default.speed:
+            refuse(given(config, default, ("split",)), "it says from when on --effort or --speed holds")
     description = described(config.robot)
     most_hz = description.control_rate_hz / 2
     if config.family in ("multisine", "chirp", "sway") and config.high_hz > most_hz:

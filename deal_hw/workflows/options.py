@@ -17,7 +17,7 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, short, shown
@@ -59,6 +59,25 @@ class Range:
         if self.unit == "s" and self.high < 1:
             return f"{1e3 * self.low:.12g} to {1e3 * self.high:.12g} ms"
         return f"{self.low:.12g} to {self.high:.12g}{self._unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Only:
+    """Marks an option, or a group of options, that only some robots or benches take.
+
+    A help page shows it where one of them is named on the line. The settings, or what runs the verb, refuse
+    it for others.
+
+    Attributes:
+        names: Names of robots or benches.
+    """
+
+    names: tuple[str, ...]
+
+
+CARTPOLE = Only(("cartpole",))
+GO2 = Only(("go2", "go2_on_stand"))
+OWN_ROBOT = Only(("robot.yaml",))
 
 
 P = ParamSpec("P")
@@ -133,16 +152,23 @@ def _kinds(hint: Any) -> Iterator[Any]:
         yield hint
 
 
-def given(settings: Any, default: Any, names: Iterable[str] = ()) -> list[str]:
-    """Return the options that differ from their defaults.
+def given(settings: Any, default: Any, names: Iterable[str] | None = None) -> list[str]:
+    """Return the options that differ from their defaults, those of groups included.
 
     Args:
         settings: A settings dataclass.
         default: The same as it is without options.
         names: The fields to look at; all by default.
     """
-    fields = tuple(names) or [f.name for f in dataclasses.fields(settings)]
-    return [option(name) for name in fields if getattr(settings, name) != getattr(default, name)]
+    fields = [f.name for f in dataclasses.fields(settings)] if names is None else names
+    found: list[str] = []
+    for name in fields:
+        value, usual = getattr(settings, name), getattr(default, name)
+        if dataclasses.is_dataclass(value):
+            found += given(value, usual)
+        elif value != usual:
+            found.append(option(name))
+    return found
 
 
 def refuse(options: Iterable[str], reason: str) -> None:
@@ -157,6 +183,31 @@ def refuse(options: Iterable[str], reason: str) -> None:
     """
     if found := list(options):
         raise ConfigurationError(f"{', '.join(found)} would have no effect: {reason}")
+
+
+def refuse_others(settings: Any, verb: str, name: str) -> None:
+    """Refuse options that are marked as :class:`Only` for other robots or benches.
+
+    Args:
+        settings: A settings dataclass, or one inside it that is marked as a whole.
+        verb: As it is typed before the name.
+        name: The robot or bench that was asked for.
+
+    Raises:
+        ConfigurationError: One was given.
+    """
+    hints = get_type_hints(type(settings), include_extras=True)
+    found: dict[Only, list[str]] = {}
+    for entry in dataclasses.fields(settings):
+        factory = entry.default_factory
+        default = SimpleNamespace(
+            **{entry.name: entry.default if factory is dataclasses.MISSING else factory()}
+        )
+        for only in (part for part in get_args(hints[entry.name])[1:] if isinstance(part, Only)):
+            if name not in only.names:
+                found.setdefault(only, []).extend(given(settings, default, [entry.name]))
+    for only, names in found.items():
+        refuse(names, f"only {' and '.join(f'`{verb} {other}`' for other in only.names)} can use that")
 
 
 def from_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], R]], Callable[P, R]]:

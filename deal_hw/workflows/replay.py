@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from deal_hw.control.behaviours import ReplayBehaviour
 from deal_hw.data.files import episode_of
@@ -11,7 +12,7 @@ from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.drivers import driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import Trajectory
-from deal_hw.workflows.options import File, from_settings
+from deal_hw.workflows.options import OWN_ROBOT, File, from_settings
 from deal_hw.workflows.robot import carries_robot, user_robot
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
@@ -40,9 +41,9 @@ class ReplaySettings(RunOptions):
     """Where the robot is, as for `deal-hw collect`."""
 
     record: bool = True
-    """Record what happens; --no-record where nothing is to be kept."""
+    """Record what happens."""
 
-    simulation: SimulationOptions = field(default_factory=SimulationOptions)
+    simulation: Annotated[SimulationOptions, OWN_ROBOT] = field(default_factory=SimulationOptions)
     """A robot of your own, in simulation: by default the one that the episode's dataset carries."""
 
     def __post_init__(self) -> None:

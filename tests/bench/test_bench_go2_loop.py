@@ -57,7 +57,7 @@ def test_cells_are_told_apart_by_what_they_measure(tmp_path: Path) -> None:
 
 def test_steps_are_of_this_bench_alone() -> None:
     """Elsewhere the option would be ignored."""
-    with pytest.raises(ConfigurationError, match="only `bench go2-loop` takes that"):
+    with pytest.raises(ConfigurationError, match="only `bench go2-loop` can use that"):
         Bench(bench="fixed-range", steps=10)
 
 

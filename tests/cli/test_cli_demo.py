@@ -117,8 +117,8 @@ def test_a_walk_with_a_clock_jump_is_walked_again(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        ({"robot": "go2", "firmware": "host"}, "--firmware would have no effect: only the demo of cartpole"),
-        ({"on_stand": True}, "--on-stand would have no effect: only the demo of go2"),
+        ({"robot": "go2", "firmware": "host"}, "--firmware would have no effect: only `demo cartpole` can"),
+        ({"on_stand": True}, "--on-stand would have no effect: only `demo go2` can use that"),
     ],
 )
 def test_what_is_another_robots_is_refused(config: dict[str, Any], words: str) -> None:

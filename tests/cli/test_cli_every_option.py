@@ -12,18 +12,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from verb_options import Option, dataclasses_of, options
 
 from deal_hw.cli.main import VERBS, parse
+from deal_hw.cli.parsing import Rules
 from deal_hw.clock import VirtualClock
-from deal_hw.control.posture import PostureConfig
 from deal_hw.drivers import driver_description, make_robot
 from deal_hw.errors import DealHwError
-from deal_hw.transport import WireOptions
 from deal_hw.types import Trajectory
 from deal_hw.workflows import collect, deploy, replay
 from deal_hw.workflows.doctor import examine
 from deal_hw.workflows.running.report import RunReport
-from deal_hw.workflows.running.settings import LegOptions, LinkOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 ZENOH = "--transport zenoh --port tcp/127.0.0.1:7447"
@@ -45,71 +44,31 @@ LINES = (
     "doctor go2 --port lo",
     f"doctor go2 {ZENOH} --simulator unitree_mujoco",
 )
-VALUES = {
-    "robot": "go2_on_stand",
-    "transport": "zenoh",
-    "port": "p2",
-    "profile": "chirp",
-    "excite": "multisine",
-    "velocity": "0.1,0,0",
-    "stop_buttons": "R2+A",
-    "stand": "False",
-    "task": "balance",
-    "mode": "peer",
-    "state_check": "length",
-    "simulator": "unitree_mujoco",
-    "out": "o2",
-    "dataset": "d2",
-    "policy": "other.onnx",
-    "json": "findings.json",
-    "ca": "ca.pem",
-    "certificate": "c.pem",
-    "key": "k.pem",
+VALUES: dict[str, tuple[str, ...]] = {
+    "robot": ("go2_on_stand",),
+    "transport": ("zenoh",),
+    "port": ("p2",),
+    "excite": ("multisine",),
+    "velocity": ("0.1,0,0",),
+    "stop_buttons": ("R2+A",),
+    "stand": ("False",),
+    "task": ("balance",),
+    "out": ("o2",),
+    "dataset": ("d2",),
+    "policy": ("other.onnx",),
+    "json": ("findings.json",),
+    "ca": ("ca.pem",),
+    "certificate": ("c.pem",),
+    "key": ("k.pem",),
+    "reveal_to": ("truth.json",),
+    "say": (),
+    "mode": ("peer",),
 }
-"""What options that are no numbers and flags are given, where that is not their default."""
+"""What options that are no numbers, flags and choices are given."""
 COMPOSED = (("", "_after_s"), ("servo_", ""))
 """Beginnings and ends of names that the emulators of the Go2 and of the servos compose."""
-TOLD_ELSEWHERE = {"quiet", "json", "say"}
+TOLD_ELSEWHERE = {"quiet", "json"}
 """They change what is printed or written of the result, which the tests of each verb look at."""
-
-
-def dataclasses_of(hint: Any) -> Iterator[type[Any]]:
-    """Yield the dataclasses in a type, those inside them included."""
-    for part in typing.get_args(hint):
-        yield from dataclasses_of(part)
-    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        yield hint
-        for inner in typing.get_type_hints(hint, include_extras=True).values():
-            yield from dataclasses_of(inner)
-
-
-@dataclasses.dataclass(frozen=True)
-class Option:
-    """An option as it is typed."""
-
-    name: str
-    words: tuple[str, ...]
-
-
-def options(config: type[Any], line: str) -> Iterator[Option]:
-    """Yield every option of a verb's settings, each with a value that is not its default in this line."""
-    values = {**VALUES, "stand": "True"} if "go2_on_stand" in line else VALUES
-    for settings in (config, LinkOptions, WireOptions, LegOptions, PostureConfig):
-        if settings not in set(dataclasses_of(config)):
-            continue
-        hints = typing.get_type_hints(settings)
-        for entry in dataclasses.fields(settings):
-            flag = entry.name.replace("_", "-")
-            hint = str(hints[entry.name])
-            if entry.name in ("say", "episode") or any(dataclasses_of(hints[entry.name])):
-                continue
-            if hints[entry.name] is bool:
-                yield Option(entry.name, (f"--no-{flag}" if entry.default is True else f"--{flag}",))
-            elif entry.name in values:
-                yield Option(entry.name, (f"--{flag}", values[entry.name]))
-            elif "int" in hint or "float" in hint:
-                whole = "int" in hint and "float" not in hint
-                yield Option(entry.name, (f"--{flag}", "2" if whole else "2.5"))
 
 
 def cases() -> Iterator[Any]:
@@ -117,10 +76,9 @@ def cases() -> Iterator[Any]:
     for line in LINES:
         verb, *words = line.split()
         config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
-        for option in options(config, line):
-            flags = {f"--{option.name.replace('_', '-')}", f"--no-{option.name.replace('_', '-')}"}
-            positional = option.name == "robot" and verb != "replay"
-            if option.name not in TOLD_ELSEWHERE and not positional and not flags & set(words):
+        values = {**VALUES, "stand": ("True",)} if "go2_on_stand" in line else VALUES
+        for option in options(config, values):
+            if option.name not in TOLD_ELSEWHERE and not {option.flag, *option.words[:1]} & set(words):
                 yield pytest.param(line, option, id=f"{line} {option.name}")
 
 
@@ -217,6 +175,23 @@ def test_an_option_changes_something_or_is_refused(line: str, option: Option, do
     assert not isinstance(plain, DealHwError), plain
     changed = outcome(done, [*line.split(), *option.words])
     assert isinstance(changed, DealHwError) or changed != plain, f"{' '.join(option.words)} did nothing"
+    if option.name in of_others(line):
+        assert isinstance(changed, DealHwError), f"{option.flag} is in no help page of this robot, but taken"
+
+
+def of_others(line: str) -> set[str]:
+    """Return the options that a line's help page leaves out, because other robots take them."""
+    verb, *words = line.split()
+    rules = Rules([*words, "--help"])
+    hidden: set[str] = set()
+    for settings in dataclasses_of(getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)):
+        for name, hint in typing.get_type_hints(settings, include_extras=True).items():
+            if rules.hides(hint):
+                hidden |= {
+                    name,
+                    *(field.name for group in dataclasses_of(hint) for field in dataclasses.fields(group)),
+                }
+    return hidden
 
 
 def test_every_option_of_every_verb_is_read() -> None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import inspect
 import math
+import re
 import typing
-from collections.abc import Iterator
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any
+from typing import Any
 
 import pytest
+from verb_options import dataclasses_of
 
 from deal_hw.cli.main import VERBS, main, run
+from deal_hw.control.posture import PostureConfig
 from deal_hw.errors import ConfigurationError, UnknownNameError
-from deal_hw.workflows.options import Range
+from deal_hw.workflows.options import Only, Range
 
 NO_USE: tuple[float, ...] = (math.nan, math.inf, -math.inf, 1e300)
 """No option takes one of these."""
@@ -84,17 +84,6 @@ REQUIRED: dict[str, Any] = {
     "name": "n",
     "model": Path("m"),
 }
-
-
-def dataclasses_of(hint: Any) -> Iterator[type[Any]]:
-    """Yield the dataclasses in a type, those inside them included."""
-    if typing.get_origin(hint) in (Annotated, UnionType, typing.Union):
-        for part in typing.get_args(hint):
-            yield from dataclasses_of(part)
-    elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        yield hint
-        for inner in typing.get_type_hints(hint, include_extras=True).values():
-            yield from dataclasses_of(inner)
 
 
 def numeric_fields() -> list[tuple[type[Any], str, Any]]:
@@ -266,25 +255,57 @@ def test_a_missing_recording_is_told_before_the_missing_desktop(
     assert "nothere.mcap cannot be read" in capsys.readouterr().err
 
 
-def test_a_flag_that_leaves_something_out_says_so() -> None:
-    """The help shows `--no-report`; its text must not read as if that wrote a report."""
-    checked = set()
-    for verb in VERBS.values():
-        for settings in dataclasses_of(getattr(importlib.import_module(verb.module), verb.config)):
-            parts = [part for part in settings.__mro__ if dataclasses.is_dataclass(part)]
-            source = "".join(map(inspect.getsource, parts))
-            for field in dataclasses.fields(settings):
-                if field.default is True and f"\n    {field.name}: bool" in source:
-                    text = source.partition(f"\n    {field.name}: bool")[2].partition('"""')[2]
-                    assert f"--no-{field.name.replace('_', '-')}" in text.partition('"""')[0]
-                    checked.add(field.name)
-    assert checked >= {"record_wire", "support_check", "report", "advise", "refine", "train", "record"}
+def help_page(line: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return what a line prints with --help."""
+    with pytest.raises(SystemExit):
+        main([*line.split(), "--help"])
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "flags"),
+    [("calibrate", ("refine", "report", "advise")), ("replay --robot go2", ("record-wire", "support-check"))],
+)
+def test_what_is_on_by_default_has_two_flags(
+    line: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A flag that only leaves something out would have a text that reads as if it did it."""
+    page = help_page(line, capsys)
+    for flag in flags:
+        assert f"--{flag}, --no-{flag}" in page
+    assert "--no-quiet" not in page and "None" not in page and "(default: )" not in page
+
+
+@pytest.mark.parametrize("verb", ["collect", "deploy", "replay", "emulate", "demo", "bench"])
+def test_a_help_page_shows_what_the_named_robot_takes(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Options of others appear where one of them is named, and without a name it is said which there are."""
+    marked: dict[str, tuple[str, ...]] = {}
+    for settings in dataclasses_of(getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)):
+        for name, hint in typing.get_type_hints(settings, include_extras=True).items():
+            for only in (part for part in typing.get_args(hint)[1:] if isinstance(part, Only)):
+                groups = [group for group in dataclasses_of(hint) if group is not PostureConfig]
+                inner = [part for group in groups for part in dataclasses.fields(group)]
+                names = [part.name for part in inner if part.name not in ("posture", "faults")] or [name]
+                marked |= dict.fromkeys((f"--{part.replace('_', '-')}" for part in names), only.names)
+    assert marked
+    plain = help_page(verb, capsys)
+    assert not set(marked) & options_of(plain)
+    for name in {name for names in marked.values() for name in names}:
+        assert name in plain.partition("more options for ")[2].partition(":")[0]
+        page = options_of(
+            help_page(f"{verb} --robot {name}" if verb == "replay" else f"{verb} {name}", capsys)
+        )
+        assert page & set(marked) == {flag for flag, names in marked.items() if name in names}
+
+
+def options_of(page: str) -> set[str]:
+    """Return the options that a help page lists."""
+    return set(re.findall(r"^\W*(--[a-z][\w-]*)", page, flags=re.M))
 
 
 @pytest.mark.parametrize("name", VERBS)
 def test_every_help_page_has_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A line that runs, above the options."""
-    with pytest.raises(SystemExit):
-        main([name, "--help"])
-    page = capsys.readouterr().out.partition("options")[0]
-    assert f"deal-hw {VERBS[name].example}" in " ".join(page.split())
+    assert f"deal-hw {VERBS[name].example}" in " ".join(
+        help_page(name, capsys).partition("options")[0].split()
+    )

@@ -113,7 +113,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
         "unknown profile 'perfect'; known: ideal, sensor",
     ),
     ("emulate", {"robot": "cartpole", "range_ratio": 0.5}, "--range-ratio 0.5: allowed are 1.001 to 1000"),
-    ("emulate", {"robot": "cartpole", "port": "lo"}, "emulate cartpole on serial has no --port"),
+    ("emulate", {"robot": "cartpole", "port": "lo"}, "--port would have no effect: only `emulate go2`"),
     ("emulate", {"robot": "cartpole", "nominal": True, "truth_from": "t.json"}, "--nominal and --truth-from"),
 ]
 """Verb, arguments, and words of the refusal."""

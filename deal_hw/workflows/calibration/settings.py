@@ -117,7 +117,7 @@ class CalibrateSettings(Checked):
     """Most generations of the search."""
 
     refine: bool = True
-    """Follow the search by multiple shooting on prediction error; --no-refine ends with the search."""
+    """Follow the search by multiple shooting on prediction error."""
 
     seed: Seed = 0
     """Fixes everything random."""
@@ -146,7 +146,7 @@ class CalibrateSettings(Checked):
             object.__setattr__(self, "dataset", dataset_of(self.dataset))
         if self.recordings.model is None:
             carries = carries_robot(self.dataset)
-            foreign = given(self.recordings, Recordings(), FROM_FILES if carries else ())
+            foreign = given(self.recordings, Recordings(), FROM_FILES if carries else None)
             if carries:
                 refuse(
                     given(self, CalibrateSettings(), ("space",)), "this robot has one set; use --parameters"

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import File, Range, Ratio, Seed, Share, check_ranges, given
+from deal_hw.workflows.options import (
+    CARTPOLE,
+    File,
+    Only,
+    Range,
+    Ratio,
+    Seed,
+    Share,
+    check_ranges,
+    given,
+    refuse,
+    refuse_others,
+)
 
+GO2 = Only(("go2",))
 DEFAULT_PORTS = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 """Transports of the Go2, and where its emulator is by default: on this machine alone."""
 
@@ -79,16 +92,6 @@ class Go2Options:
             certificate=self.certificate,
             key=self.key,
         )
-
-    def given(self) -> list[str]:
-        """Return the flags of options that differ from their defaults."""
-        given = vars(self) | asdict(self.faults)
-        default = vars(Go2Options()) | asdict(Go2Faults())
-        return [
-            "--" + name.replace("_", "-")
-            for name, value in given.items()
-            if name != "faults" and value != default[name]
-        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +187,7 @@ class EmulateSettings:
     """The wire to speak on. Cart-pole: "serial" (the default), "can", "odrive" or "dynamixel", each on a
     pseudo-terminal. Go2: "dds" (the default) or "zenoh"."""
 
-    port: str | None = None
+    port: Annotated[str | None, GO2] = None
     """Go2: network interface or its address (dds), or end point to listen at (zenoh; number 0: a free
     one). By default on this machine alone."""
 
@@ -204,11 +207,11 @@ class EmulateSettings:
     truth_from: File | None = None
     """Use the truth in this JSON file (as --reveal-to wrote it) instead of drawing one."""
 
-    firmware: Literal["python", "host", "avr"] = "python"
+    firmware: Annotated[Literal["python", "host", "avr"], CARTPOLE] = "python"
     """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
     under simavr (docs/how-to/firmware.md)."""
 
-    link: File | None = None
+    link: Annotated[File | None, CARTPOLE] = None
     """Make a symbolic link to the port here."""
 
     reveal: bool = False
@@ -239,10 +242,10 @@ class EmulateSettings:
     cut_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
     """How long the wire is cut [s]."""
 
-    vanish_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    vanish_after_s: Annotated[float | None, Range(0, 1e7, "s"), CARTPOLE] = None
     """The port vanishes this long after the motor was first armed, like a cable that is pulled [s]."""
 
-    return_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    return_after_s: Annotated[float | None, Range(0, 1e7, "s"), CARTPOLE] = None
     """The port comes back under --link so long after it vanished [s]; without it the emulator ends there."""
 
     events_to: File | None = None
@@ -252,13 +255,13 @@ class EmulateSettings:
     parent: Annotated[int | None, Range(1, 2**22)] = None
     """Stop when the process with this id is no longer the parent (for programs that start an emulator)."""
 
-    can: CanOptions = field(default_factory=CanOptions)
+    can: Annotated[CanOptions, CARTPOLE] = field(default_factory=CanOptions)
     """The CAN bus of a cart-pole."""
 
-    servo: ServoOptions = field(default_factory=ServoOptions)
+    servo: Annotated[ServoOptions, CARTPOLE] = field(default_factory=ServoOptions)
     """The servos of a cart-pole."""
 
-    go2: Go2Options = field(default_factory=Go2Options)
+    go2: Annotated[Go2Options, GO2] = field(default_factory=Go2Options)
     """Options of the Go2 alone."""
 
     def __post_init__(self) -> None:
@@ -267,29 +270,17 @@ class EmulateSettings:
             raise UnknownNameError("robot to emulate", self.robot, TRANSPORTS)
         if self.transport is not None and self.transport not in TRANSPORTS[self.robot]:
             raise UnknownNameError("transport to emulate on", self.transport, TRANSPORTS[self.robot])
-        if foreign := self._foreign():
-            where = f" on {self.transport or TRANSPORTS[self.robot][0]}" if self.robot == "cartpole" else ""
-            raise ConfigurationError(f"emulate {self.robot}{where} has no {', '.join(foreign)}")
+        refuse_others(self, "emulate", self.robot)
+        wire = self.transport or TRANSPORTS[self.robot][0]
+        if wire not in ON_CAN:
+            refuse(given(self.can, CanOptions()), "only `--transport can` and `odrive` have a CAN bus")
+        if wire != "dynamixel":
+            refuse(given(self.servo, ServoOptions()), "only `--transport dynamixel` has servos")
+        if wire != "serial":
+            refuse(given(self, EmulateSettings, ["firmware"]), "only `--transport serial` runs that firmware")
         if self.nominal and self.truth_from is not None:
             raise ConfigurationError("--nominal and --truth-from exclude each other")
         if self.return_after_s is not None and (self.vanish_after_s is None or self.link is None):
             raise ConfigurationError(
                 "--return-after-s needs --vanish-after-s and --link: the new port has another name"
             )
-
-    def _foreign(self) -> list[str]:
-        """Return the flags given that belong to another robot."""
-        bus, servos = given(self.can, CanOptions()), given(self.servo, ServoOptions())
-        if self.robot == "cartpole":
-            foreign = [] if self.transport in ON_CAN else bus
-            foreign += [] if self.transport == "dynamixel" else servos
-            if self.firmware != "python" and self.transport not in (None, "serial"):
-                foreign = [*foreign, "--firmware"]
-            return foreign + self.go2.given() + (["--port"] if self.port is not None else [])
-        own = {
-            "--firmware": None if self.firmware == "python" else self.firmware,
-            "--link": self.link,
-            "--vanish-after-s": self.vanish_after_s,
-            "--return-after-s": self.return_after_s,
-        }
-        return bus + servos + [flag for flag, value in own.items() if value is not None]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from deal_hw.control.posture import PostureConfig
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import default_transport, driver_description
 from deal_hw.errors import ConfigurationError
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.options import Checked, File, given, option, refuse
+from deal_hw.workflows.options import GO2, Checked, File, given, option, refuse
 from deal_hw.workflows.robot import is_user_robot
 from deal_hw.workflows.say import Say, silent
 
@@ -34,8 +34,7 @@ class LegOptions:
     L2+B)."""
 
     support_check: bool = True
-    """Refuse a go2 on a stand and a go2_on_stand on the floor; --no-support-check only to try a policy in the
-    air."""
+    """Refuse a go2 on a stand and a go2_on_stand on the floor; off only to try a policy in the air."""
 
     posture: PostureConfig = field(default_factory=PostureConfig)
     """How long standing up and lying down take."""
@@ -49,18 +48,18 @@ class LinkOptions(Checked):
     """How the robot is reached. Cart-pole: serial (the default), can, odrive or dynamixel. Go2: dds (the
     default) or zenoh."""
 
-    state_check: Literal["strict", "length"] = "strict"
+    state_check: Annotated[Literal["strict", "length"], GO2] = "strict"
     """What the states of a Go2 must pass: strict, or length where its firmware or a simulator makes head or
     checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
 
-    simulator: Literal["none", "unitree_mujoco"] = "none"
+    simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
     """What stands in the place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and battery
     (docs/how-to/unitree-mujoco.md). A real robot is then refused."""
 
     record_wire: bool = True
-    """Record the raw bytes, too; --no-record-wire leaves them out."""
+    """Record the raw bytes, too."""
 
-    wire: WireOptions = field(default_factory=WireOptions)
+    wire: Annotated[WireOptions, GO2] = field(default_factory=WireOptions)
     """More about a network."""
 
 
@@ -76,7 +75,7 @@ class RunOptions(Checked):
     link: LinkOptions = field(default_factory=LinkOptions)
     """How the robot is reached, beyond the port."""
 
-    legs: LegOptions = field(default_factory=LegOptions)
+    legs: Annotated[LegOptions, GO2] = field(default_factory=LegOptions)
     """What a robot with legs needs to be told."""
 
     out: File | None = None

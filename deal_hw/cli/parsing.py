@@ -1,0 +1,119 @@
+"""How settings become a command line: values from words, and a help page for the robot that was named."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from deal_hw.workflows.options import OWN_ROBOT, Only
+
+
+class Rules:
+    """What the parser is told of settings beyond their types.
+
+    Files and folders, which Python may also name by a string, are paths. Choices are left to the settings,
+    which refuse wrong ones with the same words from Python. An option that is off by default has one flag,
+    one that is on has two. A help page leaves out options for other robots, or for other benches; otherwise
+    they are parsed, so that the settings can refuse them.
+
+    Args:
+        words: The arguments, which may ask for help, and name a robot or a bench.
+    """
+
+    def __init__(self, words: Sequence[str] = ()) -> None:
+        self._named = set(words)
+        self._helps = bool({"-h", "--help"} & self._named)
+        if any(word.endswith((".yaml", ".yml")) for word in words):
+            self._named |= set(OWN_ROBOT.names)
+        self._asks_others = False
+        self.hidden: set[str] = set()
+        """Names that have options of their own, which were not shown."""
+        self.registry = ConstructorRegistry()
+        self.registry.primitive_rule(_choice)
+        self.registry.primitive_rule(_path)
+        self.registry.struct_rule(self._struct)
+
+    def hides(self, hint: Any) -> set[str]:
+        """Return for whom the options of a type are, where the page leaves them out; else nothing."""
+        names = {name for part in get_args(hint)[1:] if isinstance(part, Only) for name in part.names}
+        return names if self._helps and not self._named & names else set()
+
+    def _struct(self, info: StructTypeInfo) -> StructConstructorSpec | None:
+        if self._asks_others or not dataclasses.is_dataclass(info.type):
+            return None
+        self._asks_others = True
+        try:
+            found = ConstructorRegistry.get_struct_spec(info)
+        finally:
+            self._asks_others = False
+        if not isinstance(found, StructConstructorSpec):
+            # A default of another type, which the parser's own rule tells.
+            return None
+        return dataclasses.replace(found, fields=tuple(map(self._field, found.fields)))
+
+    def _field(self, field: StructFieldSpec) -> StructFieldSpec:
+        parts = get_args(field.type) if get_origin(field.type) is Annotated else (field.type,)
+        marks: list[Any] = [tyro.conf.arg(metavar=_metavar(field.name, parts), help_behavior_hint=_default)]
+        if others := self.hides(field.type):
+            marks.append(tyro.conf.Suppress)
+            self.hidden |= others
+        if field.default is False:
+            marks.append(tyro.conf.FlagCreatePairsOff)
+        text = field.helptext() if callable(field.helptext) else field.helptext
+        kind: Any = Annotated[(field.type, *marks)]
+        return dataclasses.replace(field, type=kind, helptext=" ".join(text.split()) if text else text)
+
+
+def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:
+    """Return what a help page writes for a value; None leaves that to the parser."""
+    if tyro.conf.Positional in parts[1:]:
+        return name.upper()
+    kinds = set(get_args(parts[0])) if get_origin(parts[0]) in (Union, UnionType) else set()
+    names = [kind.__name__.upper() for kind in kinds - {NoneType, str} if isinstance(kind, type)]
+    return names[0] if NoneType in kinds and len(names) == 1 else None
+
+
+def _default(label: str) -> str:
+    """Return what a help page says of a default; one that is empty, or off, says nothing."""
+    if label == "True":
+        return "(on by default)"
+    return "" if label in ("", "''", "None", "False") else f"(default: {label})"
+
+
+def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[str] | None:
+    choices = get_args(info.type)
+    if get_origin(info.type) is not Literal or not all(isinstance(one, str) for one in choices):
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(choices)}}}",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda value: [value],
+    )
+
+
+def _path(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path | str | None] | None:
+    optional = info.type == Path | str | None
+    if not optional and info.type != Path | str:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: None if optional and words[0] == "None" else Path(words[0]),
+        is_instance=lambda value: isinstance(value, Path | str) or (optional and value is None),
+        str_from_instance=lambda value: [str(value)],
+    )

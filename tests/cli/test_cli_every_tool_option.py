@@ -1,0 +1,369 @@
+"""Every option of the verbs that reach no robot changes what they do, or is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib
+import json
+import re
+import shutil
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from verb_options import Option, options, sub_verb
+
+from deal_hw.cli.main import VERBS, main, parse
+from deal_hw.errors import DealHwError
+from deal_hw.workflows.emulation import cartpole as emulated_cartpole
+from deal_hw.workflows.emulation import go2 as emulated_go2
+from deal_hw.workflows.emulation.settings import CARTPOLE_EMULATORS
+from deal_hw.workflows.train import udr_distribution
+
+MJCF = """<mujoco model="arm"><compiler angle="radian"/><option timestep="0.005" integrator="implicitfast"/>
+<worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.2" range="-3 3"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.5" contype="0"/></body></worldbody>
+<actuator><position name="motor" joint="shoulder" kp="20" kv="0.5" forcerange="-20 20"/></actuator>
+</mujoco>"""
+
+RECORDINGS = "calibrate --model arm.xml --data fit.csv more.csv"
+LINES = (
+    RECORDINGS,
+    "calibrate dataset",
+    "train cartpole --nominal",
+    "train go2 --udr",
+    "train cartpole --distribution distribution.json",
+    "inspect dataset/episodes/000000.mcap --save a.rrd",
+    "inspect dataset/episodes/000000.mcap --screenshot a.png",
+    "inspect dataset/episodes/000000.mcap --web",
+    "design-excitation cartpole --out e.json",
+    "design-excitation cartpole --out e.json --family multisine",
+    "design-excitation cartpole --out e.json --family chirp",
+    "design-excitation cartpole --out e.json --family steps",
+    "design-excitation go2 --out e.json --family sway",
+    "emulate cartpole",
+    "emulate cartpole --transport can",
+    "emulate cartpole --transport dynamixel",
+    "emulate go2",
+    "emulate go2 --transport zenoh --port tcp/127.0.0.1:7447",
+    "bridge go2 --port lo",
+    "bridge go2 --port lo --listen tls/127.0.0.1:7447"
+    " --ca made_keys/ca.pem --certificate made_keys/robot.pem --key made_keys/robot.key",
+    "keys make --out keys --robot 192.168.1.20",
+    "keys add made_keys somebody",
+    "robot new arm.xml --out new.yaml",
+    "data info dataset",
+    "data verify dataset",
+    "data repair dataset",
+    "data import fit.csv --out imported",
+    "data import fit.csv --out imported --model arm.xml",
+    "data import fit.csv --out imported --robot arm.yaml",
+    "data export dataset --out exported",
+    "data export dataset --out exported --format foxglove",
+    "bench loop",
+    "bench go2-loop",
+    "bench fixed-range --methods eki",
+    "bench mismatch --methods eki",
+    "bench paper --methods eki",
+    "bench real --dataset dataset",
+    "bench verdict",
+    "bench first-answer",
+    "bench speed",
+    "bench go2-codec",
+)
+VALUES: dict[str, tuple[str, ...]] = {
+    "addresses": ("10.0.0.7",),
+    "calibration": ("distribution.json",),
+    "ca": ("ca2.pem",),
+    "certificate": ("c2.pem",),
+    "key": ("k2.pem",),
+    "columns": ("columns.yaml",),
+    "controllers": ("pilot",),
+    "data": ("more.csv",),
+    "dataset": ("dataset",),
+    "description": ("description.json",),
+    "distribution": ("distribution.json",),
+    "env": ("module:Env-v0",),
+    "episodes": ("0",),
+    "events_to": ("events.jsonl",),
+    "excite": ("chirp",),
+    "faults": ("sign",),
+    "feet": ("foot",),
+    "free": ("shoulder.damping",),
+    "generations": ("7",),
+    "holdout": ("hold.csv",),
+    "hot_joint": ("FL_hip_joint",),
+    "known": ("shoulder.damping", "0.3"),
+    "latency": ("0.01",),
+    "latency_range": ("0.001", "0.03"),
+    "leave_out": ("fit.csv", "0.5", "1"),
+    "link": ("link",),
+    "listen": ("tls/127.0.0.1:7448",),
+    "lost_joint": ("FL_hip_joint",),
+    "low_hz": ("0.5",),
+    "margin_s": ("0.01",),
+    "method": ("midpoint",),
+    "methods": ("eki",),
+    "model": ("arm.xml",),
+    "name": ("other",),
+    "nan_joint": ("FL_hip_joint",),
+    "observers": ("watcher",),
+    "out": ("elsewhere",),
+    "parameters": ("parameters.yaml",),
+    "parent": ("1",),
+    "physics_step": ("0.001",),
+    "policy": ("policy.onnx",),
+    "port": ("127.0.0.2",),
+    "problems": ("pendulum",),
+    "range": ("shoulder.damping", "0.1", "0.4"),
+    "range_ratio": ("3",),
+    "real": ("real",),
+    "remote_script": ("remote.json",),
+    "residual_std": ("0.01",),
+    "reveal_to": ("reveal.json",),
+    "robot": ("arm.yaml",),
+    "save": ("b.rrd",),
+    "spike_ratio": ("50",),
+    "screenshot": ("b.png",),
+    "seeds": ("7",),
+    "space": ("k11",),
+    "start": ("start.safetensors",),
+    "steps": ("1000",),
+    "task": ("ant",),
+    "track_to": ("track.csv",),
+    "transport": ("serial",),
+    "trainer": ("ppo",),
+    "truth_from": ("truth.json",),
+    "watch_save": ("watch.rrd",),
+    "write_parameters": ("written.yaml",),
+    # Calls, which Python alone can give.
+    **dict.fromkeys(("say", "progress"), ()),
+    # Shares and margins, where 2.5 would be refused for itself.
+    **dict.fromkeys(("corrupt", "drop", "duplicate", "reorder", "holdout_part"), ("0.3",)),
+    **dict.fromkeys(("amplitude", "split"), ("0.3",)),
+    **dict.fromkeys(("command_age_s", "listen_s", "leave_s", "status_s"), ("0.05",)),
+    "rate_hz": ("200",),
+}
+TOLD_ELSEWHERE = {"quiet", "json", "force", "several_trees", "authority_days"}
+"""They change what is printed, which the tests of each verb look at; allow what is not needed here; or change
+what no certificate's line tells."""
+
+
+class SeenError(Exception):
+    """What a verb was about to do at length; nothing long is run here."""
+
+
+def cases() -> Iterator[Any]:
+    """Yield each line with each option that is not in it."""
+    for line in LINES:
+        verb, *words = line.split()
+        config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
+        for option in options(sub_verb(config, words[0]), VALUES):
+            if option.name not in TOLD_ELSEWHERE and not {option.flag, *option.words[:1]} & set(words):
+                yield pytest.param(line, option, id=f"{line} {option.name}")
+
+
+def contents(path: Path) -> str:
+    """Return a text file's contents without the times in it, a table's digest, of other files nothing."""
+    if path.suffix == ".parquet":
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    if path.suffix not in (".json", ".yaml", ".csv"):
+        return ""
+    return re.sub(r"\d{4}-\d\d-\d\dT[\d:.]+", "", path.read_text(encoding="utf-8"))
+
+
+def told(value: Any) -> str:
+    """Return a value as text that is the same for the same value."""
+    if isinstance(value, np.ndarray):
+        return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]
+    if isinstance(value, np.random.Generator):
+        return str(value.bit_generator.state)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        inner = {entry.name: told(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
+        return f"{type(value).__name__}{inner}"
+    if isinstance(value, dict):
+        return str({key: told(one) for key, one in value.items()})
+    if isinstance(value, list | tuple):
+        return str([told(one) for one in value])
+    if isinstance(value, mujoco.MjModel):
+        return f"MjModel {value.opt.timestep} {value.nq}"
+    if callable(value):
+        return getattr(value, "__qualname__", type(value).__name__)
+    if type(value).__module__.startswith("deal_hw"):
+        inner = vars(value) if hasattr(value, "__dict__") else {}
+        return f"{type(value).__name__}{ {key: told(one) for key, one in inner.items()} }"
+    return repr(value)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all files that the lines name."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "arm.xml").write_text(MJCF, encoding="utf-8")
+    model = mujoco.MjModel.from_xml_string(MJCF.replace('damping="0.2"', 'damping="0.3"'))
+    for seed, name in enumerate(("fit", "more", "hold")):
+        data, rng, rows = mujoco.MjData(model), np.random.default_rng(seed), []
+        for time_s in np.arange(0, 4, 0.02):
+            wanted = 0.5 * np.sin((3 + seed) * time_s)
+            rows.append((time_s, data.qpos[0] + 1e-3 * rng.standard_normal(), wanted))
+            data.ctrl[0] = wanted
+            mujoco.mj_step(model, data, 4)
+        rows[100] = (rows[100][0], rows[100][1] + 0.4, rows[100][2])
+        head = "time,shoulder_pos,shoulder_cmd"
+        np.savetxt(folder / f"{name}.csv", rows, "%.6f", ",", header=head, comments="")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main("robot new arm.xml --out arm.yaml --control-rate 50".split()) == 0
+        line = "data import fit.csv more.csv hold.csv --robot arm.yaml --out dataset"
+        assert main(line.split()) == 0
+        text = "parameters:\n  - {kind: dof_damping, elements: shoulder}\n"
+        (folder / "parameters.yaml").write_text(text, encoding="utf-8")
+        distribution = json.dumps(udr_distribution("cartpole").to_json())
+        (folder / "distribution.json").write_text(distribution, encoding="utf-8")
+        assert main("keys make --out made_keys --robot 192.168.1.20".split()) == 0
+    return folder
+
+
+@pytest.fixture
+def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What a verb did."""
+    did: list[str] = []
+
+    def note(name: str, answer: Any = None, *, ends: bool = False) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            did.append(f"{name} {told(args)} {told(kwargs)}")
+            if ends:
+                raise SeenError
+            return answer
+
+        return call
+
+    def patch(target: str) -> None:
+        monkeypatch.setattr(target, note(target.rpartition(".")[2], ends=True))
+
+    def nothing(name: str) -> Callable[..., Any]:
+        @contextlib.contextmanager
+        def enter(*args: Any) -> Iterator[Callable[[], None]]:
+            did.append(f"{name} {told(args)}")
+            yield lambda: None
+
+        return enter
+
+    # The model is the test's own: it needs no process that tries it first.
+    monkeypatch.setattr("deal_hw.sim.engine.compiling._try", lambda path: None)
+    experiment = types.SimpleNamespace(afresh=note("afresh"), space=None, refused=0)
+    _calibrate(monkeypatch, did)
+    for target in ("save_screenshot", "serve_web", "open_window", "check_display"):
+        place = "deal_hw.viz.screenshot" if target == "save_screenshot" else "deal_hw.cli.inspect_"
+        patch(f"{place}.{target}")
+    patch("deal_hw.workflows.train.train_policy")
+    patch("deal_hw.calib.design.excitation_search.search_excitation")
+    monkeypatch.setattr("deal_hw.calib.design.experiment_design.Experiment", note("experiment", experiment))
+    patch("deal_hw.cli.bridge.Go2Bridge")
+    for bench in ("loop.cells", "go2_loop.cells", "speed.cells", "first_answer.cells", "real.cells"):
+        monkeypatch.setattr(f"deal_hw.bench.{bench}", note(bench))
+    monkeypatch.setattr("deal_hw.bench.calibration.cells", note("calibration"))
+    monkeypatch.setattr("deal_hw.bench.verdict.table", note("verdict"))
+    patch("deal_hw.bench.rows.run_cells")
+    emulator = types.SimpleNamespace(
+        open=lambda: "port", close=lambda: None, changes=[], report=lambda: {}, slips=0, dropped=0
+    )
+    for path in CARTPOLE_EMULATORS.values():
+        monkeypatch.setattr(path.replace(":", "."), note("emulator", emulator))
+    from deal_hw.drivers.cartpole.truth import nominal_truth as nominal_cartpole
+    from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
+
+    for target, truth in (("cartpole.oracle", nominal_cartpole), ("go2.emulator.truth", nominal_go2)):
+        drawn = note("drawn", truth("sensor", 0))
+        monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
+    device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
+    monkeypatch.setattr("deal_hw.drivers.go2.emulator.device.Go2Device", note("device", device))
+    monkeypatch.setattr("deal_hw.drivers.go2.emulator.emulator.Go2Emulator", note("go2", emulator))
+    monkeypatch.setattr(emulated_go2, "make_transport", note("transport"))
+    monkeypatch.setattr(emulated_go2, "summary", lambda report: [])
+    monkeypatch.setattr(emulated_go2, "tracking", nothing("tracking"))
+    for module in (emulated_cartpole, emulated_go2):
+        for name in ("run_until", "reveal"):
+            monkeypatch.setattr(module, name, note(name))
+        monkeypatch.setattr(module, "happenings", nothing("happenings"))
+        monkeypatch.setattr(module, "realtime_priority", contextlib.nullcontext)
+    patch("deal_hw.bench.go2_codec.bench_codec")
+    return did
+
+
+def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
+    """Note all that a calibration is called with, and what its result goes into."""
+    from deal_hw.cli import calibrate
+    from deal_hw.workflows.calibration import settings
+
+    def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
+        rest.pop("progress"), rest.pop("say")
+        searched = (space.names, space.nominal, space.low, space.high)
+        did.append(told((robot.model, searched, episodes, holdout, rest)))
+
+    def finish(work: Any, result: Any, folder: Path, *settings: Any, **rest: Any) -> None:
+        did.append(told((work.provenance, folder, settings, rest)))
+        raise SeenError
+
+    @contextlib.contextmanager
+    def watching(*shown: Any) -> Iterator[None]:
+        did.append(told(shown[:2]))
+        yield None
+
+    monkeypatch.setattr(calibrate, "watching", watching)
+    monkeypatch.setattr(settings, "calibrate_episodes", search)
+    monkeypatch.setattr(calibrate, "finish", finish)
+
+
+@pytest.fixture
+def outcome(
+    made: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    done: list[str],
+) -> Callable[[str], Any]:
+    """Tells what a verb did with a line, in a copy of that folder, or the refusal."""
+
+    def run(line: str) -> Any:
+        # At the same place each time: paths are part of what is noted.
+        folder, (verb, *words) = made.with_name("copy"), line.split()
+        monkeypatch.chdir(made)
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(made, folder)
+        monkeypatch.chdir(folder)
+        done.clear()
+        try:
+            settings, function = parse(verb, words)
+            function(settings)
+        except DealHwError as error:
+            return error
+        except SeenError:
+            pass
+        files = {str(path.relative_to(folder)): contents(path) for path in folder.rglob("*")}
+        return (done.copy(), capsys.readouterr().out, files)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def plain() -> dict[str, Any]:
+    """What the lines do by themselves, as they are come to."""
+    return {}
+
+
+@pytest.mark.parametrize(("line", "option"), list(cases()))
+def test_an_option_changes_something_or_is_refused(
+    line: str, option: Option, outcome: Callable[[str], Any], plain: dict[str, Any]
+) -> None:
+    """In this combination. The lines themselves are not refused."""
+    if line not in plain:
+        plain[line] = outcome(line)
+    assert not isinstance(plain[line], DealHwError), plain[line]
+    changed = outcome(f"{line} {' '.join(option.words)}")
+    assert isinstance(changed, DealHwError) or changed != plain[line], f"{' '.join(option.words)} did nothing"
