@@ -16,8 +16,8 @@ folder = Path(tempfile.mkdtemp())
 
 # A robot on a port, with hidden physics; with a real one, leave the block out and name its port.
 with deal_hw.emulate("cartpole", profile="sensor", seed=1) as robot:
-    for profile in ("rich", "chirp"):  # 4 s to fit, and 4 s of other motion to judge by
-        deal_hw.collect("cartpole", port=robot.port, profile=profile, out=folder, say=print)
+    for motion in ("rich", "chirp"):  # 4 s to fit, and 4 s of other motion to judge by
+        deal_hw.collect("cartpole", port=robot.port, motion=motion, out=folder, say=print)
 
     found = deal_hw.calibrate(dataset=folder / "dataset", say=print)
     print(found.table())

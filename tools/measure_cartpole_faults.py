@@ -79,7 +79,7 @@ class CartpoleRig(Rig):
 
     def arguments(self) -> list[str]:
         """Play a chirp."""
-        motion = ["--profile", "chirp", "--seconds", str(self._seconds)]
+        motion = ["--motion", "chirp", "--seconds", str(self._seconds)]
         return ["collect", "cartpole", "--transport", self.wire, *motion]
 
     def command(self, out: str, port: str = "") -> list[str]:

@@ -34,9 +34,9 @@ def plan_of(name: str, seconds: float, seed: int) -> RunPlan:
     """Return the run of an excitation: `rich`, a family's name, or a file."""
     policy = str(shipped_policy("cartpole") or "")
     if name == "rich":
-        return RunPlan(robot="cartpole", profile="rich", policy=policy, seconds=seconds, seed=seed)
+        return RunPlan(robot="cartpole", motion="rich", policy=policy, seconds=seconds, seed=seed)
     length = seconds if name in FAMILIES else read_plan(Path(name)).seconds
-    return RunPlan(robot="cartpole", profile="excite", excite=name, policy=policy, seconds=length, seed=seed)
+    return RunPlan(robot="cartpole", motion="excite", excite=name, policy=policy, seconds=length, seed=seed)
 
 
 def measure(profile: str, seed: int, name: str, seconds: float, threads: int | None) -> dict[str, Any]:

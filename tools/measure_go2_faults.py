@@ -81,7 +81,7 @@ class Go2Rig(Rig):
 
     def arguments(self) -> list[str]:
         """Hold the standing pose, or walk with a faulty policy."""
-        verb, what = "collect", ["--profile", "hold"]
+        verb, what = "collect", ["--motion", "hold"]
         if self.case.policy or self.case.dry:
             verb, what = "deploy", self.policy_arguments()
         posture = [

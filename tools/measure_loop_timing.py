@@ -86,7 +86,7 @@ def measure(config: MeasureLoopTiming) -> dict[str, Any]:
                 robot="cartpole",
                 port=port,
                 dataset=Path(folder),
-                profile=config.profile,
+                motion=config.profile,
                 seconds=config.minutes * 60.0,
                 quiet=True,
             )

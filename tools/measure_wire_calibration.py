@@ -55,7 +55,7 @@ def _calibrated(folder: Path, transport: str, profile: str, seed: int) -> dict[s
                     port=emulator.port,
                     link=LinkOptions(transport=transport),
                     out=run,
-                    profile=kind,
+                    motion=kind,
                     seed=seed,
                 )
             )

@@ -36,7 +36,7 @@ def check_excitation(problem: Problem) -> None:
         InsufficientDataError: They do not; the message says what was found and what to record.
     """
     seconds = sum(float(np.sum(e.usable)) * e.period_s for e in problem.episodes)
-    advice = "record again with `deal-hw collect --profile rich` (4 s; --excitation-level 1 to 3 is stronger)"
+    advice = "record again with `deal-hw collect --motion rich` (4 s; --excitation-level 1 to 3 is stronger)"
     if seconds < SHORTEST_S:
         raise InsufficientDataError(
             f"{seconds:.2f} s of usable samples, at least {SHORTEST_S:g} s are needed; {advice}"

@@ -161,7 +161,7 @@ def policy_of(problem: Problem) -> PopulationPolicy:
     if problem.policy is None:
         raise InsufficientDataError(
             "a rollout in closed loop needs the policy that moved the robot all through the recordings, and "
-            "it is not known; record with `deal-hw collect --profile balance`, or use a method that needs no "
+            "it is not known; record with `deal-hw collect --motion balance`, or use a method that needs no "
             "policy: eki, deal, deal-paper-replay"
         )
     return problem.policy

@@ -194,7 +194,7 @@ class _Designer:
             self._speed = (0.4, largest_factor(description.speed_limit, description.limits.speed))
 
     def usual(self) -> list[ExcitationDesign]:
-        """Return designs that are known to be fair, such as the profile `rich`: the search starts here."""
+        """Return designs that are known to be fair, such as the motion `rich`: the search starts here."""
         low, fast = max(0.15, self._effort[0]), min(2.5, self._speed[1])
         fair: tuple[tuple[Family, float], ...] = (("steps", 0.5), ("multisine", 1.0), ("chirp", 1.0))
         balance_s = min(0.6, 0.25 * self._seconds) if self._balances else 0.0

@@ -146,14 +146,14 @@ def _cartpole(ask: _Ask) -> Case:
     virtual = VirtualCartpole(truth)
     plan = RunPlan(
         robot="cartpole",
-        profile="balance" if ask.by_policy else "rich",
+        motion="balance" if ask.by_policy else "rich",
         seconds=ask.seconds,
         seed=seed,
         policy=str(shipped_policy("cartpole") or ""),
     )
     # A balanced pole is no stronger the second time.
     shown, search = demonstrate(virtual, plan, 1 if ask.by_policy else ATTEMPTS)
-    chirp = replace(plan, profile="chirp")
+    chirp = replace(plan, motion="chirp")
     recordings = (shown, virtual.run(make_behaviour(chirp, DESCRIPTION), DEMONSTRATION_S))
     fit, heldout = (fill_gaps(align(r.trajectory, DESCRIPTION)) for r in recordings)
     # The truth is of K9; what else may be searched has its nominal value.

@@ -12,7 +12,7 @@ import tyro
 
 from deal_hw.data.files import INDEX_NAME, dataset_of
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
+from deal_hw.data.recording.episode_info import EpisodeInfo, motion_of, summarize
 from deal_hw.data.recording.repair import RepairReport, repair, verify
 from deal_hw.errors import DatasetError
 from deal_hw.workflows.import_export import (
@@ -217,7 +217,7 @@ def _dataset_table(dataset: Dataset) -> Table:
 def _motion(episode: EpisodeInfo) -> str:
     """Return why an episode was recorded and what was played, with its level where that was changed."""
     level = float(episode.facts.get("excitation_level") or 0.0)
-    words = [episode.purpose, str(episode.facts.get("profile") or ""), f"level {level:+g}" if level else ""]
+    words = [episode.purpose, motion_of(episode.facts), f"level {level:+g}" if level else ""]
     return " ".join(word for word in words if word)
 
 

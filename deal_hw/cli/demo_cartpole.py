@@ -60,7 +60,7 @@ def run(config: Demo, folder: RunFolder, stages: Stages) -> Demonstrated:
         with stages.stage("collect", "4 s that tell much, and 4 s of other motion to judge by"):
             for kind in ("rich", "chirp"):
                 collect(
-                    Collect(robot="cartpole", port=port, link=link, out=out, profile=kind, seed=config.seed)
+                    Collect(robot="cartpole", port=port, link=link, out=out, motion=kind, seed=config.seed)
                 )
         with stages.stage("calibrate", "search, refinement, latency, intervals"):
             found = calibrate(Calibrate(dataset=folder.dataset, out=out, seed=config.seed))

@@ -82,8 +82,12 @@ def _metavar(name: str, parts: tuple[Any, ...]) -> str | None:
     if tyro.conf.Positional in parts[1:]:
         return name.upper()
     kinds = set(get_args(parts[0])) if get_origin(parts[0]) in (Union, UnionType) else set()
-    names = [kind.__name__.upper() for kind in kinds - {NoneType, str} if isinstance(kind, type)]
-    return names[0] if NoneType in kinds and len(names) == 1 else None
+    # A file that may be left out: Python may name it by a string, too.
+    kinds -= {str} if Path in kinds else set()
+    if NoneType not in kinds or len(kinds) != 2:
+        return None
+    (kind,) = kinds - {NoneType}
+    return "True|False" if kind is bool else str(getattr(kind, "__name__", kind)).upper()
 
 
 def _default(label: str) -> str:

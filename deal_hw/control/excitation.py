@@ -65,7 +65,7 @@ def segment_command(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RichConfig:
-    """Collection profile `rich`: balance, then random set-points; the pole may fall."""
+    """Collection motion `rich`: balance, then random set-points; the pole may fall."""
 
     duration_s: float = 4.0
     """Length of the run [s]; segments are fractions of it."""
@@ -93,7 +93,7 @@ class RichConfig:
             and 1e-3 <= low <= high <= LONGEST_S
         ):
             raise ConfigurationError(
-                f"not a usable collection profile: duration {self.duration_s:g} s, balance "
+                f"not a usable motion: duration {self.duration_s:g} s, balance "
                 f"{self.balance_s:g} s, amplitude {self.amplitude:g}, hold {low:g} to "
                 f"{high:g} s; numbers above 0, at most {LONGEST_S:g} s"
             )
@@ -105,7 +105,7 @@ class RichBehaviour:
     Args:
         description: The robot.
         balance: What balances at first; None starts with the set-points at once.
-        config: The profile.
+        config: The motion.
         seed: Fixes the set-points; ``reset`` repeats them.
     """
 

@@ -74,14 +74,14 @@ def shortfalls(found: Excitation, description: RobotDescription) -> tuple[str, .
 
 
 def with_excitation_level(config: RichConfig, level: float, description: RobotDescription) -> RichConfig:
-    """Return the profile, stronger or gentler by some steps, inside the safety limits.
+    """Return the motion, stronger or gentler by some steps, inside the safety limits.
 
     A step up: set-points half again as far and held half again as long, gains stiffer and less damped, higher
     limits (those sent low to be felt apart), half the balancing. A step down: nearer set-points, softer and
     more damped gains, lower limits.
 
     Args:
-        config: The profile as it is at 0.
+        config: The motion as it is at 0.
         level: Steps up, or down where negative; half steps, too.
         description: The robot.
 
@@ -90,7 +90,7 @@ def with_excitation_level(config: RichConfig, level: float, description: RobotDe
     """
     if not LOWEST_LEVEL <= level <= HIGHEST_LEVEL:
         raise ConfigurationError(
-            f"excitation level {level:g}: {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}, 0 is the profile itself"
+            f"excitation level {level:g}: {LOWEST_LEVEL:g} to {HIGHEST_LEVEL:g}, 0 is the motion itself"
         )
     if level == 0:
         return config

@@ -46,12 +46,12 @@ class CollectSettings(RunOptions):
     simulation: Annotated[SimulationOptions, OWN_ROBOT] = field(default_factory=SimulationOptions)
     """A robot of your own, in simulation."""
 
-    profile: Literal["rich", "chirp", "balance", "hold"] = "rich"
+    motion: Literal["rich", "chirp", "balance", "hold"] = "rich"
     """rich: balance, then random set-points (with --simulated these alone, with the robot's own gains);
     chirp: a sine sweep (for held-out data); balance: the policy all the time; hold: the start pose."""
 
     excite: str = ""
-    """Play this instead of a profile: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
+    """Play this instead of MOTION: multisine, chirp, optimal (computed first; needs deal-hw[calib]), or a
     file that `deal-hw design-excitation` wrote, which says how long it is."""
 
     policy: File | None = None
@@ -64,18 +64,18 @@ class CollectSettings(RunOptions):
     """How many episodes."""
 
     excitation_level: Annotated[float, Range(LOWEST_LEVEL, HIGHEST_LEVEL)] = 0.0
-    """Start profile rich stronger (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
+    """Start motion rich stronger (1 to 3) or gentler (-1 to -3): amplitude, holds, gains and limits, inside
     the safety limits."""
 
     attempts: Annotated[int, Range(1, 100)] = ATTEMPTS
-    """How often an episode of profile rich is recorded at most: one that hardly moves is repeated stronger.
+    """How often an episode of motion rich is recorded at most: one that hardly moves is repeated stronger.
     After a trip nothing is repeated; look at the robot first."""
 
     seed: Seed = 0
     """Fixes the random set-points; episode k uses SEED + k."""
 
     rich: RichConfig = field(default_factory=RichConfig)
-    """Settings of the profile `rich`; its length is SECONDS."""
+    """Settings of the motion `rich`; its length is SECONDS."""
 
 
 @from_settings(CollectSettings)
@@ -109,10 +109,10 @@ def run(config: CollectSettings, view: RunView) -> RunReport:
             f"warning: {seconds * config.episodes:g} s in all is too short for `deal-hw calibrate`, which "
             f"needs {SHORTEST_S:g} s of usable samples; 4 s are enough (--seconds 4)"
         )
-    walks = config.profile == "balance" and not excite
+    walks = config.motion == "balance" and not excite
     plan = RunPlan(
         **plan_options(config.robot, config.link, config.legs, walks=walks),
-        profile="excite" if excite else config.profile,
+        motion="excite" if excite else config.motion,
         policy=str(policy or ""),
         seconds=seconds,
         seed=config.seed,
@@ -137,7 +137,7 @@ def _rehearse(config: CollectSettings, view: RunView) -> RunReport:
     excite, seconds = _excitation(config, view)
     plan = RunPlan(
         robot=config.robot,
-        profile="excite" if excite else config.profile,
+        motion="excite" if excite else config.motion,
         policy=str(config.policy or ""),
         seconds=seconds,
         seed=config.seed,
@@ -168,13 +168,11 @@ def _refuse_ignored(config: CollectSettings) -> None:
     if config.simulation.simulated:
         refuse(given(config, default, ["policy"]), "--simulated runs no policy")
     if config.excite:
-        refuse(given(config, default, ["profile"]), "--excite plays its own motion; leave one of the two out")
-    if config.excite or config.profile != "rich":
-        refuse(
-            given(config, default, ["excitation_level", "attempts"]), "only --profile rich can be stronger"
-        )
-    if not config.excite and config.profile in ("chirp", "hold"):
-        refuse(given(config, default, ["policy"]), f"--profile {config.profile} runs no policy")
+        refuse(given(config, default, ["motion"]), "--excite plays its own motion; leave one of the two out")
+    if config.excite or config.motion != "rich":
+        refuse(given(config, default, ["excitation_level", "attempts"]), "only --motion rich can be stronger")
+    if not config.excite and config.motion in ("chirp", "hold"):
+        refuse(given(config, default, ["policy"]), f"--motion {config.motion} runs no policy")
 
 
 def _excitation(config: CollectSettings, view: RunView) -> tuple[str, float]:

@@ -75,7 +75,7 @@ def run(config: DeploySettings, view: RunView) -> RunReport:
     policy = config.policy or shipped_policy(config.robot)
     plan = RunPlan(
         **plan_options(config.robot, config.link, config.legs),
-        profile="balance",
+        motion="balance",
         policy=str(policy or ""),
         seconds=config.seconds,
         seed=config.seed,

@@ -84,7 +84,7 @@ def run(config: ReplaySettings, view: RunView) -> RunReport:
     behaviour = ReplayBehaviour(trajectory, driver_description(robot))
     plan = RunPlan(
         **plan_options(robot, config.link, config.legs, walks=False),
-        profile="replay",
+        motion="replay",
         recording=str(path.resolve()),
         seconds=behaviour.duration_s,
     )
@@ -107,7 +107,7 @@ def _rehearse(
     folder = recording_folder(config.out, config.dataset, "replay", description.name, record=config.record)
     if folder is None:
         raise ConfigurationError("--no-record: a rehearsal is there to be recorded; leave the option out")
-    plan = RunPlan(robot=robot, profile="replay", recording=str(path.resolve()), seconds=behaviour.duration_s)
+    plan = RunPlan(robot=robot, motion="replay", recording=str(path.resolve()), seconds=behaviour.duration_s)
     return run_simulated(
         plan, robot, config.simulation, dataset=folder, episodes=1, purpose="replay", view=view
     )

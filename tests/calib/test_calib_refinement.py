@@ -261,7 +261,7 @@ def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) 
     still = dataclasses.replace(ideal.fit, position=np.zeros_like(ideal.fit.position))
     problem = Problem(ideal.robot, ideal.space, [still], threads=1)
     search = FixedSearch(ideal.theta, 1e-3, 0.05)
-    with pytest.raises(InsufficientDataError, match=r"hardly moves.*--profile rich"):
+    with pytest.raises(InsufficientDataError, match=r"hardly moves.*--motion rich"):
         CalibrationPipeline(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.budgets == []
     short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 60)

@@ -28,7 +28,7 @@ def record(folder: Path, runs: list[tuple[str, Behaviour, float]]) -> Path:
         for profile, behaviour, seconds in runs:
             path = store.next_episode_path()
             robot.run(
-                behaviour, seconds, path, {"profile": profile, "purpose": "collect", "robot": "cartpole"}
+                behaviour, seconds, path, {"motion": profile, "purpose": "collect", "robot": "cartpole"}
             )
             store.note_episode(path)
     return folder

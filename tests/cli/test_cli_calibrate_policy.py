@@ -25,13 +25,13 @@ POLICY = shipped_policy("cartpole") or Path()
 def record(folder: Path, *changes: Mapping[str, Any]) -> Path:
     """Record seconds of balancing for each set of changes to the metadata, as `collect` does."""
     plan = check_plan(
-        RunPlan(robot="cartpole", profile="balance", seconds=2.4, policy=str(POLICY)), DESCRIPTION
+        RunPlan(robot="cartpole", motion="balance", seconds=2.4, policy=str(POLICY)), DESCRIPTION
     )
     with Dataset.create_or_open(folder, DESCRIPTION) as store:
         for change in changes:
             path = store.next_episode_path()
             metadata = {
-                "profile": plan.profile,
+                "motion": plan.motion,
                 "purpose": "collect",
                 "robot": "cartpole",
                 "policy_digest": plan.policy_digest[:16],
@@ -83,7 +83,7 @@ def test_the_datasets_own_policy_is_run(dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ([{"profile": "rich"}], "episode 0 was recorded with profile 'rich'.*deal-paper-replay"),
+        ([{"motion": "rich"}], "episode 0 was recorded with motion 'rich'.*deal-paper-replay"),
         ([{"stand": True}], "episode 0 stands up and lies down"),
         ([{}, {"policy_digest": "0123456789abcdef"}], "recorded with 2 policies"),
         ([{"velocity": "keyboard"}], "one fixed velocity"),

@@ -35,7 +35,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Dataset.create_or_open(folder, DESCRIPTION) as store:
         path = store.next_episode_path()
         VirtualCartpole(nominal_truth("sensor", 4, actuation_ticks=9)).run(
-            behaviour, 2.2, path, {"profile": "rich", "purpose": "collect", "robot": "cartpole"}
+            behaviour, 2.2, path, {"motion": "rich", "purpose": "collect", "robot": "cartpole"}
         )
         store.note_episode(path)
     return folder

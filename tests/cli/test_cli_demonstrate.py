@@ -35,7 +35,7 @@ from deal_hw.workflows.shipped import shipped_policy
 def shown(truth: CartpoleTruth) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
     """Return the demonstration of an emulated robot."""
     policy = str(shipped_policy("cartpole"))
-    plan = RunPlan(robot="cartpole", profile="rich", policy=policy, seed=truth.seed)
+    plan = RunPlan(robot="cartpole", motion="rich", policy=policy, seed=truth.seed)
     return demonstrate(VirtualCartpole(truth), plan)
 
 

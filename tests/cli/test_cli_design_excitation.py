@@ -83,7 +83,7 @@ def test_each_excitation_keeps_the_limits(
             quiet=True,
         )
         design_excitation(settings)
-    plan = RunPlan(robot="cartpole", profile="excite", excite=name, policy=POLICY, seconds=2.0, seed=3)
+    plan = RunPlan(robot="cartpole", motion="excite", excite=name, policy=POLICY, seconds=2.0, seed=3)
     assert RunPlan.from_json(json.loads(json.dumps(plan.to_json()))) == plan
     run = VirtualCartpole(truth).run(make_behaviour(plan, DESCRIPTION), plan.seconds)
     assert (run.report.outcome, run.report.clipped) == (Outcome.FINISHED, {})
@@ -96,7 +96,7 @@ def test_seeds_give_other_multisines() -> None:
     """Episode k is recorded with SEED + k."""
     asked = []
     for seed in (0, 0, 1):
-        plan = RunPlan(robot="so101", profile="excite", excite="multisine", seconds=10.0, seed=seed)
+        plan = RunPlan(robot="so101", motion="excite", excite="multisine", seconds=10.0, seed=seed)
         behaviour = make_behaviour(plan, ARM)
         assert isinstance(behaviour, ExcitationBehaviour)
         asked.append(behaviour._plan.offsets(np.linspace(0, 10, 50)))
@@ -122,10 +122,10 @@ def test_collect_finds_what_to_play(optimal: Path) -> None:
 def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> None:
     """Another robot's, or of another length than the run."""
     with pytest.raises(ConfigurationError, match="made for robot 'cartpole'"):
-        make_behaviour(RunPlan(robot="so101", profile="excite", excite=str(optimal), seconds=2.0), ARM)
+        make_behaviour(RunPlan(robot="so101", motion="excite", excite=str(optimal), seconds=2.0), ARM)
     with pytest.raises(ConfigurationError, match="is 2 s long"):
         make_behaviour(
-            RunPlan(robot="cartpole", profile="excite", excite=str(optimal), policy=POLICY, seconds=4.0),
+            RunPlan(robot="cartpole", motion="excite", excite=str(optimal), policy=POLICY, seconds=4.0),
             DESCRIPTION,
         )
     with pytest.raises(UnknownNameError, match="k99"):
@@ -139,7 +139,7 @@ def test_playing_needs_no_extra(optimal: Path) -> None:
     code = (
         "import sys; from deal_hw.workflows.running.plan import RunPlan, make_behaviour; "
         "from deal_hw.drivers import robot_description; import deal_hw.cli.collect; "
-        f"plan = RunPlan(robot='cartpole', profile='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
+        f"plan = RunPlan(robot='cartpole', motion='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
         "seconds=2.0); make_behaviour(plan, robot_description('cartpole')); "
         "print([m for m in ('torch', 'mujoco', 'scipy') if m in sys.modules])"
     )

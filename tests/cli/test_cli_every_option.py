@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[2]
 ZENOH = "--transport zenoh --port tcp/127.0.0.1:7447"
 LINES = (
     "collect cartpole --port p --out o",
-    "collect cartpole --port p --out o --profile chirp",
-    "collect cartpole --port p --out o --profile hold",
-    "collect go2 --port lo --out o --profile hold",
+    "collect cartpole --port p --out o --motion chirp",
+    "collect cartpole --port p --out o --motion hold",
+    "collect go2 --port lo --out o --motion hold",
     f"collect go2_on_stand {ZENOH} --out o",
     "deploy cartpole --port p",
     "deploy cartpole --port p --out o --dry-run",

@@ -42,7 +42,7 @@ def record(device: Go2Device, dataset: Dataset, plan: RunPlan) -> None:
     clock = VirtualClock(10**9)
     robot = Go2OnStandRobot(VirtualTopics(device, clock), clock)
     path = dataset.next_episode_path()
-    with EpisodeRecorder(path, DESCRIPTION.to_json(), {"profile": plan.profile}, clock) as recorder:
+    with EpisodeRecorder(path, DESCRIPTION.to_json(), {"profile": plan.motion}, clock) as recorder:
 
         def sink(cycle: CycleRecord) -> bool:
             recorder.write(cycle)
@@ -85,7 +85,7 @@ def dataset(truth: Go2Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Dataset.create_or_open(folder, DESCRIPTION.to_json()) as store:
         for kind, seconds in (("multisine", 4.0), ("chirp", 2.4)):
             device = Go2Device(truth, on_stand=True, sport="")
-            plan = RunPlan(robot="go2_on_stand", profile="excite", excite=kind, seconds=seconds)
+            plan = RunPlan(robot="go2_on_stand", motion="excite", excite=kind, seconds=seconds)
             record(device, store, plan)
     return folder
 
@@ -229,7 +229,7 @@ def test_playing_a_planned_sway_needs_no_simulator(tmp_path: Path) -> None:
         "import json, sys\n"
         "from deal_hw.workflows.running.plan import RunPlan, make_behaviour\n"
         "from deal_hw.drivers.go2.descriptions.driver import DRIVER\n"
-        f"plan = RunPlan(robot='go2', profile='excite', excite={str(path)!r}, seconds=1.0)\n"
+        f"plan = RunPlan(robot='go2', motion='excite', excite={str(path)!r}, seconds=1.0)\n"
         "make_behaviour(plan, DRIVER)\n"
         "print(json.dumps([n for n in ('mujoco', 'torch', 'scipy') if n in sys.modules]))\n"
     )

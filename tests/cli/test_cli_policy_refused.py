@@ -85,16 +85,16 @@ def test_a_faulty_network_never_reaches_a_robot(
     """Whichever verb runs it, also where nothing would be sent."""
     path = tmp_path / "faulty.onnx"
     write_policy(*faulty_policy(DESCRIPTION, fault), path)
-    arguments = (*verb, "--out", str(tmp_path / "run"), "--profile", "rich") if verb[0] == "collect" else verb
+    arguments = (*verb, "--out", str(tmp_path / "run"), "--motion", "rich") if verb[0] == "collect" else verb
     said = deploy(path, *arguments)
     assert "faulty.onnx: the network" in said and "seen with fastest command" in said
     assert "no-port" not in said and not (tmp_path / "run").exists()
 
 
 def test_a_policy_that_would_not_run_is_refused(tmp_path: Path, deploy: Callable[..., str]) -> None:
-    """The profile `hold` runs none: whoever gives one expects something else."""
-    verb = ("collect", "cartpole", "--profile", "hold", "--out", str(tmp_path / "run"))
-    assert "--policy would have no effect: --profile hold runs no policy" in deploy(
+    """The motion `hold` runs none: whoever gives one expects something else."""
+    verb = ("collect", "cartpole", "--motion", "hold", "--out", str(tmp_path / "run"))
+    assert "--policy would have no effect: --motion hold runs no policy" in deploy(
         tmp_path / "nothing.onnx", *verb
     )
 

@@ -113,7 +113,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rich = RichBehaviour(DESCRIPTION, None, RichConfig(duration_s=2.4, balance_s=0.0), 1)
     with Dataset.create_or_open(folder / "run" / "dataset", DESCRIPTION) as store:
         path = store.next_episode_path()
-        robot.run(rich, 2.4, path, {"profile": "rich", "purpose": "collect", "robot": "cartpole"})
+        robot.run(rich, 2.4, path, {"motion": "rich", "purpose": "collect", "robot": "cartpole"})
         store.note_episode(path)
     Dataset.create_or_open(folder / "blank", DESCRIPTION).close()
     facts = {**DESCRIPTION.to_json(), "state_rate_hz": 50}

@@ -30,7 +30,7 @@ def record(folder: Path, seconds: float, *faults: str) -> tuple[EpisodeReport, T
                 port=emulator.port + PATIENT,
                 link=LINK,
                 dataset=folder / "set",
-                profile="chirp",
+                motion="chirp",
                 seconds=seconds,
                 quiet=True,
             )

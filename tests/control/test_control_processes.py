@@ -133,7 +133,7 @@ def run(
             act()
 
     plan = RunPlan(
-        robot="cartpole", profile="chirp", seconds=seconds, dry_run=dry, passive_timeout_s=PASSIVE_S
+        robot="cartpole", motion="chirp", seconds=seconds, dry_run=dry, passive_timeout_s=PASSIVE_S
     )
     return run_episodes(
         plan, port=emulator.port, dataset=folder, episodes=1, purpose="collect", on_beat=on_beat
@@ -159,7 +159,7 @@ def test_collect_records_a_whole_episode(emulator: Emulator, tmp_path: Path) -> 
             robot="cartpole",
             port=emulator.port,
             out=tmp_path,
-            profile="chirp",
+            motion="chirp",
             seconds=0.6,
             episodes=2,
             quiet=True,
@@ -230,7 +230,7 @@ def test_ctrl_c_in_every_other_phase_ends_passively(emulator: Emulator, tmp_path
             done = True
             os.kill(os.getpid(), signal.SIGINT)
 
-    plan = RunPlan(robot="cartpole", profile="chirp", seconds=0.2 if phase == "making passive" else LONG)
+    plan = RunPlan(robot="cartpole", motion="chirp", seconds=0.2 if phase == "making passive" else LONG)
     with pytest.raises(InterruptedRunError) as raised:
         run_episodes(
             plan,
@@ -314,7 +314,7 @@ def test_a_killed_supervisor_leaves_a_passive_robot_and_no_process(
                 print(Path("/proc/self/task/" + str(os.getpid()) + "/children").read_text(), flush=True)
 
         run_episodes(
-            RunPlan(robot="cartpole", profile="chirp", seconds={LONG}), port={emulator.port!r},
+            RunPlan(robot="cartpole", motion="chirp", seconds={LONG}), port={emulator.port!r},
             dataset=Path({str(tmp_path)!r}), episodes=1, purpose="collect", on_beat=on_beat,
         )
     """
@@ -397,7 +397,7 @@ def test_a_second_collector_is_refused_and_disturbs_nobody(emulator: Emulator, t
 def test_no_such_port_and_a_wrong_device_are_refused_before_anything_is_made(tmp_path: Path) -> None:
     """The port that does not exist, and one on which something else answers."""
     with pytest.raises(PortNotFoundError, match="no serial port '/dev/ttyNOPE'"):
-        collect(Collect(robot="cartpole", port="/dev/ttyNOPE", dataset=tmp_path / "a", profile="hold"))
+        collect(Collect(robot="cartpole", port="/dev/ttyNOPE", dataset=tmp_path / "a", motion="hold"))
     master, slave = os.openpty()
     done = threading.Event()
 
@@ -409,7 +409,7 @@ def test_no_such_port_and_a_wrong_device_are_refused_before_anything_is_made(tmp
     thread.start()
     try:
         with pytest.raises(WrongDeviceError, match="no answer to hello"):
-            collect(Collect(robot="cartpole", port=os.ttyname(slave), dataset=tmp_path / "a", profile="hold"))
+            collect(Collect(robot="cartpole", port=os.ttyname(slave), dataset=tmp_path / "a", motion="hold"))
     finally:
         done.set()
         thread.join()
@@ -497,13 +497,13 @@ def test_policies_that_do_not_fit_are_refused_before_the_robot_is_touched(tmp_pa
 def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:
     """Where the data should go, how long, how often."""
     with pytest.raises(ConfigurationError, match="not both"):
-        collect(Collect(robot="cartpole", port="x", out=tmp_path, dataset=tmp_path, profile="hold"))
+        collect(Collect(robot="cartpole", port="x", out=tmp_path, dataset=tmp_path, motion="hold"))
     with pytest.raises(ConfigurationError, match="give --out RUN"):
-        collect(Collect(robot="cartpole", port="x", profile="hold"))
+        collect(Collect(robot="cartpole", port="x", motion="hold"))
     with pytest.raises(ConfigurationError, match="--seconds"):
-        collect(Collect(robot="cartpole", port="x", out=tmp_path, profile="hold", seconds=math.nan))
+        collect(Collect(robot="cartpole", port="x", out=tmp_path, motion="hold", seconds=math.nan))
     with pytest.raises(ConfigurationError, match="--episodes 0: allowed are 1 to 10000"):
-        collect(Collect(robot="cartpole", port="x", out=tmp_path, profile="hold", episodes=0))
+        collect(Collect(robot="cartpole", port="x", out=tmp_path, motion="hold", episodes=0))
 
 
 def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy() -> None:
@@ -518,7 +518,7 @@ def test_the_verbs_that_run_on_the_robot_load_neither_torch_nor_mujoco_nor_scipy
         from deal_hw.clock import MonotonicClock
         from deal_hw.drivers import make_robot
         robot = make_robot("cartpole", "serial", "/dev/null", MonotonicClock())
-        make_behaviour(RunPlan(robot="cartpole", profile="chirp"), robot.description)
+        make_behaviour(RunPlan(robot="cartpole", motion="chirp"), robot.description)
         heavy = ("torch", "mujoco", "scipy", "rerun", "pandas")
         print(json.dumps([name for name in heavy if name in sys.modules]))
     """

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 PLAN = RunPlan(
     robot="go2",
     transport="zenoh",
-    profile="hold",
+    motion="hold",
     seconds=1.0,
     stand=True,
     posture=PostureConfig(fold_s=0.4, rise_s=0.8, settle_s=0.2, lie_s=0.8),

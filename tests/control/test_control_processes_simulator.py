@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 PLAN = RunPlan(
     robot="go2",
     transport="zenoh",
-    profile="hold",
+    motion="hold",
     seconds=1.0,
     stand=True,
     posture=PostureConfig(fold_s=0.4, rise_s=0.8, settle_s=0.2, lie_s=0.8),
@@ -95,7 +95,7 @@ def test_a_run_ends_with_next_to_no_torque(tmp_path: Path, simulator: tuple[str,
 def test_the_simulator_is_not_taken_for_a_robot(simulator: tuple[str, UnitreeMujoco]) -> None:
     """Without the option, nothing is sent to it."""
     port, device = simulator
-    plan = RunPlan(robot="go2", transport="zenoh", profile="hold", seconds=1.0)
+    plan = RunPlan(robot="go2", transport="zenoh", motion="hold", seconds=1.0)
     with pytest.raises(VersionMismatchError, match="--simulator unitree_mujoco"):
         run_episodes(plan, port=port, dataset=None, episodes=1, purpose="collect")
     assert device.commands == 0

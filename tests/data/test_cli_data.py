@@ -26,7 +26,7 @@ def dataset(tmp_path: Path, write_episode: WriteEpisode) -> Path:
     with Dataset.create_or_open(folder, DESCRIPTION) as collection:
         path = collection.next_episode_path()
         shutil.copy(write_episode("source.mcap"), path)
-        collection.note_episode(path, {"profile": "rich", "excitation_level": 1.5})
+        collection.note_episode(path, {"motion": "rich", "excitation_level": 1.5})
     return folder
 
 

@@ -369,7 +369,7 @@ def test_collect_records_a_whole_run(tmp_path: Path, transport: str) -> None:
                 port=emulator.port,
                 link=LinkOptions(transport=transport),
                 out=tmp_path / "run",
-                profile="hold",
+                motion="hold",
                 seconds=1.0,
                 quiet=True,
             )

@@ -101,7 +101,7 @@ class Go2:
 
     def plan(self, **changes: Any) -> dict[str, Any]:
         """Return a run that holds the pose, and its port."""
-        values = {"robot": "go2", "transport": "zenoh", "profile": "hold", "seconds": 60.0, **changes}
+        values = {"robot": "go2", "transport": "zenoh", "motion": "hold", "seconds": 60.0, **changes}
         return {"plan": RunPlan(**values), "port": self.process.port}
 
     def commands(self) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def on_beat(beat):
             os.kill(os.getpid(), int(number))
 
 
-plan = RunPlan(robot="go2", transport="zenoh", profile="hold", seconds=600.0)
+plan = RunPlan(robot="go2", transport="zenoh", motion="hold", seconds=600.0)
 run_episodes(plan, port=port, dataset=None, episodes=1, purpose="collect", on_beat=on_beat)
 """
 
@@ -363,7 +363,7 @@ def interrupt(beat: Beat) -> None:
 def test_ctrl_c_ends_a_loop_of_runs() -> None:
     """It ended one `collect()`: a loop in Python went on with the next."""
     with EmulatorProcess("cartpole", "--nominal", "--profile", "sensor") as emulator:
-        plan = RunPlan(robot="cartpole", profile="chirp", seconds=60.0)
+        plan = RunPlan(robot="cartpole", motion="chirp", seconds=60.0)
         with pytest.raises(KeyboardInterrupt):
             run(plan, emulator.port, interrupt)
 
@@ -393,7 +393,7 @@ def test_the_supervisor_has_real_time_priority() -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     seen: set[int] = set()
     with EmulatorProcess("cartpole", "--nominal", "--profile", "sensor") as emulator:
-        plan = RunPlan(robot="cartpole", profile="chirp", seconds=0.2)
+        plan = RunPlan(robot="cartpole", motion="chirp", seconds=0.2)
         run(plan, emulator.port, lambda beat: seen.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK))
     assert seen == {os.SCHED_FIFO}
 

@@ -65,7 +65,7 @@ def loaded():
     return sorted({name.partition(".")[0] for name in sys.modules})
 
 clock = MonotonicClock()
-plan = RunPlan(robot="go2", transport=transport, port=port, profile="hold", stand=True, wire=options)
+plan = RunPlan(robot="go2", transport=transport, port=port, motion="hold", stand=True, wire=options)
 robot = make_robot(plan.robot, plan.transport, plan.port, clock, plan.wire)
 behaviour = make_behaviour(plan, robot.description)
 ControlLoop(robot, behaviour, Safety(robot.description), clock, bool, LoopConfig(duration_s=plan.total_s))
@@ -150,7 +150,7 @@ def test_collect_runs_without_extras(tmp_path: Path, port: str) -> None:
         "cartpole",
         "--port",
         port,
-        "--profile",
+        "--motion",
         "hold",
         "--seconds",
         "0.4",
@@ -206,7 +206,7 @@ def test_go2_runs_without_extras(tmp_path: Path) -> None:
     with EmulatorProcess("go2", *options) as emulator:
         reach = ("go2", "--transport", "zenoh", "--port", emulator.port)
         done = run_bare(
-            tmp_path, "collect", *reach, "--profile", "hold", "--seconds", "0.4", "--out", "run", *posture
+            tmp_path, "collect", *reach, "--motion", "hold", "--seconds", "0.4", "--out", "run", *posture
         )
         assert done.returncode in {FINISHED, TRIPPED}, done.stderr
         told = run_bare(tmp_path, "doctor", *reach, "--seconds", "1")
@@ -219,7 +219,7 @@ def test_go2_runs_without_extras(tmp_path: Path) -> None:
 
 def test_dds_without_its_package_names_the_extra(tmp_path: Path) -> None:
     """One line that says what to install; no process was started for it."""
-    done = run_bare(tmp_path, "collect", "go2", "--port", "lo", "--profile", "hold", "--out", "run")
+    done = run_bare(tmp_path, "collect", "go2", "--port", "lo", "--motion", "hold", "--out", "run")
     assert done.returncode == 2
     assert install_line("dds") in done.stderr
     assert "Traceback" not in done.stderr

@@ -299,7 +299,7 @@ def test_the_control_process_opens_the_bytes_that_were_checked(file: Callable[..
 
 def test_a_profile_without_a_policy_tries_none(tmp_path: Path) -> None:
     """A file that is not used is not looked at."""
-    plan = RunPlan(robot="cartpole", profile="hold", policy=str(tmp_path / "nothing.onnx"))
+    plan = RunPlan(robot="cartpole", motion="hold", policy=str(tmp_path / "nothing.onnx"))
     assert check_plan(plan, CARTPOLE).policy_digest == ""
 
 

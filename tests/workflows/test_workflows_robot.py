@@ -104,14 +104,14 @@ def test_a_rehearsal_without_a_robot(made: Path, tmp_path: Path) -> None:
     yaml.write_text(text, encoding="utf-8")
     simulation = deal_hw.SimulationOptions(simulated=True, truth_seed=2, reveal_to=tmp_path / "truth.json")
     report = deal_hw.collect(
-        str(yaml), simulation=simulation, profile="chirp", seconds=3.0, out=tmp_path / "run"
+        str(yaml), simulation=simulation, motion="chirp", seconds=3.0, out=tmp_path / "run"
     )
     assert report.exit_code == 0 and report.episodes[0].states_recorded == 151
     truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
     assert truth["latency_s"] == 0.005 and len(truth["parameters"]) > 2
     dataset = tmp_path / "run" / "dataset"
     line = ["collect", str(dataset), "--simulated", "--out", str(tmp_path / "again"), "--seconds", "3"]
-    assert main([*line, "--truth-seed", "2", "--profile", "chirp"]) == EXIT_OK
+    assert main([*line, "--truth-seed", "2", "--motion", "chirp"]) == EXIT_OK
     again = tmp_path / "again" / "dataset" / "episodes" / "000000.mcap"
     one, two = (deal_hw.inspect(path).episode.trajectory for path in (report.paths[0], again))
     assert (one.position == two.position).all()

@@ -25,7 +25,7 @@ POSTURE = PostureConfig(fold_s=1.0, rise_s=2.0, settle_s=0.5, lie_s=1.5)
 FULL = RunPlan(
     robot="go2",
     transport="zenoh",
-    profile="rich",
+    motion="rich",
     policy="p.onnx",
     recording="r.mcap",
     seconds=7.5,
@@ -98,14 +98,14 @@ def test_the_velocity_comes_from_a_script(tmp_path: Path) -> None:
 
 def test_a_wrong_velocity_is_said_before_anybody_touches_the_robot() -> None:
     """Also where the profile does not walk."""
-    plan = RunPlan(robot="go2", profile="hold", velocity="fast")
+    plan = RunPlan(robot="go2", motion="hold", velocity="fast")
     with pytest.raises(ConfigurationError, match=r"--velocity 'fast': give x,y,yaw"):
         make_behaviour(plan, DRIVER)
 
 
 def test_standing_up_is_wrapped_around_the_profile() -> None:
     """It rises, holds and lies down; its length is the run's."""
-    plan = RunPlan(robot="go2", profile="hold", seconds=2.0, stand=True, posture=POSTURE)
+    plan = RunPlan(robot="go2", motion="hold", seconds=2.0, stand=True, posture=POSTURE)
     behaviour = make_behaviour(plan, DRIVER)
     assert isinstance(behaviour, PostureBehaviour)
     assert behaviour.duration_s == plan.total_s
@@ -119,13 +119,13 @@ def test_standing_up_is_wrapped_around_the_profile() -> None:
 def test_a_robot_without_legs_cannot_be_asked_to_stand_up() -> None:
     """The message names the robot."""
     with pytest.raises(ConfigurationError, match="'cartpole' has no rest pose"):
-        make_behaviour(RunPlan(robot="cartpole", profile="hold", stand=True), CARTPOLE)
+        make_behaviour(RunPlan(robot="cartpole", motion="hold", stand=True), CARTPOLE)
 
 
 def test_profiles_and_lengths_that_cannot_be_are_refused() -> None:
     """A run lasts longer than 0 s and not for ever."""
     with pytest.raises(UnknownNameError, match="dance"):
-        RunPlan(robot="go2", profile="dance")  # type: ignore[arg-type]
+        RunPlan(robot="go2", motion="dance")  # type: ignore[arg-type]
     for seconds in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(ConfigurationError, match="longer than 0 s"):
             RunPlan(robot="go2", seconds=seconds)

@@ -38,7 +38,7 @@ def test_a_robot_is_emulated_recorded_and_replayed(
         port = robot.port
         assert port in repr(robot) and not robot.truth
         run = deal_hw.collect(
-            "cartpole", port=port, out=str(tmp_path), profile="hold", seconds=SECONDS, say=said.append
+            "cartpole", port=port, out=str(tmp_path), motion="hold", seconds=SECONDS, say=said.append
         )
         again = deal_hw.replay(run.paths[0], port=port, dataset=str(tmp_path / "again"))
         dry = deal_hw.deploy("cartpole", port=port, seconds=SECONDS, dry_run=True)

@@ -133,3 +133,9 @@ def _clock(episode: Episode) -> Mapping[str, Any] | None:
     except InsufficientDataError:
         return None
     return {**found, "jumps": found["jumps"][:_MOST_JUMPS]}
+
+
+def motion_of(metadata: Mapping[str, Any]) -> str:
+    """Return what was played in a recording, by its metadata or its facts; "" where that is not said."""
+    # Until November 2026 it was called a profile.
+    return str(metadata.get("motion") or metadata.get("profile") or "")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.methods import CLOSED_LOOP_METHODS
+from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.description import RobotDescription
 from deal_hw.drivers import parameter_spaces
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
 
-HELDOUT_PROFILE = "chirp"
+HELDOUT_MOTION = "chirp"
 SAMPLES_A_PERIOD = 4
 """States of a control period that are fitted to."""
 
@@ -39,7 +40,7 @@ class DatasetRecordings:
     Attributes:
         folder: The dataset.
         episodes: What is fitted; empty: all but what is held out.
-        holdout: What only judges; empty: episodes of the profile `chirp`.
+        holdout: What only judges; empty: episodes of the motion `chirp`.
         policy: File of the policy that moved the robot; None: the copy that the dataset keeps.
         sample_hz: States a second that are fitted to; None: four a control period.
         spikes: What counts as a spike.
@@ -100,7 +101,7 @@ def prepare_dataset(
             "episodes": list(fit),
             "holdout": list(holdout),
         },
-        advice="`deal-hw collect --profile chirp` records one",
+        advice="`deal-hw collect --motion chirp` records one",
         balance=balancer(robot.description, None),
         name="" if robot.base is not None else robot.description.name,
         policy=policy,
@@ -164,8 +165,8 @@ def choose_episodes(
     """
     every = range(len(dataset.episodes))
     metadata = [dataset.read(i).metadata for i in every]
-    profiles = [str(m.get("profile", "")) for m in metadata]
-    held = tuple(holdout) or tuple(i for i in every if profiles[i] == HELDOUT_PROFILE and i not in episodes)
+    judges = (i for i in every if motion_of(metadata[i]) == HELDOUT_MOTION and i not in episodes)
+    held = tuple(holdout) or tuple(judges)
     repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
     if repeated:
         say(f"episodes {repeated} hardly moved and were recorded again: not fitted (--episodes names others)")
@@ -178,14 +179,15 @@ def choose_episodes(
     if not fit:
         raise ConfigurationError(
             f"nothing to fit: the dataset has {len(every)} episodes, {len(held)} of them held out; "
-            "collect one with `deal-hw collect --profile rich`"
+            "collect one with `deal-hw collect --motion rich`"
         )
     return fit, held
 
 
 def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
     """Say whether a recording is the stronger repetition of the one before, by their metadata."""
-    same = all(one.get(key) == former.get(key) for key in ("profile", "seed", "seconds"))
+    same = all(one.get(key) == former.get(key) for key in ("seed", "seconds"))
+    same = same and motion_of(one) == motion_of(former)
     return same and one.get("attempt", 0) == former.get("attempt", 0) + 1
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from deal_hw.calib.methods import CLOSED_LOOP_METHODS
 from deal_hw.control.velocity import FixedVelocity, make_source
+from deal_hw.data.recording.episode_info import motion_of
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.workflows.options import refuse
@@ -93,12 +94,12 @@ def recorded_policy(
 
 def _refuse_other_motion(index: int, run: Mapping[str, Any]) -> None:
     """Refuse an episode in which something else than the policy moved the robot, too."""
-    profile, stands = str(run.get("profile", "")), bool(run.get("stand", False))
-    if profile == "balance" and not stands:
+    motion, stands = motion_of(run), bool(run.get("stand", False))
+    if motion == "balance" and not stands:
         return
-    what = f"was recorded with profile {profile or 'unknown'!r}" if not stands else "stands up and lies down"
+    what = f"was recorded with motion {motion or 'unknown'!r}" if not stands else "stands up and lies down"
     raise InsufficientDataError(
         f"episode {index} {what}, so that the policy did not move the robot all the time, and the policy "
-        "alone is run in the simulators; record with `deal-hw collect --profile balance`, or use a method "
+        "alone is run in the simulators; record with `deal-hw collect --motion balance`, or use a method "
         "that needs no policy: eki, deal, deal-paper-replay"
     )

@@ -56,7 +56,7 @@ class CalibrateSettings(Checked):
     """Episodes of the dataset to fit; by default all but the held-out ones."""
 
     holdout: Annotated[tuple[int | Path, ...], Range(0, 1_000_000)] = ()
-    """What only judges the result: episodes of the dataset (by default those collected with --profile chirp),
+    """What only judges the result: episodes of the dataset (by default those collected with --motion chirp),
     or with --model recordings (by default the last part of each, --holdout-part)."""
 
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S

@@ -109,7 +109,7 @@ class VirtualCartpole:
 def demonstrate(
     virtual: VirtualCartpole, plan: RunPlan, attempts: int = ATTEMPTS
 ) -> tuple[VirtualEpisode, ExcitationLevelSearch]:
-    """Record the profile `rich`, again and stronger or gentler until it is whole and moves.
+    """Record the motion `rich`, again and stronger or gentler until it is whole and moves.
 
     Args:
         virtual: The robot.

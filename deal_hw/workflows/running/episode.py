@@ -68,7 +68,7 @@ class EpisodeRun:
             "description_digest": robot.description.digest(),
             "purpose": purpose,
             "task": task,
-            "profile": plan.profile,
+            "motion": plan.motion,
             "policy": plan.policy,
             "policy_digest": plan.policy_digest[:16],
             "recording": plan.recording,
@@ -119,7 +119,7 @@ class EpisodeRun:
         )
         if self._store is not None and self._path is not None:
             try:
-                kept = {name: self._metadata[name] for name in ("task", "profile", "excitation_level")}
+                kept = {name: self._metadata[name] for name in ("task", "motion", "excitation_level")}
                 facts = {**kept, **report.to_json()}
                 moved = self._store.note_episode(self._path, facts).excitation
                 if moved is not None:
@@ -145,13 +145,13 @@ class EpisodeRun:
 
     def _balance(self, path: Path) -> BalanceResult | None:
         """Return how well a policy held the pole up."""
-        if self._plan.robot not in BALANCE or self._plan.profile != "balance":
+        if self._plan.robot not in BALANCE or self._plan.motion != "balance":
             return None
         return balanced(self._plan.robot, read_trajectory(path))
 
     def _replayed(self, path: Path) -> ReplayError | None:
         """Return how far a replay's motion is from the recorded one."""
-        if self._plan.profile != "replay":
+        if self._plan.motion != "replay":
             return None
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
         return replay_error(read_trajectory(Path(self._plan.recording)), read_trajectory(path), before_s)

@@ -32,7 +32,7 @@ from deal_hw.schema import OPEN, from_values
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.running.view import RunView
 
-Profile = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
+Motion = Literal["rich", "chirp", "balance", "hold", "replay", "excite"]
 """What a run does; `balance` runs the policy all the time."""
 
 
@@ -43,7 +43,7 @@ class RunPlan:
     Attributes:
         robot: Its name.
         transport: Name of the transport.
-        profile: What it does.
+        motion: What it does.
         policy: Policy file; "" for none.
         trust_calibration: Whether to run a policy that was trained under a calibration whose verdict is red.
         policy_digest: SHA-256 of the policy file that was checked, the only one that will be opened; "" where
@@ -53,9 +53,9 @@ class RunPlan:
         seed: Fixes what is random in the behaviour.
         dry_run: Whether to compute everything and send nothing.
         home: Whether to bring the robot to its start pose first.
-        rich: Settings of the profile `rich`; its length is ``seconds``.
-        excitation_level: Steps that the profile `rich` is stronger, or gentler where negative.
-        excite: What the profile `excite` plays: `chirp`, `multisine`, or a file of
+        rich: Settings of the motion `rich`; its length is ``seconds``.
+        excitation_level: Steps that the motion `rich` is stronger, or gentler where negative.
+        excite: What the motion `excite` plays: `chirp`, `multisine`, or a file of
             `deal-hw design-excitation`.
         port: Where the robot is, for transports without a descriptor to inherit.
         wire: More about a transport of topics.
@@ -74,7 +74,7 @@ class RunPlan:
 
     robot: str
     transport: str = "serial"
-    profile: Profile = "balance"
+    motion: Motion = "balance"
     policy: str = ""
     trust_calibration: bool = False
     policy_digest: str = ""
@@ -98,8 +98,8 @@ class RunPlan:
     passive_timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
-        if self.profile not in get_args(Profile):
-            raise UnknownNameError("profile", self.profile, get_args(Profile))
+        if self.motion not in get_args(Motion):
+            raise UnknownNameError("motion", self.motion, get_args(Motion))
         if not 0 < self.seconds < float("inf"):
             raise ConfigurationError(
                 f"--seconds {self.seconds!r}: a run lasts longer than 0 s and not for ever"
@@ -156,7 +156,7 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
             digests.append(policy.digest)
             if policy.spec.training.get(VERDICT) == "red" and not plan.trust_calibration:
                 _ask(Path(plan.policy), view or RunView())
-            walks = plan.profile not in ("excite", "rich")
+            walks = plan.motion not in ("excite", "rich")
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
             if limited and view is not None:
                 view.warn(
@@ -204,7 +204,7 @@ def make_behaviour(
         plan: The plan.
         description: The robot.
         source: The wanted velocity of a policy that walks; by default made from the plan.
-        load: Called for the plan's policy, where its profile needs one.
+        load: Called for the plan's policy, where its motion needs one.
 
     Raises:
         PolicyError: The policy is missing or cannot run.
@@ -219,19 +219,19 @@ def make_behaviour(
 def _inner_behaviour(
     plan: RunPlan, description: RobotDescription, source: VelocitySource, policy: Callable[[], Policy]
 ) -> Behaviour:
-    if plan.profile == "hold":
+    if plan.motion == "hold":
         return HoldBehaviour(description)
-    if plan.profile == "chirp":
+    if plan.motion == "chirp":
         return ChirpBehaviour(description, ChirpConfig(duration_s=plan.seconds))
-    if plan.profile == "replay":
+    if plan.motion == "replay":
         from deal_hw.data.recording.reader import read_trajectory
 
         return ReplayBehaviour(read_trajectory(Path(plan.recording)), description)
-    if plan.profile == "excite":
+    if plan.motion == "excite":
         excitation = find_excitation(plan, description)
         balance = PolicyBehaviour(policy(), description) if excitation.balance_s > 0 else None
         return ExcitationBehaviour(excitation, description, balance)
-    if plan.profile == "rich":
+    if plan.motion == "rich":
         config = with_excitation_level(plan.rich, plan.excitation_level, description)
         config = dataclasses.replace(config, duration_s=plan.seconds)
         balance = PolicyBehaviour(policy(), description) if config.balance_s > 0 else None
@@ -240,9 +240,9 @@ def _inner_behaviour(
 
 
 def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:
-    """Return what the profile `excite` plays: the file's plan, or one made from name and seed.
+    """Return what the motion `excite` plays: the file's plan, or one made from name and seed.
 
-    A robot that cannot stand without a policy balances first, as in the profile `rich`.
+    A robot that cannot stand without a policy balances first, as in the motion `rich`.
 
     Raises:
         ConfigurationError: The file is no plan, is for another robot, or is not as long as the run.
@@ -269,7 +269,7 @@ def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationP
 def _loaded(plan: RunPlan, load: Callable[[RunPlan], Policy]) -> Policy:
     if not plan.policy:
         raise PolicyError(
-            f"profile {plan.profile!r} needs a policy, and none is shipped for robot {plan.robot!r}; "
-            "give --policy FILE, or use --profile chirp or hold"
+            f"motion {plan.motion!r} needs a policy, and none is shipped for robot {plan.robot!r}; "
+            "give --policy FILE, or use --motion chirp or hold"
         )
     return load(plan)

@@ -114,7 +114,7 @@ def run_simulated(
         episodes: How many.
         purpose: For the metadata.
         view: What is told.
-        attempts: How often an episode of the profile `rich` is recorded at most.
+        attempts: How often an episode of the motion `rich` is recorded at most.
 
     Raises:
         DealHwError: The robot cannot be used, or an episode failed.
@@ -164,7 +164,7 @@ def _record(
         "robot": description.name,
         "description_digest": description.digest(),
         "purpose": purpose,
-        "profile": plan.profile,
+        "motion": plan.motion,
         "excite": plan.excite,
         "seed": plan.seed,
         "seconds": plan.seconds,
@@ -185,7 +185,7 @@ def _record(
         config = LoopConfig(duration_s=plan.seconds, record_wire=False)
         behaviour = make_behaviour(plan, description)
         end = ControlLoop(robot, behaviour, Safety(description), clock, sink, config).run()
-    kept = {name: metadata[name] for name in ("profile", "excitation_level", "simulated")}
+    kept = {name: metadata[name] for name in ("motion", "excitation_level", "simulated")}
     report = EpisodeReport(
         path=path,
         outcome=end.outcome,

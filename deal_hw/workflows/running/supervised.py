@@ -110,7 +110,7 @@ def run_episodes(
         task: For the metadata.
         view: What is told and asked; by default nothing.
         on_beat: Called with each heartbeat of the control process, in the thread that waits for it.
-        attempts: How often an episode of the profile `rich` is recorded at most, stronger each time, until it
+        attempts: How often an episode of the motion `rich` is recorded at most, stronger each time, until it
             moves enough; see :mod:`deal_hw.control.excitation_level`.
 
     Raises:
@@ -174,7 +174,7 @@ def play_episodes(
     view: RunView,
     run_one: Callable[[RunPlan, int, int], EpisodeReport],
 ) -> None:
-    """Run episodes, those of the profile `rich` again and stronger until they move enough.
+    """Run episodes, those of the motion `rich` again and stronger until they move enough.
 
     Args:
         plan: What to do; each episode adds its number to the seed.
@@ -216,7 +216,7 @@ def _to_repeat(
 ) -> bool:
     """Say whether an episode is recorded again, at the search's new excitation level; its words tell why."""
     judged = report.outcome in (Outcome.FINISHED, Outcome.TRIPPED) and report.motion is not None
-    if plan.profile != "rich" or not judged or plan.dry_run or description.floating_base is not None:
+    if plan.motion != "rich" or not judged or plan.dry_run or description.floating_base is not None:
         return False
     tripped = report.reason if report.outcome is Outcome.TRIPPED else ""
     return report.motion is not None and search.tell(shortfalls(report.motion, description), tripped)
