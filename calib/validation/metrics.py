@@ -27,12 +27,19 @@ class HeldoutErrors:
         window_s: Predictions restarted from the measured state this often [s].
         nrmse: Root mean square error over the signal's range, mean over the coordinates.
         rmse: Root mean square errors of the coordinates, (n,) [rad or m]; infinite where it diverged.
+        units: Unit of each coordinate, (n,).
+        span: Range of each coordinate's signal, (n,) [rad or m].
+        noise: Root mean square of the sensor's noise, estimated from the recordings, (n,) [rad or m]: no
+            prediction of what was measured errs by less. NaN where the states are known without noise.
     """
 
     names: tuple[str, ...]
     window_s: float
     nrmse: Mapping[str, float]
     rmse: Mapping[str, FloatArray]
+    units: tuple[str, ...]
+    span: FloatArray
+    noise: FloatArray
 
     def mean(self) -> dict[str, float]:
         """Return the mean of :attr:`rmse` over the coordinates by predictor."""
@@ -51,6 +58,12 @@ class HeldoutErrors:
             "by_coordinate": {
                 name: _plain(dict(zip(self.names, map(float, values), strict=True)))
                 for name, values in self.rmse.items()
+            },
+            "unit": dict(zip(self.names, self.units, strict=True)),
+            "noise": {
+                "nrmse": _plain({"": float(np.mean(self.noise / self.span))})[""],
+                "mean": _plain({"": float(np.mean(self.noise))})[""],
+                "by_coordinate": _plain(dict(zip(self.names, map(float, self.noise), strict=True))),
             },
         }
 
@@ -88,6 +101,12 @@ class HeldOut:
         self._window_s = window_s
         self._columns = columns = problem.channels[problem.channels < problem.coordinates]
         self._windows = problem.windows(samples_in(problem, window_s))
+        self._noise = np.full(len(columns), np.nan)
+        if truth is None and not problem.noise_free:
+            std = np.concatenate([data.std.reshape(-1, len(problem.channels)) for data in self._windows])
+            seen = std[np.isfinite(std).all(axis=1)][:, problem.channels < problem.coordinates]
+            if len(seen):
+                self._noise = np.sqrt(np.mean(seen**2, axis=0))
         self._references = [
             problem.episodes[data.episode].position[:, columns] if truth is None else truth[data.episode]
             for data in self._windows
@@ -119,6 +138,9 @@ class HeldOut:
             window_s=self._window_s,
             nrmse={name: float(np.mean(rms / span)) for name, (rms, _) in found.items()},
             rmse={name: rmse for name, (_, rmse) in found.items()},
+            units=tuple(self.problem.robot.coordinate_units[c] for c in self._columns),
+            span=span,
+            noise=self._noise,
         )
 
     def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:

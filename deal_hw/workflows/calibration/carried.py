@@ -76,7 +76,8 @@ def prepare_carried(
             "its files themselves: --model robot.xml --data rec.csv --feet ..."
         )
     episodes = {
-        i: aligned(Recording(trajectory, None, None), robot, ()) for i, trajectory in trajectories.items()
+        i: aligned(Recording(trajectory, None, None), robot, (), dataset.path(i).name)
+        for i, trajectory in trajectories.items()
     }
     if source.sample_hz is not None:
         episodes = {i: thin(episode, source.sample_hz) for i, episode in episodes.items()}
