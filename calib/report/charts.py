@@ -72,7 +72,7 @@ def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
                 title=f"{shown.names[m]} [{unit}]",
                 x_title="time [s]",
                 series=series,
-                x=_wide(shown.time_s),
+                x=_from_zero(*_wide(shown.time_s)),
                 y=_frame(shown.real[:, m]),
                 linked=True,
                 label=f"{shown.title}: real, nominal and calibrated {shown.names[m]} [{unit}] over time [s]",
@@ -91,6 +91,11 @@ def _wide(values: FloatArray, least: float = 1e-9) -> tuple[float, float]:
     if not low <= high:
         return 0.0, 1.0
     return low, max(high, low + least)
+
+
+def _from_zero(low: float, high: float) -> tuple[float, float]:
+    """Return the ends of a time axis, from 0 where that is near."""
+    return (0.0 if 0 < low < 0.05 * high else low), high
 
 
 def _frame(real: FloatArray) -> tuple[float, float]:
@@ -133,7 +138,7 @@ def _residual_row(shown: Residuals, m: int, size: float) -> Iterator[Panel]:
         title=f"{name}: {size:.2f} times the noise" if len(finite) else f"{name}: no prediction",
         x_title="time [s]",
         series=[Series(name="residual", style="calibrated thin", x=time, y=series)],
-        x=_wide(shown.time_s),
+        x=_from_zero(*_wide(shown.time_s)),
         y=(-1.05 * reach, 1.05 * reach),
         bands=[(-2, 2)],
         style="long",
@@ -307,9 +312,8 @@ def robot(drawing: RobotDrawing) -> Markup:
     bar = nice_step(0.12 * max(width, height))
     words = f"{bar:g} m" if bar >= 0.1 else f"{1000 * bar:g} mm"
     y = size[1] - 6
-    parts.append(
-        f'<path class="scale" d="M6 {y:.1f}h{bar * scale:.1f}"/><text x="6" y="{y - 6:.1f}">{words}</text>'
-    )
+    parts.append(f'<path class="scale" d="M6 {y:.1f}h{bar * scale:.1f}"/>')
+    parts.append(f'<text x="{bar * scale + 12:.1f}" y="{y + 3:.1f}">{words}</text>')
     who = ", ".join(drawing.moving)
     return Markup(
         f'<svg class="robot" viewBox="0 0 {size[0]:.1f} {size[1]:.1f}" style="max-width:{size[0]:.0f}px" '

@@ -110,9 +110,9 @@ def _times(ratio: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share with two digits, as percent."""
+    """Return a share with two digits, as percent that no line break parts."""
     value = 100.0 * share
-    return f"{value:.2g} %" if value < 99.5 else f"{value:.0f} %"
+    return f"{value:.2g}\u00a0%" if value < 99.5 else f"{value:.0f}\u00a0%"
 
 
 def _in_units(rmse: Mapping[str, Any]) -> str:

@@ -32,10 +32,10 @@ def panel(drawn: list[float], **changes: object) -> str:
 
 def path(html: str) -> str:
     """Return the geometry of the series."""
-    return re.findall(r'data-name="real" d="([^"]*)"', html)[0]
+    return str(re.findall(r'data-name="real" d="([^"]*)"', html)[0])
 
 
-def test_drawnlie_where_the_axes_put_them() -> None:
+def test_values_lie_where_the_axes_put_them() -> None:
     """0 is at the bottom, 10 at the top; a gap begins anew, a lone sample is a dot, far outside is cut."""
     assert (WIDTH, HEIGHT) == (8000, 2000)
     assert path(panel([0, 10, 5])) == "M0 2000L2000 0L4000 1000"

@@ -51,11 +51,14 @@ def test_errors_are_compared_in_plain_words(nominal: float, calibrated: float, w
 def test_the_sentence_tells_the_held_out_gain() -> None:
     """26.4 % against 1.1 % is 24 times; the bars are 100 % and 1.1 / 26.4 = 4.17 % long."""
     story = tell(result({"nominal": 0.264, "calibrated": 0.011, "null": 0.5}))
-    assert story.sentence == (
+    assert story.sentence.replace("\u00a0", " ") == (
         "The calibrated simulator predicts motion that it was not given 24 times better than the nominal "
         "model: its error is 1.1 % of the motion's range against 26 %."
     )
-    assert [(bar.name, bar.words) for bar in story.bars] == [("nominal", "26 %"), ("calibrated", "1.1 %")]
+    assert [(bar.name, bar.words) for bar in story.bars] == [
+        ("nominal", percent(0.264)),
+        ("calibrated", "1.1\u00a0%"),
+    ]
     assert [bar.share for bar in story.bars] == pytest.approx([100, 4.167], abs=1e-3)
     assert story.floor is None and story.in_units == ""
 
@@ -94,7 +97,7 @@ def test_units_and_noise_stand_beside_the_gain() -> None:
     heldout = {"nominal": 0.264, "calibrated": 0.011}
     story = tell(result(heldout, provenance={"heldout_rmse": rmse}))
     assert story.in_units == "In rad, mean over the joints: nominal 0.027, calibrated 0.0011."
-    assert story.floor == pytest.approx(1.894, abs=1e-3) and story.floor_words == "0.5 %"
+    assert story.floor == pytest.approx(1.894, abs=1e-3) and story.floor_words == "0.5\u00a0%"
     rmse["unit"]["hip"], rmse["noise"]["nrmse"] = "m", None
     story = tell(result(heldout, provenance={"heldout_rmse": rmse}))
     assert story.in_units == "" and story.floor is None
@@ -104,4 +107,4 @@ def test_units_and_noise_stand_beside_the_gain() -> None:
 
 def test_percent_has_two_digits() -> None:
     """Also above 100 %."""
-    assert [percent(v) for v in (0.0012345, 0.5, 2.34)] == ["0.12 %", "50 %", "234 %"]
+    assert [percent(v) for v in (0.0012345, 0.5, 2.34)] == ["0.12\u00a0%", "50\u00a0%", "234\u00a0%"]
