@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Problem, WindowData, samples_in
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import Z90
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.engine.tangent_coordinates import to_vector
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
@@ -153,8 +153,7 @@ class HeldOut:
                 theta, latency = np.stack([fit[0] for fit in given]), np.array([fit[1] for fit in given])
                 predicted = self.problem.predict(theta, latency, data).position[..., self._columns]
             else:
-                still = data.start_position[:, None, self._columns]
-                predicted = np.broadcast_to(still, reference[sample].shape)[None]
+                predicted = _still(self.problem, data)[None, ..., self._columns]
             # A diverged member is as wrong as the whole range.
             error = np.where(np.isfinite(predicted), predicted - reference[sample], span)
             squares[0] += np.sum(error**2, axis=(1, 2))
@@ -165,6 +164,18 @@ class HeldOut:
             counts[1] += np.count_nonzero(seen)
         rms = np.sqrt(squares / np.maximum(counts, 1)[:, None, None])
         self._known.update(zip(fits, zip(rms[0], rms[1], strict=True), strict=True))
+
+
+def _still(problem: Problem, data: WindowData) -> FloatArray:
+    """Return positions where nothing moves, (W, H, C): a base's chart moves, its orientation does not."""
+    sample = data.windows.samples()
+    still = np.repeat(data.start_position[:, None], sample.shape[1], axis=1)
+    charts = problem.episodes[data.episode].reference
+    if charts is not None:
+        rotation = problem.robot.rotation
+        start = to_quaternion(data.start_position[:, rotation], charts[data.windows.start])
+        still[..., rotation] = to_vector(start[:, None], charts[sample])
+    return still
 
 
 def signal_range(
