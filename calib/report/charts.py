@@ -213,11 +213,14 @@ def _positive(title: str, x_title: str, series: Series, style: str = "", *, whol
     log_y = low > 0 and high > SETTINGS.log_ratio * low
     margin = max(0.08 * (high - low), 1e-6 * abs(high), 1e-12)
     y = (low / 1.3, 1.3 * high) if log_y else (low - margin, high + margin)
+    left, right = _wide(series.x)
+    # Dots at the ends are drawn whole.
+    aside = 0.04 * (right - left) if series.kind == "dots" else 0.0
     return Panel(
         title=title,
         x_title=x_title,
         series=[series],
-        x=_wide(series.x),
+        x=(left - aside, right + aside),
         y=y,
         log_y=log_y,
         whole_x=whole,

@@ -16,6 +16,7 @@ from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.sim.recordings.parts import joined
 from deal_hw.types import FloatArray
 
 
@@ -89,7 +90,7 @@ class ReportInputs:
     Attributes:
         robot: The robot's name.
         result: What the calibration found.
-        overlays: Recordings beside predictions.
+        overlays: Recordings beside predictions, held-out ones first.
         residuals: Whitened errors of the fitted recordings.
         drawing: The robot at a moment of a held-out recording.
         heldout: Names of the held-out recordings.
@@ -136,8 +137,10 @@ def gather(
     residuals: list[Residuals] = []
     left_out: list[str] = []
     drawing = None
-    parts = Counter(e.name for e in (*episodes, *holdout))
-    for group, heldout in ((episodes, False), (holdout, True)):
+    # A recording that was cut into stretches is one recording to look at.
+    fitted, held = joined(episodes), joined(holdout)
+    parts = Counter(e.name for e in (*fitted, *held))
+    for group, heldout in ((held, True), (fitted, False)):
         word = "held-out" if heldout else "fitted"
         if not group:
             continue

@@ -35,7 +35,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
-from deal_hw.sim.recordings.parts import part
+from deal_hw.sim.recordings.parts import part, stretches
 from deal_hw.testing.simulated_episode import simulated_episode
 
 HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"
@@ -429,7 +429,7 @@ def test_overlays_restart_as_often_as_held_out_predictions(
     robot, found, episodes = recordings
     short = part(episodes[0], 0, round(0.5 / episodes[0].period_s) + 1)
     drawn = gather(robot, found, [episodes[0], short], episodes[1:], window_s=1.0, threads=1).overlays
-    assert [shown.window_s for shown in drawn] == pytest.approx([1.0, 0.45, 1.0], abs=0.06)
+    assert [shown.window_s for shown in drawn] == pytest.approx([1.0, 1.0, 0.45], abs=0.06)
     text = Tags(render(ReportInputs(robot="r", result=found, overlays=drawn))).text()
     assert text.count("fitted; restarts every 1 s") == 1 and "never saw it; restarts every 1 s" in text
 
@@ -443,9 +443,12 @@ def test_recordings_are_called_by_their_files(
     half = part(first, len(first.sample) // 2, len(first.sample))
     shown = gather(robot, found, [first, half], [second], threads=1)
     between = f"{half.time_s[0]:.4g} to {half.time_s[-1]:.4g} s"
-    assert [one.title for one in shown.overlays][1:] == [f"a.csv, {between}", "b.csv"]
-    assert shown.overlays[1].time_s[0] == pytest.approx(1.25, abs=0.05)
-    assert [one.title for one in shown.residuals] == [one.title for one in shown.overlays[:2]]
+    assert [one.title for one in shown.overlays][::2] == ["b.csv", f"a.csv, {between}"]
+    assert shown.overlays[2].time_s[0] == pytest.approx(1.25, abs=0.05)
+    assert [one.title for one in shown.residuals] == [one.title for one in shown.overlays[1:]]
+    # Stretches that follow each other are shown as the one recording that they were.
+    whole = gather(robot, found, stretches(first, 1.0), [second], threads=1).overlays[1]
+    assert whole.title == "a.csv" and len(whole.time_s) == len(first.sample)
     assert shown.heldout == ("b.csv",) and shown.heldout_s == pytest.approx(2.5, abs=0.1)
     # Real and calibrated are drawn on each other, the nominal model beside them.
     assert shown.drawing is not None and "b.csv at" in shown.drawing.caption
@@ -456,7 +459,7 @@ def test_recordings_are_called_by_their_files(
 
 def test_gathered_series_show_what_the_models_predict(gathered: ReportInputs) -> None:
     """The true parameters predict both recordings better than the nominal ones, in every channel."""
-    assert [shown.heldout for shown in gathered.overlays] == [False, True]
+    assert [shown.heldout for shown in gathered.overlays] == [True, False]
     for shown in gathered.overlays:
         assert shown.names == ("cart", "pole") and shown.units == ("m", "rad")
         assert shown.real.shape == shown.nominal.shape == shown.calibrated.shape == (len(shown.time_s), 2)
