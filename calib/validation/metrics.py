@@ -61,8 +61,9 @@ class HeldoutErrors:
             },
             "unit": dict(zip(self.names, self.units, strict=True)),
             "noise": {
-                "nrmse": _plain({"": float(np.mean(self.noise / self.span))})[""],
-                "mean": _plain({"": float(np.mean(self.noise))})[""],
+                **_plain(
+                    {"nrmse": float(np.mean(self.noise / self.span)), "mean": float(np.mean(self.noise))}
+                ),
                 "by_coordinate": _plain(dict(zip(self.names, map(float, self.noise), strict=True))),
             },
         }
