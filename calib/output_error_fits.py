@@ -277,7 +277,7 @@ class OutputErrorFits(Fits):
     ) -> SplitHalf:
         """Fit two halves of the recordings, motion by motion, from the whole's estimate and compare."""
         space, before = problem.space, problem.steps
-        estimates, stds, intervals = [], [], []
+        estimates, halves = [], []
         for mask in fold_masks(problem, 2):
             try:
                 half = fit_output_error(
@@ -290,11 +290,9 @@ class OutputErrorFits(Fits):
                 )
             except InsufficientDataError as err:
                 return SplitHalf((), (), np.zeros(len(space)), note=f"a half cannot be fitted: {err}")
-            told = _known(problem, half)
             estimates.append(half.theta)
-            stds.append(np.sqrt(np.diag(told.covariance)))
-            intervals.append(told.interval)
-        return agreement(problem, fit.theta, known, estimates, stds, intervals, problem.steps - before)
+            halves.append(_known(problem, half))
+        return agreement(problem, fit.theta, known, estimates, halves, problem.steps - before)
 
     def _unexplained(self, chi2: float) -> tuple[Alarm, ...]:
         settings = self.settings

@@ -1,205 +1,49 @@
-"""The page's charts, as inline SVG that follows the page's light or dark colours."""
+"""The page's charts: which series stand in which panels, the robot's drawing, and matrices."""
 
 from __future__ import annotations
 
-import io
-import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from deal_hw.calib.report.gather import OverlayPanel, Residuals
+from deal_hw.calib.report.panels import Panel, Series, envelope, nice_step
+from deal_hw.calib.report.robot_drawing import Outline, RobotDrawing
 from deal_hw.calibration import CalibrationResult
-from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChartSettings:
-    """How large charts are.
+    """How much charts show.
 
     Attributes:
-        width: Width of a chart [inches]; the page scales charts to its own.
         channels: Channels whose residuals are drawn: those with the largest.
         panels: Channels whose motion is drawn: the first ones.
         points: Points of all motion on the page; long series are thinned to their lows and highs.
         lags: Longest lag of autocorrelations [samples].
-        numbered: Up to so many parameters the correlations are written into their cells.
+        bins: Of histograms.
+        log_ratio: Positive series whose highest is this many times their lowest are drawn on a log scale.
+        told: Correlations of at least this size are listed.
+        listed: Up to so many of them.
+        picture: Width of the robot's drawing [pixels].
     """
 
-    width: float = 10.2
     channels: int = 8
     panels: int = 24
-    points: int = 60_000
+    points: int = 90_000
     lags: int = 20
-    numbered: int = 12
+    bins: int = 30
+    log_ratio: float = 20.0
+    told: float = 0.8
+    listed: int = 12
+    picture: int = 480
 
 
 SETTINGS = ChartSettings()
-
-INK, FAINT, REAL, NOMINAL, CALIBRATED, MINUS, PAPER = (
-    "#010101",
-    "#020202",
-    "#030303",
-    "#040404",
-    "#050505",
-    "#060606",
-    "#070707",
-)
-"""Colours to draw with: stand-ins, each of which becomes a variable of the page's style sheet."""
-
-_VARIABLES = {
-    INK: "ink",
-    FAINT: "faint",
-    REAL: "real",
-    NOMINAL: "nominal",
-    CALIBRATED: "calibrated",
-    MINUS: "minus",
-    PAPER: "paper",
-}
-
-_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "deal-hw",
-    "font.family": "sans-serif",
-    "font.size": 9.0,
-    # Names are the user's: a dollar sign in one is no formula.
-    "text.parse_math": False,
-    "axes.formatter.use_mathtext": False,
-    "axes.unicode_minus": True,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.titlesize": 9.0,
-    "axes.titlelocation": "left",
-    # A fixed place: looking for a free one costs a third of the drawing.
-    "axes.titley": 1.0,
-    "axes.titlecolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "text.color": INK,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "lines.linewidth": 1.2,
-    "path.simplify_threshold": 0.3,
-}
-_UNUSED_IDS = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
-_GEOMETRY = re.compile(r' (?:d|x|y|transform|points)="[^"]*"')
-_DECIMALS = re.compile(r"-?\d+\.\d{2,}")
-_FONT = re.compile(r"'DejaVu Sans'[^;\"]*")
-
-
-@contextmanager
-def drawing() -> Iterator[None]:
-    """Set the style of the page's figures and nothing outside."""
-    with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
-        # The font here only measures text; the reader's browser has the letters.
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        yield
-
-
-def svg(figure: Figure, label: str) -> Markup:
-    """Return a figure as inline SVG.
-
-    Args:
-        figure: The figure, drawn in the colours of this module.
-        label: What it shows, for those who do not see it.
-    """
-    file = io.StringIO()
-    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    text = file.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    for stand_in, name in _VARIABLES.items():
-        text = text.replace(stand_in, f"var(--{name})")
-    # Ids must be unique in the page; only clip paths and marks, named by their digest, are referred to.
-    text = _UNUSED_IDS.sub("", text)
-    text = _GEOMETRY.sub(lambda found: _DECIMALS.sub(_rounded, found[0]), text)
-    text = _FONT.sub("sans-serif", text)
-    inches = figure.get_size_inches()
-    box = f"0 0 {72 * inches[0]:.1f} {72 * inches[1]:.1f}"
-    opening = (
-        f'<svg viewBox="{box}" style="max-width:{96 * inches[0]:.0f}px" role="img" '
-        f'aria-label="{escape(label)}">'
-    )
-    return Markup(opening + text[text.index(">") + 1 :])
-
-
-def _rounded(number: re.Match[str]) -> str:
-    return f"{float(number[0]):.1f}"
-
-
-def log_scale(axis: Any) -> None:
-    """Make an axis logarithmic with plain numbers at its ticks."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
-
-
-def grid(
-    rows: int, columns: int, width: float, row_height: float, gap: float = 0.7, **options: Any
-) -> tuple[Figure, Any]:
-    """Return a figure with rows times columns axes, (rows, columns).
-
-    Args:
-        rows: Rows.
-        columns: Columns.
-        width: Inches.
-        row_height: Inches, the gap included.
-        gap: Between rows, for tick labels, title and perhaps an axis label [inches].
-        options: Passed on to ``Figure.subplots``.
-    """
-    figure = Figure(figsize=(width, rows * row_height))
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    inch = 1.0 / (rows * row_height)
-    figure.subplots_adjust(
-        left=0.62 / width,
-        right=1 - 0.15 / width,
-        bottom=0.42 * inch,
-        top=1 - 0.28 * inch,
-        hspace=gap / (row_height - gap),
-        wspace=0.75 * columns / max(width - 0.8 * columns, 1.0),
-    )
-    return figure, axes
-
-
-def envelope(time: FloatArray, values: FloatArray, buckets: int = 350) -> tuple[FloatArray, FloatArray]:
-    """Thin a long series so that its picture stays the same: lowest and highest of each bucket, in order.
-
-    Args:
-        time: (T,).
-        values: (T,); NaN leaves a gap.
-        buckets: Buckets; series of up to twice as many samples stay as they are.
-
-    Returns:
-        Times and values, up to two a bucket.
-    """
-    if len(values) <= 2 * buckets:
-        return time, values
-    keep: list[int] = []
-    for part in np.array_split(np.arange(len(values)), buckets):
-        finite = part[np.isfinite(values[part])]
-        if len(finite) < len(part):
-            keep.append(int(part[~np.isfinite(values[part])][0]))
-        if len(finite):
-            keep.extend({int(finite[np.argmin(values[finite])]), int(finite[np.argmax(values[finite])])})
-    order = np.unique(keep)
-    return time[order], values[order]
 
 
 def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
@@ -210,42 +54,55 @@ def overlay(shown: OverlayPanel, panels: int = SETTINGS.panels) -> Markup:
         panels: Panels of all overlays on the page, which share the points there may be.
     """
     M = min(len(shown.names), SETTINGS.panels)
-    buckets = int(np.clip(SETTINGS.points / (6 * panels), 80, 350))
-    columns = 1 if M <= 2 else 2
-    rows = -(-M // columns)
-    with drawing():
-        figure, axes = grid(
-            rows, columns, SETTINGS.width, 1.55 if columns == 1 else 1.3, gap=0.38, sharex=True
+    buckets = int(np.clip(SETTINGS.points / (6 * panels), 80, 1000))
+    found = []
+    for m in range(M):
+        series = [
+            Series(name=name, style=name, x=x, y=y)
+            for name, values in (
+                ("real", shown.real),
+                ("nominal", shown.nominal),
+                ("calibrated", shown.calibrated),
+            )
+            for x, y in [envelope(shown.time_s, values[:, m], buckets)]
+        ]
+        unit = shown.units[m]
+        found.append(
+            Panel(
+                title=f"{shown.names[m]} [{unit}]",
+                x_title="time [s]",
+                series=series,
+                x=_from_zero(*_wide(shown.time_s)),
+                y=_frame(shown.real[:, m]),
+                linked=True,
+                label=f"{shown.title}: real, nominal and calibrated {shown.names[m]} [{unit}] over time [s]",
+            )
         )
-        for m, axis in enumerate(axes.ravel()):
-            if m >= M:
-                axis.set_visible(False)
-                continue
-            for values, colour, style in (
-                (shown.real, REAL, "-"),
-                (shown.nominal, NOMINAL, (0, (3, 2))),
-                (shown.calibrated, CALIBRATED, "-"),
-            ):
-                width = 2.4 if colour == REAL else 1.1
-                x, y = envelope(shown.time_s, values[:, m], buckets)
-                axis.plot(x, y, color=colour, linestyle=style, linewidth=width)
-            _frame(axis, shown.real[:, m])
-            axis.set_title(f"{shown.names[m]} [{shown.units[m]}]")
-            if m >= M - columns:
-                axis.set_xlabel("time [s]")
-                axis.tick_params(labelbottom=True)
-        return svg(figure, f"{shown.title}: real, nominal and calibrated motion of {M} channels over time")
+    return group(found, "alone" if M <= 2 else "")
 
 
-def _frame(axis: Any, real: FloatArray) -> None:
+def group(panels: Iterable[Panel], style: str = "") -> Markup:
+    """Return panels side by side, as many as the page's width holds; linked ones zoom together."""
+    return Markup(f'<div class="panels {style}">{"".join(p.html() for p in panels)}</div>')
+
+
+def _wide(values: FloatArray, least: float = 1e-9) -> tuple[float, float]:
+    low, high = float(np.min(values, initial=np.inf)), float(np.max(values, initial=-np.inf))
+    if not low <= high:
+        return 0.0, 1.0
+    return low, max(high, low + least)
+
+
+def _from_zero(low: float, high: float) -> tuple[float, float]:
+    """Return the ends of a time axis, from 0 where that is near."""
+    return (0.0 if 0 < low < 0.05 * high else low), high
+
+
+def _frame(real: FloatArray) -> tuple[float, float]:
     """Frame what was measured: a model that runs away must not shrink it."""
-    finite = real[np.isfinite(real)]
-    if len(finite) == 0:
-        return
-    low, high = float(finite.min()), float(finite.max())
-    margin = 0.25 * (high - low) or 1e-3
-    axis.set_ylim(low - margin, high + margin)
-    axis.yaxis.set_major_locator(MaxNLocator(4))
+    low, high = _wide(real[np.isfinite(real)])
+    margin = max(0.2 * (high - low), 1e-6 * abs(high), 1e-6)
+    return low - margin, high + margin
 
 
 def residuals(shown: Residuals) -> tuple[Markup, str]:
@@ -258,17 +115,8 @@ def residuals(shown: Residuals) -> tuple[Markup, str]:
         if M <= SETTINGS.channels
         else f"the {SETTINGS.channels} channels with the largest residuals of {M}"
     )
-    with drawing():
-        figure, axes = grid(len(order), 3, SETTINGS.width, 1.5, gap=0.55, width_ratios=(2.6, 1, 1))
-        for row, m in enumerate(sorted(order)):
-            _residual_row(axes[row], shown, int(m), float(size[m]))
-            if row < len(order) - 1:
-                continue
-            for axis, label in zip(
-                axes[row], ("time [s]", "standard deviations", "lag [samples]"), strict=True
-            ):
-                axis.set_xlabel(label)
-        return svg(figure, f"{shown.title}: whitened residuals of {len(order)} channels"), words
+    rows = [group(_residual_row(shown, int(m), float(size[m])), "residual") for m in sorted(order)]
+    return Markup("").join(rows), words
 
 
 def _root_mean_square(values: FloatArray) -> float:
@@ -276,31 +124,62 @@ def _root_mean_square(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else float("nan")
 
 
-def _residual_row(axes: Sequence[Any], shown: Residuals, m: int, size: float) -> None:
-    series, histogram, correlation = axes
-    values = shown.whitened[..., m]
-    series.axhspan(-2, 2, color=FAINT, alpha=0.15, linewidth=0)
+def _residual_row(shown: Residuals, m: int, size: float) -> Iterator[Panel]:
+    name, values = shown.names[m], shown.whitened[..., m]
     order = np.argsort(shown.time_s.ravel(), kind="stable")
-    series.plot(
-        *envelope(shown.time_s.ravel()[order], values.ravel()[order]), color=CALIBRATED, linewidth=0.7
-    )
-    series.set_title(f"{shown.names[m]}: {size:.2f} times the noise")
+    time, series = shown.time_s.ravel()[order], values.ravel()[order]
+    # Stretches that are not fitted are gaps.
+    step = np.diff(time)
+    pauses = np.flatnonzero(step > 1.5 * np.median(step if len(step) else 0.0)) + 1
+    time, series = envelope(np.insert(time, pauses, time[pauses]), np.insert(series, pauses, np.nan))
     finite = values[np.isfinite(values)]
+    reach = float(np.max(np.abs(finite), initial=3.0))
+    yield Panel(
+        title=f"{name}: {size:.2f} times the noise" if len(finite) else f"{name}: no prediction",
+        x_title="time [s]",
+        series=[Series(name="residual", style="calibrated thin", x=time, y=series)],
+        x=_from_zero(*_wide(shown.time_s)),
+        y=(-1.05 * reach, 1.05 * reach),
+        bands=[(-2, 2)],
+        style="long",
+    )
     if len(finite) == 0:
         return
-    limit = max(3.5, min(float(np.max(np.abs(finite))), 4 * size))
-    bins = np.linspace(-limit, limit, 31)
-    clipped = np.clip(finite, -limit, limit)
-    histogram.hist(clipped, bins=bins, density=True, histtype="stepfilled", facecolor=CALIBRATED, alpha=0.5)
+    limit = max(3.5, min(reach, 4 * size))
+    density, edges = np.histogram(
+        np.clip(finite, -limit, limit), SETTINGS.bins, (-limit, limit), density=True
+    )
     x = np.linspace(-limit, limit, 101)
-    histogram.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color=INK, linewidth=0.9)
-    histogram.set_yticks([])
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    yield Panel(
+        title="histogram",
+        x_title="residual [times the noise]",
+        series=[
+            Series(
+                name="histogram",
+                style="calibrated",
+                kind="area",
+                x=np.repeat(edges, 2)[1:-1],
+                y=np.repeat(density, 2),
+            ),
+            Series(name="unit normal", style="plain", x=x, y=normal),
+        ],
+        x=(-limit, limit),
+        y=(0.0, 1.1 * max(float(density.max()), 0.4)),
+        no_y=True,
+    )
     rho, band = autocorrelation(values)
-    correlation.axhspan(-band, band, color=FAINT, alpha=0.2, linewidth=0)
-    correlation.vlines(np.arange(1, len(rho) + 1), 0, rho, color=CALIBRATED, linewidth=2)
-    correlation.axhline(0, color=FAINT, linewidth=0.8)
-    correlation.set_ylim(
-        min(-0.4, float(rho.min(initial=0)) * 1.1), max(0.4, float(rho.max(initial=0)) * 1.1)
+    low, high = min(-0.4, 1.1 * float(rho.min(initial=0))), max(0.4, 1.1 * float(rho.max(initial=0)))
+    yield Panel(
+        title="autocorrelation",
+        x_title="lag [samples]",
+        series=[
+            Series(name="correlation", style="calibrated", kind="bars", x=np.arange(1.0, len(rho) + 1), y=rho)
+        ],
+        x=(0.0, len(rho) + 1.0),
+        y=(low, high),
+        bands=[(-band, band)],
+        whole_x=True,
     )
 
 
@@ -317,124 +196,129 @@ def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
     return np.array(rho), 2.0 / float(np.sqrt(max(values.size, 1)))
 
 
-def correlations(result: CalibrationResult) -> Markup | None:
-    """Draw the correlation matrix of the estimates; None where there is no covariance."""
-    if result.covariance is None or len(result.space) < 2:
-        return None
-    std = np.sqrt(np.diag(result.covariance))
-    matrix = result.covariance / np.maximum(np.outer(std, std), 1e-300)
-    K = len(std)
-    side = float(np.clip(0.36 * K, 1.8, 6.6))
-    longest = 0.075 * max(len(name) for name in result.space.names) + 0.15
-    with drawing():
-        figure, ((axis,),) = grid(1, 1, side + longest + 0.2, side + longest + 0.2)
-        across = side / (side + longest + 0.2)
-        axis.set_position((1 - across - 0.02, 0.02, across, across))
-        for i in range(K):
-            for j in range(K):
-                _cell(axis, i, j, float(matrix[i, j]), K)
-        axis.set_xlim(0, K)
-        axis.set_ylim(K, 0)
-        axis.xaxis.tick_top()
-        axis.set_xticks(np.arange(K) + 0.5, result.space.names, rotation=90)
-        axis.set_yticks(np.arange(K) + 0.5, result.space.names)
-        axis.tick_params(length=0, labelsize=8 if K <= 24 else 6)
-        axis.spines[:].set_visible(False)
-        return svg(figure, f"correlations between {K} parameters")
-
-
-def _cell(axis: Any, i: int, j: int, value: float, count: int) -> None:
-    if abs(value) >= 0.05:
-        colour = CALIBRATED if value > 0 else MINUS
-        axis.add_patch(
-            Rectangle(
-                (j + 0.04, i + 0.04), 0.92, 0.92, facecolor=colour, alpha=min(abs(value), 1.0), linewidth=0
-            )
-        )
-    if count <= SETTINGS.numbered and i != j and abs(value) >= 0.05:
-        ink = PAPER if abs(value) > 0.6 else INK
-        words = f"{value:.1f}".replace("0.", ".")
-        axis.text(j + 0.5, i + 0.52, words, ha="center", va="center", fontsize=7, color=ink)
-
-
 def latency_scan(scan: Mapping[str, Any], tick_s: float | None) -> Markup | None:
     """Draw the misfit of each whole tick of latency that was tried."""
-    ticks, chi2 = np.array(scan.get("ticks", ())), np.array(scan.get("chi2", ()))
+    ticks, chi2 = np.array(scan.get("ticks", ()), dtype=float), np.array(scan.get("chi2", ()), dtype=float)
     if len(ticks) < 2 or len(ticks) != len(chi2):
         return None
     unit, label = (1e3 * tick_s, "latency [ms]") if tick_s else (1.0, "latency [device ticks]")
-    with drawing():
-        figure, ((axis,),) = grid(1, 1, 4.6, 2.3)
-        axis.plot(ticks * unit, chi2, color=CALIBRATED, marker="o", markersize=4)
-        best = int(np.argmin(chi2))
-        axis.plot(ticks[best] * unit, chi2[best], color=INK, marker="o", markersize=7, fillstyle="none")
-        if chi2.max() > 20 * max(chi2.min(), 1e-12):
-            log_scale(axis)
-        axis.set_xlabel(label)
-        axis.set_title("misfit (chi-square) at each whole tick tried")
-        axis.set_xticks(ticks * unit if len(ticks) <= 9 else ticks[::2] * unit)
-        return svg(figure, "misfit over latency")
+    series = Series(name="chi-square", style="calibrated", kind="dots", x=ticks * unit, y=chi2)
+    return group([_positive("misfit (chi-square) at each whole tick tried", label, series, "half")], "alone")
+
+
+def _positive(title: str, x_title: str, series: Series, style: str = "", *, whole: bool = False) -> Panel:
+    """Return a panel of one series, on a log scale where it spans much."""
+    finite = series.y[np.isfinite(series.y)]
+    low, high = float(finite.min()), float(finite.max())
+    log_y = low > 0 and high > SETTINGS.log_ratio * low
+    margin = max(0.08 * (high - low), 1e-6 * abs(high), 1e-12)
+    y = (low / 1.3, 1.3 * high) if log_y else (low - margin, high + margin)
+    left, right = _wide(series.x)
+    # Dots at the ends are drawn whole.
+    aside = 0.04 * (right - left) if series.kind == "dots" else 0.0
+    return Panel(
+        title=title,
+        x_title=x_title,
+        series=[series],
+        x=(left - aside, right + aside),
+        y=y,
+        log_y=log_y,
+        whole_x=whole,
+        style=style,
+    )
 
 
 def trace(rows: Sequence[Mapping[str, float]]) -> Markup | None:
     """Draw what the search noted of each generation, one panel a quantity."""
     keys = list(dict.fromkeys(k for row in rows for k in row if k != "generation"))
-    series = {k: np.array([row.get(k, np.nan) for row in rows], dtype=float) for k in keys}
-    series = {k: v for k, v in series.items() if np.isfinite(v).sum() >= 2}
-    if not series:
+    found = []
+    for key in keys:
+        values = np.array([row.get(key, np.nan) for row in rows], dtype=float)
+        if np.isfinite(values).sum() >= 2:
+            number = np.arange(1.0, len(values) + 1)
+            series = Series(name=key, style="calibrated", x=number, y=values)
+            found.append(_positive(key.replace("_", " "), "generation", series, whole=True))
+    return group(found, "small") if found else None
+
+
+def ticks_in_range(unit: FloatArray) -> Markup:
+    """Draw members of a population inside a search range, values from 0 to 1, (N,)."""
+    places = np.unique(np.round(1000 * np.clip(unit, 0, 1)).astype(int))
+    d = "".join(f"M{x} 0V10" for x in places)
+    return Markup(
+        '<svg viewBox="0 0 1000 10" preserveAspectRatio="none" aria-hidden="true">'
+        f'<path class="rug" d="{d}"/></svg>'
+    )
+
+
+def correlation_matrix(result: CalibrationResult) -> FloatArray | None:
+    """Return the estimates' correlations, (K, K); None where there is no covariance, or one parameter."""
+    if result.covariance is None or len(result.space) < 2:
         return None
-    columns = min(3, len(series))
-    with drawing():
-        figure, axes = grid(-(-len(series) // columns), columns, SETTINGS.width, 1.9, gap=0.8)
-        for axis, (key, values) in zip(axes.ravel(), series.items(), strict=False):
-            axis.plot(np.arange(1, len(values) + 1), values, color=CALIBRATED)
-            finite = values[np.isfinite(values)]
-            if finite.min() > 0 and finite.max() > 30 * finite.min():
-                log_scale(axis)
-            axis.set_title(key.replace("_", " "))
-            axis.set_xlabel("generation")
-            axis.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-        for axis in axes.ravel()[len(series) :]:
-            axis.set_visible(False)
-        return svg(figure, f"search trace: {', '.join(series)}")
+    std = np.sqrt(np.diag(result.covariance))
+    return np.asarray(result.covariance / np.maximum(np.outer(std, std), 1e-300))
 
 
-def population(
-    space: ParameterSpace,
-    members: FloatArray,
-    estimate: FloatArray,
-    told: np.ndarray[Any, np.dtype[np.bool_]],
-) -> Markup:
-    """Draw the last population inside the search range, one line a parameter, with the final estimate.
+def correlations(matrix: FloatArray, names: Sequence[str]) -> Markup:
+    """Draw correlations, (K, K): rows and columns are numbered as the names are."""
+    K = len(matrix)
+    cells: dict[tuple[str, int], list[str]] = {}
+    marks = []
+    for i, j in np.ndindex(K, K):
+        value = float(np.nan_to_num(matrix[i, j]))
+        level = round(10 * min(abs(value), 1.0))
+        if not level:
+            continue
+        square = f"M{j}.03 {i}.03h.94v.94h-.94z"
+        cells.setdefault(("plus" if value > 0 else "minus", level), []).append(square)
+        if value < 0:
+            # A sign beside the colour.
+            marks.append(f"M{j}.3 {i}.5h.4")
+    paths = "".join(
+        f'<path class="{sign}" fill-opacity="{level / 10:g}" d="{"".join(squares)}"/>'
+        for (sign, level), squares in cells.items()
+    )
+    numbers = "".join(
+        f'<text x="{k + 0.5}" y="-.25">{k + 1}</text><text x="-.45" y="{k + 0.65}">{k + 1}</text>'
+        for k in range(K)
+    )
+    return Markup(
+        f'<svg class="matrix" viewBox="-1 -1 {K + 1} {K + 1}" style="max-width:{min(34 * (K + 1), 640)}px" '
+        f'role="img" aria-label="correlations between {K} parameters">{paths}'
+        f'<path class="sign" d="{"".join(marks)}"/>{numbers}</svg>'
+    )
 
-    Args:
-        space: The parameters.
-        members: Physical values, (N, K).
-        estimate: Physical values, (K,).
-        told: Which estimates to draw, (K,).
-    """
-    K = len(space)
-    unit = np.clip(space.normalize(members), 0.0, 1.0)
-    longest = 0.075 * max(len(name) for name in space.names) + 0.2
-    height = 0.24 * K + 0.6
-    with drawing():
-        figure, ((axis,),) = grid(1, 1, SETTINGS.width * 0.75, height)
-        axis.set_position(
-            (
-                longest / (SETTINGS.width * 0.75),
-                0.5 / height,
-                1 - (longest + 0.2) / (SETTINGS.width * 0.75),
-                1 - 0.55 / height,
-            )
+
+def strongest(matrix: FloatArray, names: Sequence[str]) -> list[tuple[str, str, float]]:
+    """Return pairs of parameters whose estimates hang on each other most, strongest first."""
+    i, j = np.triu_indices(len(matrix), 1)
+    size = np.nan_to_num(np.abs(matrix[i, j]))
+    order = [n for n in np.argsort(-size) if size[n] >= SETTINGS.told][: SETTINGS.listed]
+    return [(names[i[n]], names[j[n]], float(matrix[i[n], j[n]])) for n in order]
+
+
+def robot(drawing: RobotDrawing) -> Markup:
+    """Draw the robot where each predictor has it, with a bar that tells its size."""
+    left, bottom, width, height = drawing.box
+    scale = SETTINGS.picture / max(width, height)
+    size = np.array([width, height]) * scale
+
+    def path(outline: Outline, style: str) -> str:
+        points = (
+            np.column_stack([outline.points[:, 0] - left, bottom + height - outline.points[:, 1]]) * scale
         )
-        for k in range(K):
-            axis.plot(
-                unit[:, k], np.full(len(unit), k), "|", color=CALIBRATED, markersize=9, markeredgewidth=0.8
-            )
-        axis.plot(space.normalize(estimate)[told], np.flatnonzero(told), "D", color=INK, markersize=3.5)
-        axis.set_yticks(np.arange(K), space.names)
-        axis.set_ylim(K - 0.5, -0.5)
-        axis.set_xlim(-0.02, 1.02)
-        axis.set_xticks([0, 0.25, 0.5, 0.75, 1], ["low", "", "midpoint of the range", "", "high"])
-        axis.grid(axis="y", color=FAINT, alpha=0.25, linewidth=0.6)
-        return svg(figure, f"last population of {len(unit)} members and estimate of {K} parameters")
+        d = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+        return f'<path class="{style}" d="M{d}Z"><title>{escape(outline.name)}</title></path>'
+
+    parts = [path(o, "fixed") for o in drawing.fixed]
+    parts += [path(o, f"body {name}") for name, outlines in drawing.moving.items() for o in outlines]
+    bar = nice_step(0.12 * max(width, height))
+    words = f"{bar:g} m" if bar >= 0.1 else f"{1000 * bar:g} mm"
+    y = size[1] - 6
+    parts.append(f'<path class="scale" d="M6 {y:.1f}h{bar * scale:.1f}"/>')
+    parts.append(f'<text x="{bar * scale + 12:.1f}" y="{y + 3:.1f}">{words}</text>')
+    who = ", ".join(drawing.moving)
+    return Markup(
+        f'<svg class="robot" viewBox="0 0 {size[0]:.1f} {size[1]:.1f}" style="max-width:{size[0]:.0f}px" '
+        f'role="img" aria-label="{escape(f"the robot: {who}; {drawing.caption}")}">{"".join(parts)}</svg>'
+    )

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from deal_hw.calib.data.innovations import Members, whitened_residual
-from deal_hw.calib.data.problem import Problem, WindowData, longest_windows, samples_in
+from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, longest_windows, samples_in
+from deal_hw.calib.report.robot_drawing import RobotDrawing, draw_robot
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.sim.recordings.parts import joined
 from deal_hw.types import FloatArray
 
 
@@ -41,11 +44,11 @@ class OverlayPanel:
     """One recording beside open-loop predictions that restart from the measured state.
 
     Attributes:
-        title: Which recording.
+        title: Which recording: its file, and which part of it where several are shown.
         heldout: The search never saw it.
         names: The M measured channels.
         units: Unit of each channel, (M,).
-        time_s: Time of each sample, (T,) [s].
+        time_s: Time of each sample since the recording's first, (T,) [s].
         real: Measured values, (T, M).
         nominal: Predicted by the user's own model, (T, M); NaN where nothing was predicted.
         calibrated: Predicted by the calibrated model, likewise.
@@ -68,7 +71,7 @@ class Residuals:
     """Whitened prediction errors of the calibrated model: white and of unit variance where it is right.
 
     Attributes:
-        title: Which recording.
+        title: Which recording, as in :class:`OverlayPanel`.
         names: The M measured channels.
         time_s: Time at the end of each window's samples, (W, H) [s].
         whitened: Recording minus prediction, in standard deviations, (W, H, M); NaN where it diverged.
@@ -87,8 +90,11 @@ class ReportInputs:
     Attributes:
         robot: The robot's name.
         result: What the calibration found.
-        overlays: Recordings beside predictions.
+        overlays: Recordings beside predictions, held-out ones first.
         residuals: Whitened errors of the fitted recordings.
+        drawing: The robot at a moment of a held-out recording.
+        heldout: Names of the held-out recordings.
+        heldout_s: How long they are together [s].
         tick_s: Device period, the unit of the latency scan [s]; None where unknown.
         telemetry: Verdicts of the telemetry checks, in words.
         left_out: What is not drawn, in words.
@@ -98,6 +104,9 @@ class ReportInputs:
     result: CalibrationResult
     overlays: tuple[OverlayPanel, ...] = ()
     residuals: tuple[Residuals, ...] = ()
+    drawing: RobotDrawing | None = None
+    heldout: tuple[str, ...] = ()
+    heldout_s: float = 0.0
     tick_s: float | None = None
     telemetry: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -127,7 +136,11 @@ def gather(
     overlays: list[OverlayPanel] = []
     residuals: list[Residuals] = []
     left_out: list[str] = []
-    for group, heldout in ((episodes, False), (holdout, True)):
+    drawing = None
+    # A recording that was cut into stretches is one recording to look at.
+    fitted, held = joined(episodes), joined(holdout)
+    parts = Counter(e.name for e in (*fitted, *held))
+    for group, heldout in ((held, True), (fitted, False)):
         word = "held-out" if heldout else "fitted"
         if not group:
             continue
@@ -135,8 +148,11 @@ def gather(
         if len(group) > len(shown):
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
         problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
-        titles = [f"{word} recording {i + 1} of {len(group)}" for i in range(len(shown))]
-        overlays.extend(_overlays(problem, result, titles, heldout, window_s))
+        titles = [_title(e, f"{word} recording {i} of {len(group)}", parts) for i, e in enumerate(shown, 1)]
+        for data, predicted in _predictions(problem, result, window_s):
+            overlays.append(_overlay(problem, data, predicted, titles[data.episode], heldout))
+            if heldout and drawing is None:
+                drawing = _worst_moment(problem, data, predicted, titles[data.episode])
         if not heldout:
             residuals.extend(_residuals(problem, result, titles))
     return ReportInputs(
@@ -144,41 +160,79 @@ def gather(
         result=result,
         overlays=tuple(overlays),
         residuals=tuple(residuals),
+        drawing=drawing,
+        heldout=tuple(dict.fromkeys(e.name for e in holdout)),
+        heldout_s=float(sum(e.time_s[-1] - e.time_s[0] for e in holdout)),
         tick_s=episodes[0].step_s if episodes else None,
         telemetry=tuple(telemetry),
         left_out=tuple(left_out),
     )
 
 
-def _overlays(
-    problem: Problem, result: CalibrationResult, titles: Sequence[str], heldout: bool, window_s: float
-) -> list[OverlayPanel]:
+def _title(episode: SampledEpisode, other: str, parts: Counter[str]) -> str:
+    """Return what a recording is called, with the part of it where several are shown."""
+    if not episode.name:
+        return other
+    between = f", {episode.time_s[0]:.4g} to {episode.time_s[-1]:.4g} s"
+    return episode.name + (between if parts[episode.name] > 1 else "")
+
+
+def _predictions(
+    problem: Problem, result: CalibrationResult, window_s: float
+) -> Iterator[tuple[WindowData, MemberPrediction]]:
+    """Yield the windows of each recording and what the nominal and the calibrated model predict of them."""
     theta = np.stack([result.space.nominal, result.estimate])
     # The user's own model knows no latency: the same candidates as in the held-out error.
     latency = np.array([0.0, result.latency_s])
-    found = []
     for data in _windows(problem, window_s):
-        predicted = problem.predict(theta, latency, data).observed
-        real = problem.measured(data.episode)
-        both = np.full((2, *real.shape), np.nan)
-        both[:, data.windows.samples()] = predicted
-        episode = problem.episodes[data.episode]
-        if episode.reported is not None:
-            real = np.where(episode.reported[:, None], real, np.nan)
-        found.append(
-            OverlayPanel(
-                title=titles[data.episode],
-                heldout=heldout,
-                names=problem.channel_names,
-                units=_units(problem),
-                time_s=np.asarray(episode.sample * episode.step_s, dtype=np.float64),
-                real=real,
-                nominal=both[0],
-                calibrated=both[1],
-                window_s=data.windows.length * episode.period_s,
-            )
-        )
-    return found
+        yield data, problem.predict(theta, latency, data)
+
+
+def _overlay(
+    problem: Problem, data: WindowData, predicted: MemberPrediction, title: str, heldout: bool
+) -> OverlayPanel:
+    real = problem.measured(data.episode)
+    both = np.full((2, *real.shape), np.nan)
+    both[:, data.windows.samples()] = predicted.observed
+    episode = problem.episodes[data.episode]
+    if episode.reported is not None:
+        real = np.where(episode.reported[:, None], real, np.nan)
+    return OverlayPanel(
+        title=title,
+        heldout=heldout,
+        names=problem.channel_names,
+        units=_units(problem),
+        time_s=episode.time_s,
+        real=real,
+        nominal=both[0],
+        calibrated=both[1],
+        window_s=data.windows.length * episode.period_s,
+    )
+
+
+def _worst_moment(
+    problem: Problem, data: WindowData, predicted: MemberPrediction, title: str
+) -> RobotDrawing | None:
+    """Draw the robot at the end of the window after which the nominal model is furthest off."""
+    episode, sample = problem.episodes[data.episode], data.windows.samples()[:, -1]
+    columns = problem.channels[problem.channels < problem.coordinates]
+    ends = predicted.position[:, :, -1]
+    off = (ends[0] - episode.position[sample])[:, columns]
+    far = np.linalg.norm(off / np.maximum(np.ptp(episode.position[:, columns], axis=0), 1e-12), axis=1)
+    far = np.where(np.isfinite(ends).all(axis=(0, 2)), far, -1.0)
+    worst = int(np.argmax(far))
+    row = int(sample[worst])
+    # Where nobody measured a coordinate, such as a base's place, all are drawn where it is estimated.
+    states = np.tile(episode.position[row], (3, 1))
+    states[1:, columns] = ends[:, worst, columns]
+    return draw_robot(
+        problem.robot,
+        dict(zip(("real", "nominal", "calibrated"), states, strict=True)),
+        episode.position,
+        None if episode.reference is None else np.append(episode.reference, episode.reference[[row]], axis=0),
+        f"{title} at {episode.time_s[row]:.4g} s, after {data.windows.length * episode.period_s:.3g} s of "
+        "prediction: where the nominal model is furthest off",
+    )
 
 
 def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
@@ -207,9 +261,13 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
     for data in windows:
         whitened = _whitened(problem, centre, data)
         episode = problem.episodes[data.episode]
-        time = np.asarray(episode.sample[data.windows.samples()] * episode.step_s, dtype=np.float64)
         found.append(
-            Residuals(title=titles[data.episode], names=problem.channel_names, time_s=time, whitened=whitened)
+            Residuals(
+                title=titles[data.episode],
+                names=problem.channel_names,
+                time_s=episode.time_s[data.windows.samples()],
+                whitened=whitened,
+            )
         )
     return found
 

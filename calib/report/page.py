@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -11,8 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
+from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
+from deal_hw.calib.report.story import tell
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import published_together, write_json
@@ -42,6 +47,7 @@ class Row:
     high: float
     verdict: str
     told: bool
+    outside: bool
     at_bound: str
     bar_left: float
     bar_width: float
@@ -68,28 +74,32 @@ def write_report(path: Path, inputs: ReportInputs) -> None:
 
 def render(inputs: ReportInputs) -> str:
     """Return the page; all that comes from the user is escaped."""
-    # Only here: matplotlib takes half a second to load.
     from jinja2 import Environment, StrictUndefined
-
-    from deal_hw.calib.report import charts
 
     # StrictUndefined: a name that the template has and this module lacks is an error, not a gap.
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["short"] = short
+    environment.filters["short3"] = lambda value: short(value, 3)
     result = inputs.result
+    rows = parameter_rows(result)
     provenance = dict(result.provenance)
-    scan = _mapping(provenance.get("latency_scan"))
     panels = sum(min(len(shown.names), charts.SETTINGS.panels) for shown in inputs.overlays)
     heldout = _mapping(provenance.get("heldout_rmse"))
     names, joints = heldout_rows(heldout)
-    drawn = [(shown, *charts.residuals(shown)) for shown in inputs.residuals]
-    template = resources.files("deal_hw.calib.report").joinpath(TEMPLATE).read_text(encoding="utf-8")
-    return environment.from_string(template).render(
+    matrix = charts.correlation_matrix(result)
+    script = _asset("report.js")
+    return environment.from_string(_asset(TEMPLATE)).render(
         inputs=inputs,
         result=result,
-        rows=parameter_rows(result),
+        # Ours, and not HTML: quotes in them stay quotes.
+        style=Markup(_asset("report.css")),
+        script=Markup(script),
+        script_digest=script_digest(script),
+        story=tell(result),
+        drawing=None if inputs.drawing is None else charts.robot(inputs.drawing),
+        rows=rows,
         trust=trust(result),
         counts=[
             (word, result.verdicts.count(word))
@@ -98,19 +108,25 @@ def render(inputs: ReportInputs) -> str:
         ],
         weak=[n for n, v in zip(result.space.names, result.verdicts, strict=False) if v == "weak"],
         overlays=[(shown, charts.overlay(shown, panels)) for shown in inputs.overlays],
+        windows=list(dict.fromkeys(short(shown.window_s) for shown in inputs.overlays)),
         panels_each=charts.SETTINGS.panels,
-        heldout_window_s=float(heldout.get("window_s") or 0.0),
+        heldout_window_s=float(heldout.get("window_s") or provenance.get("heldout_window_s") or 0.0),
         heldout_names=names,
         heldout_joints=joints,
         split=_mapping(_mapping(provenance.get("split_half")).get("parameters")),
-        residuals=drawn,
+        residuals=[(shown, *charts.residuals(shown)) for shown in inputs.residuals],
         advice=advice_rows(result),
-        scan=charts.latency_scan(scan, inputs.tick_s),
-        correlations=charts.correlations(result),
+        scan=charts.latency_scan(_mapping(provenance.get("latency_scan")), inputs.tick_s),
+        correlations=None if matrix is None else charts.correlations(matrix, result.space.names),
+        strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
+        told=charts.SETTINGS.told,
         trace=charts.trace(result.trace),
-        population=None
+        population=[]
         if result.population is None
-        else charts.population(result.space, result.population, result.estimate, with_value(result)),
+        else [
+            (row, charts.ticks_in_range(unit))
+            for row, unit in zip(rows, result.space.normalize(result.population).T, strict=True)
+        ],
         facts=[(key, _plain(value)) for key, value in provenance.items() if key not in _HIDDEN],
         versions=_mapping(provenance.get("versions")),
         settings=[
@@ -119,6 +135,16 @@ def render(inputs: ReportInputs) -> str:
             for key, value in _mapping(provenance.get(group)).items()
         ],
     )
+
+
+def _asset(name: str) -> str:
+    return resources.files("deal_hw.calib.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def script_digest(script: str) -> str:
+    """Return what the page's policy calls its one script: it runs no other, whatever a name holds."""
+    digest = hashlib.sha256(f"\n{script}".encode()).digest()
+    return f"sha256-{base64.b64encode(digest).decode()}"
 
 
 def parameter_rows(result: CalibrationResult) -> list[Row]:
@@ -137,6 +163,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
             prior = f"expected {p.prior_mean:.4g} {p.unit} within {spread}"
         low, high = map(float, result.interval[k])
+        told = bool(with_value(result)[k])
         rows.append(
             Row(
                 parameter=p,
@@ -144,7 +171,8 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
                 low=low,
                 high=high,
                 verdict=result.verdicts[k] if result.verdicts else "",
-                told=bool(with_value(result)[k]),
+                told=told,
+                outside=told and not low <= result.estimate[k] <= high,
                 at_bound=bound,
                 bar_left=float(at[0][k]),
                 bar_width=max(float(at[1][k] - at[0][k]), 0.4),
@@ -156,18 +184,25 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
     return rows
 
 
-def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, list[float | None]]]]:
-    """Return predictors, and of each joint (and of their mean) the error of each; None where it diverged.
+def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, str, list[float | None]]]]:
+    """Return predictors, and of each joint (and of their mean) its unit and the error of each.
+
+    An error is None where a prediction diverged. The sensor's noise stands beside them where it is known.
+    The mean is left out where joints have different units.
 
     Args:
         rmse: ``provenance.heldout_rmse``; empty where nothing was held out.
     """
-    by_joint = _mapping(rmse.get("by_coordinate"))
-    names = list(by_joint)
+    by_joint, noise = _mapping(rmse.get("by_coordinate")), _mapping(rmse.get("noise"))
+    means = _mapping(rmse.get("mean"))
+    if noise.get("mean") is not None:
+        by_joint, means = by_joint | {"noise": noise["by_coordinate"]}, means | {"noise": noise["mean"]}
+    names, units = list(by_joint), _mapping(rmse.get("unit"))
     joints = list(_mapping(by_joint[names[0]])) if names else []
-    rows = [(joint, [by_joint[name][joint] for name in names]) for joint in joints]
-    if len(joints) > 1:
-        rows.append(("mean", [_mapping(rmse.get("mean")).get(name) for name in names]))
+    rows = [(joint, units.get(joint, ""), [by_joint[name][joint] for name in names]) for joint in joints]
+    same = {units.get(joint, "") for joint in joints}
+    if len(joints) > 1 and len(same) == 1:
+        rows.append(("mean", same.pop(), [means.get(name) for name in names]))
     return names, rows
 
 
@@ -198,9 +233,9 @@ def with_value(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]
     return np.array([v != "not identifiable" for v in result.verdicts] or [True] * K, dtype=bool)
 
 
-def short(value: float) -> str:
-    """Return a number with four digits."""
-    return f"{value:.4g}" if math.isfinite(value) else "–"
+def short(value: float, digits: int = 4) -> str:
+    """Return a number with so many digits."""
+    return f"{value:.{digits}g}" if math.isfinite(value) else "–"
 
 
 def _mapping(value: Any) -> dict[str, Any]:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Problem, WindowData, samples_in
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calibration import Z90
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.engine.tangent_coordinates import to_vector
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
 
@@ -27,12 +27,19 @@ class HeldoutErrors:
         window_s: Predictions restarted from the measured state this often [s].
         nrmse: Root mean square error over the signal's range, mean over the coordinates.
         rmse: Root mean square errors of the coordinates, (n,) [rad or m]; infinite where it diverged.
+        units: Unit of each coordinate, (n,).
+        span: Range of each coordinate's signal, (n,) [rad or m].
+        noise: Root mean square of the sensor's noise, estimated from the recordings, (n,) [rad or m]: no
+            prediction of what was measured errs by less. NaN where the states are known without noise.
     """
 
     names: tuple[str, ...]
     window_s: float
     nrmse: Mapping[str, float]
     rmse: Mapping[str, FloatArray]
+    units: tuple[str, ...]
+    span: FloatArray
+    noise: FloatArray
 
     def mean(self) -> dict[str, float]:
         """Return the mean of :attr:`rmse` over the coordinates by predictor."""
@@ -51,6 +58,13 @@ class HeldoutErrors:
             "by_coordinate": {
                 name: _plain(dict(zip(self.names, map(float, values), strict=True)))
                 for name, values in self.rmse.items()
+            },
+            "unit": dict(zip(self.names, self.units, strict=True)),
+            "noise": {
+                **_plain(
+                    {"nrmse": float(np.mean(self.noise / self.span)), "mean": float(np.mean(self.noise))}
+                ),
+                "by_coordinate": _plain(dict(zip(self.names, map(float, self.noise), strict=True))),
             },
         }
 
@@ -88,6 +102,12 @@ class HeldOut:
         self._window_s = window_s
         self._columns = columns = problem.channels[problem.channels < problem.coordinates]
         self._windows = problem.windows(samples_in(problem, window_s))
+        self._noise = np.full(len(columns), np.nan)
+        if truth is None and not problem.noise_free:
+            std = np.concatenate([data.std.reshape(-1, len(problem.channels)) for data in self._windows])
+            seen = std[np.isfinite(std).all(axis=1)][:, problem.channels < problem.coordinates]
+            if len(seen):
+                self._noise = np.sqrt(np.mean(seen**2, axis=0))
         self._references = [
             problem.episodes[data.episode].position[:, columns] if truth is None else truth[data.episode]
             for data in self._windows
@@ -119,6 +139,9 @@ class HeldOut:
             window_s=self._window_s,
             nrmse={name: float(np.mean(rms / span)) for name, (rms, _) in found.items()},
             rmse={name: rmse for name, (_, rmse) in found.items()},
+            units=tuple(self.problem.robot.coordinate_units[c] for c in self._columns),
+            span=span,
+            noise=self._noise,
         )
 
     def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:
@@ -131,8 +154,7 @@ class HeldOut:
                 theta, latency = np.stack([fit[0] for fit in given]), np.array([fit[1] for fit in given])
                 predicted = self.problem.predict(theta, latency, data).position[..., self._columns]
             else:
-                still = data.start_position[:, None, self._columns]
-                predicted = np.broadcast_to(still, reference[sample].shape)[None]
+                predicted = _still(self.problem, data)[None, ..., self._columns]
             # A diverged member is as wrong as the whole range.
             error = np.where(np.isfinite(predicted), predicted - reference[sample], span)
             squares[0] += np.sum(error**2, axis=(1, 2))
@@ -143,6 +165,18 @@ class HeldOut:
             counts[1] += np.count_nonzero(seen)
         rms = np.sqrt(squares / np.maximum(counts, 1)[:, None, None])
         self._known.update(zip(fits, zip(rms[0], rms[1], strict=True), strict=True))
+
+
+def _still(problem: Problem, data: WindowData) -> FloatArray:
+    """Return positions where nothing moves, (W, H, C): a base's chart moves, its orientation does not."""
+    sample = data.windows.samples()
+    still = np.repeat(data.start_position[:, None], sample.shape[1], axis=1)
+    charts = problem.episodes[data.episode].reference
+    if charts is not None:
+        rotation = problem.robot.rotation
+        start = to_quaternion(data.start_position[:, rotation], charts[data.windows.start])
+        still[..., rotation] = to_vector(start[:, None], charts[sample])
+    return still
 
 
 def signal_range(

@@ -51,17 +51,20 @@ class SplitHalfRow:
 
     Attributes:
         name: The parameter.
-        first: Estimate and 90 % interval (low, high) of one half.
+        first: Estimate and 90 % interval (low, high) of one half. The estimate is None where that half cannot
+            tell the parameter: the interval is then the range's own.
         second: The same of the other half.
     """
 
     name: str
-    first: tuple[float, float, float]
-    second: tuple[float, float, float]
+    first: tuple[float | None, float, float]
+    second: tuple[float | None, float, float]
 
     @property
-    def agree(self) -> bool:
-        """Whether the intervals overlap."""
+    def agree(self) -> bool | None:
+        """Whether the intervals overlap; None where a half cannot tell the parameter."""
+        if self.first[0] is None or self.second[0] is None:
+            return None
         return self.first[1] <= self.second[2] and self.second[1] <= self.first[2]
 
 
@@ -100,7 +103,11 @@ class SplitHalf:
         """Return one alarm that names all that is flagged; none where nothing is."""
         if not self.flagged:
             return ()
-        both = {r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g} {space[r.name].unit})" for r in self.rows}
+        both = {
+            r.name: f" ({r.first[0]:.4g} and {r.second[0]:.4g} {space[r.name].unit})"
+            for r in self.rows
+            if r.agree is not None
+        }
         return (
             Alarm(
                 "Two halves of the data disagree about "
@@ -134,7 +141,7 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
         # Blocks as long as residuals are correlated, but at least two blocks in each half.
         longest = windows // SETTINGS.fewest_windows
         block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
-    estimates, stds, intervals = [], [], []
+    estimates, halves = [], []
     for half in range(2):
         found = refine_windows(
             *half_of(shooting, refined.point, half, block), SETTINGS.iterations, fixed_latency=True
@@ -142,11 +149,9 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
         told = uncertainty_at(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: what all of them say of clustering holds for it, too.
         std = np.sqrt(np.diag(told.covariance)) * np.maximum(known.widened / told.widened, 1.0)
-        told = widened_to(problem, told, found.theta, std)
         estimates.append(found.theta)
-        stds.append(np.sqrt(np.diag(told.covariance)))
-        intervals.append(told.interval)
-    return agreement(problem, refined.theta, known, estimates, stds, intervals, problem.steps - before)
+        halves.append(widened_to(problem, told, found.theta, std))
+    return agreement(problem, refined.theta, known, estimates, halves, problem.steps - before)
 
 
 def agreement(
@@ -154,8 +159,7 @@ def agreement(
     theta: FloatArray,
     known: Uncertainty,
     estimates: Sequence[FloatArray],
-    stds: Sequence[FloatArray],
-    intervals: Sequence[FloatArray],
+    halves: Sequence[Uncertainty],
     steps: int,
 ) -> SplitHalf:
     """Return whether two halves agree.
@@ -165,14 +169,15 @@ def agreement(
         theta: The estimate of all data, (K,).
         known: What is known there; what the data cannot tell is not compared.
         estimates: Of each half, (K,).
-        stds: Of each half, in the parameters' own scale, (K,).
-        intervals: Of each half, (K, 2).
+        halves: What is known from each half.
         steps: Physics steps that it cost.
     """
     space = problem.space
 
-    def three(half: int, k: int) -> tuple[float, float, float]:
-        return float(estimates[half][k]), float(intervals[half][k, 0]), float(intervals[half][k, 1])
+    def three(half: int, k: int) -> tuple[float | None, float, float]:
+        estimate, (low, high) = float(estimates[half][k]), map(float, halves[half].interval[k])
+        told = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
+        return estimate if told else None, low, high
 
     rows = tuple(
         SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
@@ -180,8 +185,8 @@ def agreement(
     told = ~known.shape.blind
     least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(told.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
-    far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*stds)
-    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and not r.agree)
+    far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*(np.sqrt(np.diag(h.covariance)) for h in halves))
+    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and r.agree is False)
     return SplitHalf(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
 
 

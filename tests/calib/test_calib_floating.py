@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Problem
@@ -15,6 +16,7 @@ from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.validation.metrics import HeldOut, signal_range
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.tangent_coordinates import to_quaternion
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 
@@ -101,6 +103,23 @@ def test_heldout_error_counts_measured_coordinates_only(exact: Case, sensed: Cas
     sets = {"nominal": (sensed.space.nominal, 0.0), "true": (sensed.theta, sensed.latency_s)}
     errors = HeldOut(sensed.robot, sensed.space, [sensed.heldout]).errors(sets).nrmse
     assert errors["true"] < 0.5 * errors["nominal"]
+
+
+def test_a_base_that_does_not_move_is_off_by_its_turn(exact: Case) -> None:
+    """The error of "null" is the angle from where a window starts, whatever the charts do meanwhile."""
+    charts = exact.heldout.reference
+    assert charts is not None
+    held_out = HeldOut(exact.robot, exact.space, [exact.heldout])
+    found = held_out.errors({})
+    rotation = [i for i, name in enumerate(found.names) if name.startswith("base.r")]
+    turned = []
+    for data in held_out.problem.windows(round(0.2 / exact.heldout.period_s)):
+        where = Rotation.from_quat(to_quaternion(exact.heldout.position[:, 3:6], charts), scalar_first=True)
+        for start, samples in zip(data.windows.start, data.windows.samples(), strict=True):
+            turned.append((where[int(start)].inv() * where[samples]).magnitude())
+    expected = np.sqrt(np.mean(np.concatenate(turned) ** 2))
+    assert expected > 0.01
+    np.testing.assert_allclose(np.linalg.norm(found.rmse["null"][rotation]), expected, rtol=0.02)
 
 
 def test_range_of_a_turning_base_is_that_of_its_turn(exact: Case) -> None:

@@ -132,6 +132,21 @@ def test_heldout_error_falls_far_below_nominal(noisy: Case) -> None:
     assert errors["truth"] < errors["null"]
 
 
+def test_no_prediction_of_noisy_samples_errs_by_less_than_their_noise(noisy: Case) -> None:
+    """True parameters err by it and by what it does to start states, nominal ones by more; with units."""
+    held_out = HeldOut(noisy.robot, noisy.space, [noisy.heldout], threads=1)
+    truth = (noisy.theta, noisy.latency_s)
+    errors = held_out.errors({"nominal": (noisy.space.nominal, 0.0), "truth": truth})
+    assert np.all(errors.rmse["truth"] > 0.9 * errors.noise)
+    assert np.all(errors.rmse["truth"] < 3 * errors.noise)
+    assert np.all(errors.rmse["nominal"] > 3 * errors.noise)
+    written = errors.to_json()
+    assert written["unit"] == {"cart": "m", "pole": "rad"}
+    assert written["noise"]["nrmse"] == pytest.approx(np.mean(errors.noise / errors.span))
+    exact = HeldOut(noisy.robot, noisy.space, [noisy.heldout], threads=1, truth=[noisy.heldout_truth])
+    assert exact.errors({"truth": truth}).to_json()["noise"]["mean"] is None
+
+
 def test_unexplained_residual_restarts_the_search_until_it_repeats_itself(ideal: Case) -> None:
     """With a wrong latency forced on it nothing explains the data: a second search, then an alarm."""
     problem = Problem(ideal.robot, ideal.space, [ideal.fit], threads=1, fixed_latency_s=0.02)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import hashlib
+import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,9 +16,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deal_hw.calib.report.charts import autocorrelation, envelope
+from deal_hw.calib.report.charts import autocorrelation, correlations, strongest
 from deal_hw.calib.report.gather import OverlayPanel, ReportInputs, Residuals, gather
-from deal_hw.calib.report.page import heldout_rows, parameter_rows, render, write_report, write_result
+from deal_hw.calib.report.page import (
+    heldout_rows,
+    parameter_rows,
+    render,
+    script_digest,
+    write_report,
+    write_result,
+)
+from deal_hw.calib.report.panels import envelope
+from deal_hw.calib.report.robot_drawing import Outline, RobotDrawing
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import Alarm, CalibrationResult, read_result
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -23,7 +35,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align
-from deal_hw.sim.recordings.parts import part
+from deal_hw.sim.recordings.parts import part, stretches
 from deal_hw.testing.simulated_episode import simulated_episode
 
 HOSTILE = "<script>alert('x')</script>&$a_b$ --> \" </svg>"
@@ -85,34 +97,50 @@ def inputs(found: CalibrationResult, channels: int = 2, samples: int = 200, name
 
 
 class Tags(HTMLParser):
-    """Collects the tags and attributes of a page."""
+    """Collects the tags, the attributes and the words of a page; its style sheet and script are no words."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.tags: list[str] = []
         self.attributes: list[tuple[str, str]] = []
         self.words: list[str] = []
+        self.scripts: list[str] = []
+        self._inside = ""
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Note one tag."""
         self.tags.append(tag)
+        self._inside = tag
         self.attributes.extend((k, v or "") for k, v in attrs)
 
     def handle_data(self, data: str) -> None:
-        """Note what is read."""
-        self.words.append(data)
+        """Note what is read, and what is run."""
+        {"script": self.scripts, "style": []}.get(self._inside, self.words).append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        """What follows is read."""
+        self._inside = ""
+
+    def text(self) -> str:
+        """Return what is read, one blank between words."""
+        return " ".join(" ".join(self.words).split())
 
 
 def test_page_loads_nothing_from_elsewhere() -> None:
-    """No address, script, image or style sheet: references stay inside, and a policy forbids others."""
+    """No address, image or style sheet: references stay inside, a policy forbids all but its own script."""
     text = render(inputs(result(space())))
     page = Tags(text)
-    assert "http:" not in text and "https:" not in text and "@import" not in text
-    assert not {"script", "img", "link", "iframe", "object"} & set(page.tags)
+    assert "http:" not in text and "https:" not in text and "@import" not in text and "url(" not in text
+    assert not {"img", "link", "iframe", "object"} & set(page.tags)
+    (script,) = page.scripts
+    assert page.tags.count("script") == 1 and not any(k.startswith("on") for k, _ in page.attributes)
+    (policy,) = [v for k, v in page.attributes if k == "content" and "-src" in v]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    allowed = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    assert policy == allowed and script_digest(script.removeprefix("\n")) == f"sha256-{digest}"
     references = [v for k, v in page.attributes if k in ("href", "xlink:href", "src")]
     assert references and all(v.startswith("#") for v in references)
-    assert "default-src 'none'" in text
     identities = [v for k, v in page.attributes if k == "id"]
     assert {v.removeprefix("#") for v in references} <= set(identities)
 
@@ -139,18 +167,100 @@ def test_names_of_the_user_are_escaped_everywhere() -> None:
         inputs(found, name=HOSTILE),
         telemetry=(HOSTILE,),
         left_out=(HOSTILE,),
+        heldout=(HOSTILE,),
+        drawing=drawing(HOSTILE),
     )
     page = Tags(render(given_))
-    assert "script" not in page.tags
-    assert sum(HOSTILE in words for words in page.words) >= 12
-    assert page.tags.count("svg") == 6
+    assert page.tags.count("script") == 1 and "alert" not in page.scripts[0]
+    assert sum(HOSTILE in words for words in page.words) >= 16
+    # The robot, 4 panels of motion, 6 of residuals, 1 of correlations, 1 of the search, 3 of the population.
+    assert page.tags.count("svg") == 16
 
 
-def test_alarms_come_first() -> None:
-    """The first thing under the title is whether the result can be used, and why not."""
-    text = render(inputs(result(space(), alarms=(Alarm("the rail is bent by 2 mm", "friction", "buy one"),))))
-    assert text.index("Read them before you use it") < text.index("the rail is bent")
-    assert text.index("the rail is bent") < text.index('id="parameters"')
+def drawing(name: str = "now") -> RobotDrawing:
+    """Return the drawing of a robot that is a triangle."""
+    triangle = Outline(name=name, points=np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    return RobotDrawing(caption=name, box=(0, 0, 1, 1), fixed=(), moving={"real": (triangle,)})
+
+
+def test_the_story_comes_first_then_the_verdict_then_alarms() -> None:
+    """Result, bars and robot; whether it can be used; alarms in three parts; parameters; then the charts."""
+    found = result(space(), alarms=(Alarm("the rail is bent by 2 mm", "friction", "buy one"),))
+    page = Tags(render(dataclasses.replace(inputs(found), drawing=drawing("after 0.2 s"))))
+    order = (
+        "5.0 times better than the nominal model",
+        "nominal model: 10 %",
+        "calibrated model: 2 %",
+        "after 0.2 s",
+        "Can it be used?",
+        "! Amber.",
+        "Read them before you use it",
+        "1 alarm",
+        "seen the rail is bent by 2 mm it means friction to do buy one",
+        "90 % interval",
+        "Held-out error",
+        "Real, nominal and calibrated motion",
+        "Residuals of the calibrated model",
+        "Provenance",
+    )
+    text, at = page.text(), -1
+    for words in order:
+        at = text.index(words, at + 1)
+
+
+def test_every_panel_names_recording_unit_and_lines() -> None:
+    """Titles are files; axes have units and ticks; a legend names what is drawn before the first panel."""
+    found = inputs(result(space()))
+    overlays = [
+        dataclasses.replace(shown, title=title)
+        for shown, title in zip(found.overlays, ("fit.csv, 0 to 2 s", "000003.mcap"), strict=True)
+    ]
+    html = render(
+        dataclasses.replace(found, overlays=tuple(overlays), heldout=("000003.mcap",), heldout_s=2.0)
+    )
+    text = Tags(html).text()
+    assert "fit.csv, 0 to 2 s fitted; restarts every 0.2 s" in text
+    assert "000003.mcap held out: the search never saw it; restarts every 0.2 s" in text
+    assert "Held out: 000003.mcap; 2 s." in text
+    assert text.index("real robot nominal model calibrated model") < text.index("fit.csv, 0 to 2 s")
+    panels = html.split('<figure class="panel ')[1:]
+    assert len(panels) == 4 + 6 + 1 + 1
+    for one in panels:
+        assert one.count('class="xt"') >= 2 and 'class="xtitle">' in one
+        assert one.count('class="yt"') >= 2 or "<figcaption>histogram" in one
+    for one in panels[:4]:
+        assert re.search(r"<figcaption>q[01] \[rad\]<", one) and 'class="xtitle">time [s]<' in one
+        assert re.findall(r'data-name="(\w+)"', one) == ["real", "nominal", "calibrated"]
+
+
+def test_correlations_are_drawn_with_a_sign_and_the_strongest_are_named() -> None:
+    """Both signs differ in more than colour; correlations near 0 are left out."""
+    matrix = np.array([[1.0, -0.9, 0.02], [-0.9, 1.0, 0.85], [0.02, 0.85, 1.0]])
+    drawn = correlations(matrix, ("a", "b", "c"))
+    squares = {sign: d.count("z") for sign, d in re.findall(r'class="(plus|minus)".*?d="([^"]*)"', drawn)}
+    assert squares["minus"] == 2 and len(re.findall(r"M\d\.3 ", drawn)) == 2
+    assert sum(d.count("z") for d in re.findall(r'd="([^"]*)"', drawn)) == 3 + 2 + 2
+    assert strongest(matrix, ("a", "b", "c")) == [("a", "b", -0.9), ("b", "c", 0.85)]
+
+
+def test_a_half_that_tells_nothing_has_no_value() -> None:
+    """No estimate stands beside an interval that does not hold it."""
+    rows = {
+        "a": {"first": [2, 1, 3], "second": [None, 5, 95], "agree": None},
+        "b": {"first": [2, 1, 3], "second": [2.5, 2, 3], "agree": True},
+        "c": {"first": [2, 1, 3], "second": [7, 6, 8], "agree": False},
+    }
+    text = Tags(render(inputs(result(space(), provenance={"split_half": {"parameters": rows}})))).text()
+    assert "a first half 2 (1 … 3) second half no value (5 … 95) a half cannot tell it" in text
+    assert "second half 2.5 (2 … 3) agree" in text
+    assert "second half 7 (6 … 8) disagree: intervals do not overlap" in text
+
+
+def test_an_estimate_outside_its_interval_is_said_to_be() -> None:
+    """An interval of 5 to 20 does not hold 30."""
+    found = result(space(2), estimate=np.array([10.0, 30.0]))
+    assert [row.outside for row in parameter_rows(found)] == [False, True]
+    assert Tags(render(inputs(found))).text().count("outside its interval") == 1
 
 
 HELD = {"nominal": 0.06, "calibrated": 0.01, "null": 0.2}
@@ -196,9 +306,9 @@ def test_parameter_at_the_end_of_its_range_is_marked() -> None:
 
 def test_what_the_data_cannot_tell_gets_no_value() -> None:
     """A parameter that is not identifiable has an interval and no estimate on the page."""
-    found = result(space(2), estimate=np.array([11.5, 12.5]), verdicts=("identifiable", "not identifiable"))
-    text = render(inputs(found))
-    assert "<b>11.5</b>" in text and "12.5" not in text and "no value" in text
+    found = result(space(2), estimate=np.array([11.3, 13.7]), verdicts=("identifiable", "not identifiable"))
+    text = Tags(render(dataclasses.replace(inputs(found), overlays=(), residuals=()))).text()
+    assert "estimate 11.3" in text and "13.7" not in text and "no value" in text
 
 
 def test_a_bare_result_makes_a_page_too() -> None:
@@ -217,7 +327,8 @@ def test_a_bare_result_makes_a_page_too() -> None:
     assert (
         "No recording was given" in text
         and "The method gives none" in text
-        and "nothing says whether" in text
+        and "Nothing says how well" in text
+        and text.count("--holdout") == 1
     )
 
 
@@ -252,19 +363,28 @@ def test_autocorrelation_of_an_alternating_series() -> None:
 
 def test_held_out_error_of_each_joint_stands_in_its_unit() -> None:
     """A row for each joint and their mean, a column for each predictor; what diverged says so."""
-    rmse = {
+    rmse: dict[str, Any] = {
         "window_s": 5.0,
+        "unit": {"hip": "rad", "knee": "rad"},
         "mean": {"nominal": None, "calibrated": 0.02},
         "by_coordinate": {"nominal": {"hip": 0.5, "knee": None}, "calibrated": {"hip": 0.01, "knee": 0.03}},
     }
     names, rows = heldout_rows(rmse)
     assert names == ["nominal", "calibrated"]
-    assert rows == [("hip", [0.5, 0.01]), ("knee", [None, 0.03]), ("mean", [None, 0.02])]
-    text = " ".join(
-        Tags(render(inputs(result(space(), heldout_nrmse=HELD, provenance={"heldout_rmse": rmse})))).words
-    )
-    assert "restart every 5 s, in rad or m" in text and "by_coordinate" not in text
-    assert " ".join(text.partition("knee")[2].split()).startswith("diverged 0.03 mean diverged 0.02")
+    assert rows == [
+        ("hip", "rad", [0.5, 0.01]),
+        ("knee", "rad", [None, 0.03]),
+        ("mean", "rad", [None, 0.02]),
+    ]
+    found = result(space(), heldout_nrmse=HELD, provenance={"heldout_rmse": rmse})
+    text = Tags(render(inputs(found))).text()
+    assert "restart every 5 s" in text and "by_coordinate" not in text
+    assert "knee [rad] nominal diverged calibrated 0.03 mean [rad] nominal diverged calibrated 0.02" in text
+    # A mean over rad and m is no quantity; the sensor's noise is a column where it is known.
+    noise = {"nrmse": 0.01, "mean": 0.2, "by_coordinate": {"hip": 0.1, "knee": 0.3}}
+    names, rows = heldout_rows({**rmse, "unit": {"hip": "rad", "knee": "m"}, "noise": noise})
+    assert names[-1] == "noise"
+    assert rows == [("hip", "rad", [0.5, 0.01, 0.1]), ("knee", "m", [None, 0.03, 0.3])]
     assert heldout_rows({}) == ([], [])
 
 
@@ -309,13 +429,37 @@ def test_overlays_restart_as_often_as_held_out_predictions(
     robot, found, episodes = recordings
     short = part(episodes[0], 0, round(0.5 / episodes[0].period_s) + 1)
     drawn = gather(robot, found, [episodes[0], short], episodes[1:], window_s=1.0, threads=1).overlays
-    assert [shown.window_s for shown in drawn] == pytest.approx([1.0, 0.45, 1.0], abs=0.06)
-    assert "restarted every 1 s" in render(ReportInputs(robot="r", result=found, overlays=drawn))
+    assert [shown.window_s for shown in drawn] == pytest.approx([1.0, 1.0, 0.45], abs=0.06)
+    text = Tags(render(ReportInputs(robot="r", result=found, overlays=drawn))).text()
+    assert text.count("fitted; restarts every 1 s") == 1 and "never saw it; restarts every 1 s" in text
+
+
+def test_recordings_are_called_by_their_files(
+    recordings: tuple[RobotModel, CalibrationResult, list[SampledEpisode]],
+) -> None:
+    """Where parts of one file are shown, each says from when to when; time counts from the file's start."""
+    robot, found, episodes = recordings
+    first, second = (dataclasses.replace(e, name=f"{n}.csv") for e, n in zip(episodes, "ab", strict=True))
+    half = part(first, len(first.sample) // 2, len(first.sample))
+    shown = gather(robot, found, [first, half], [second], threads=1)
+    between = f"{half.time_s[0]:.4g} to {half.time_s[-1]:.4g} s"
+    assert [one.title for one in shown.overlays][::2] == ["b.csv", f"a.csv, {between}"]
+    assert shown.overlays[2].time_s[0] == pytest.approx(1.25, abs=0.05)
+    assert [one.title for one in shown.residuals] == [one.title for one in shown.overlays[1:]]
+    # Stretches that follow each other are shown as the one recording that they were.
+    whole = gather(robot, found, stretches(first, 1.0), [second], threads=1).overlays[1]
+    assert whole.title == "a.csv" and len(whole.time_s) == len(first.sample)
+    assert shown.heldout == ("b.csv",) and shown.heldout_s == pytest.approx(2.5, abs=0.1)
+    # Real and calibrated are drawn on each other, the nominal model beside them.
+    assert shown.drawing is not None and "b.csv at" in shown.drawing.caption
+    places = {name: outlines[0].points.mean(axis=0) for name, outlines in shown.drawing.moving.items()}
+    off = {name: np.linalg.norm(place - places["real"]) for name, place in places.items()}
+    assert off["calibrated"] < 0.1 * off["nominal"]
 
 
 def test_gathered_series_show_what_the_models_predict(gathered: ReportInputs) -> None:
     """The true parameters predict both recordings better than the nominal ones, in every channel."""
-    assert [shown.heldout for shown in gathered.overlays] == [False, True]
+    assert [shown.heldout for shown in gathered.overlays] == [True, False]
     for shown in gathered.overlays:
         assert shown.names == ("cart", "pole") and shown.units == ("m", "rad")
         assert shown.real.shape == shown.nominal.shape == shown.calibrated.shape == (len(shown.time_s), 2)

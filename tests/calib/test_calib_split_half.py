@@ -12,9 +12,15 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline import foretell
 from deal_hw.calib.uncertainty.intervals import uncertainty_at, with_rows
-from deal_hw.calib.validation.split_half import SplitHalf, check_split_half, half_of, widened_by_split_half
+from deal_hw.calib.validation.split_half import (
+    SplitHalf,
+    agreement,
+    check_split_half,
+    half_of,
+    widened_by_split_half,
+)
 from deal_hw.calib.validation.verdict import Validation, judge
-from deal_hw.calibration import BEFORE_SEARCH, Progress
+from deal_hw.calibration import BEFORE_SEARCH, Identifiability, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
 
 
@@ -36,9 +42,34 @@ def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Re
     split = check_split_half(noisy_problem, noisy_refined, known)
     assert split.flagged == () and split.alarms(noisy_problem.space) == () and split.steps > 0
     assert [r.name for r in split.rows] == list(noisy_problem.space.names)
-    assert all(r.first[1] <= r.first[0] <= r.first[2] for r in split.rows)
+    for row in split.rows:
+        for estimate, low, high in (row.first, row.second):
+            assert estimate is None or low <= estimate <= high
     assert set(split.to_json()["parameters"]) == set(noisy_problem.space.names)
     assert widened_by_split_half(noisy_problem, known, noisy_refined.theta, split) is known
+
+
+def test_a_half_that_cannot_tell_a_parameter_gives_it_no_value(
+    noisy_problem: Problem, noisy_refined: Refined
+) -> None:
+    """Its interval is the range's own 90 %, which need not hold the estimate: no value, and no comparison."""
+    problem, K = noisy_problem, len(noisy_problem.space)
+    known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
+    nothing: Identifiability = "not identifiable"
+    ends = np.stack([problem.space.unnormalize(np.full(K, u)) for u in (0.05, 0.95)], axis=1)
+    blind = dataclasses.replace(known, interval=ends, verdicts=(nothing,) * K)
+    low = problem.space.unnormalize(np.full(K, 0.01))
+    split = agreement(problem, noisy_refined.theta, known, [low, noisy_refined.theta], [blind, known], 0)
+    assert all(row.first[0] is None and row.second[0] is not None for row in split.rows)
+    assert all(row.agree is None for row in split.rows) and split.flagged == ()
+    assert split.to_json()["parameters"][problem.space.names[0]]["agree"] is None
+    # The same two estimates from halves that tell them disagree, and are flagged.
+    tight = dataclasses.replace(known, interval=np.stack([low, 1.01 * low], axis=1))
+    split = agreement(problem, noisy_refined.theta, known, [low, noisy_refined.theta], [tight, known], 0)
+    assert all(row.agree is False for row in split.rows)
+    told = np.array(problem.space.names)[~known.shape.blind]
+    assert set(split.flagged) <= set(told) and "servo.stiffness" in split.flagged
+    assert "(" in split.alarms(problem.space)[0].seen
 
 
 def test_halves_of_two_robots_are_flagged_and_the_interval_holds_both(

@@ -44,6 +44,7 @@ class SampledEpisode:
         estimate_std: Standard deviation of the entries that were not measured, (2 C,) or, sample by sample,
             (T, 2 C); None where all positions were.
         exact: Whether the whole state is reported without any error: only a simulated target does that.
+        name: What it was cut from, for people: mostly a file's name.
     """
 
     step_s: float
@@ -64,6 +65,7 @@ class SampledEpisode:
     measured: npt.NDArray[np.bool_] | None = None
     estimate_std: FloatArray | None = None
     exact: bool = False
+    name: str = ""
 
     @property
     def channels(self) -> IntArray:
@@ -86,6 +88,11 @@ class SampledEpisode:
         """Time from one sample to the next [s]."""
         return self.stride * self.step_s
 
+    @property
+    def time_s(self) -> FloatArray:
+        """Time of each sample since the recording's first one, (T,) [s]."""
+        return np.asarray((self.origin + self.sample) * self.step_s, dtype=np.float64)
+
     def cut(self, rows: slice, periods: slice) -> SampledEpisode:
         """Return the episode with these samples and periods only; indices and the start stay as they are."""
         each = {name: getattr(self, name)[rows] for name in ("sample", "position", "velocity", "usable")}
@@ -96,7 +103,7 @@ class SampledEpisode:
         return dataclasses.replace(self, **each, **some, **sent)
 
 
-def align(trajectory: Trajectory, description: RobotDescription) -> SampledEpisode:
+def align(trajectory: Trajectory, description: RobotDescription, name: str = "") -> SampledEpisode:
     """Put a recording on the device's time grid.
 
     A state sample says which command was in force and how long ago the device received it, so the reception
@@ -106,6 +113,7 @@ def align(trajectory: Trajectory, description: RobotDescription) -> SampledEpiso
     Args:
         trajectory: The recording.
         description: The robot.
+        name: What the recording is called.
 
     Returns:
         The episode, from the first armed sample with a command in force to the last armed one.
@@ -154,6 +162,7 @@ def align(trajectory: Trajectory, description: RobotDescription) -> SampledEpiso
         start_setpoint=_armed_at(trajectory, armed, int(rows[0]))[list(description.actuated_index)],
         first_row=int(rows[0]),
         origin=origin - int(device[0]),
+        name=name,
     )
 
 

@@ -74,7 +74,9 @@ def prepare_carried(
     recordings = {i: Recording(trajectory) for i, trajectory in trajectories.items()}
     feet = config.feet or description.feet
     require_base(robot, feet, list(recordings.values()))
-    episodes = {i: aligned(recording, robot, feet) for i, recording in recordings.items()}
+    episodes = {
+        i: aligned(recording, robot, feet, dataset.path(i).name) for i, recording in recordings.items()
+    }
     if source.sample_hz is not None:
         episodes = {i: thin(episode, source.sample_hz) for i, episode in episodes.items()}
     parts, judge = parts_to_calibrate(

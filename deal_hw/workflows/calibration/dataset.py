@@ -84,7 +84,8 @@ def prepare_dataset(
     recordings, verdicts = sound_recordings(
         {i: episode.trajectory for i, episode in episodes_read.items()}, source.folder, source.spikes, say
     )
-    robot, episodes = _simulation(description, recordings, source.sample_hz)
+    names = {i: dataset.path(i).name for i in recordings}
+    robot, episodes = _simulation(description, recordings, names, source.sample_hz)
     walks = all_walk(robot, recordings.values())
     if walks:
         space = weighed(space, robot, recordings[fit[0]], say)
@@ -192,7 +193,10 @@ def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
 
 
 def _simulation(
-    description: RobotDescription, recordings: Mapping[int, Trajectory], sample_hz: float | None
+    description: RobotDescription,
+    recordings: Mapping[int, Trajectory],
+    names: Mapping[int, str],
+    sample_hz: float | None,
 ) -> tuple[RobotModel, dict[int, SampledEpisode]]:
     try:
         from deal_hw.sim.engine.model import load_model
@@ -204,7 +208,7 @@ def _simulation(
     robot = load_model(description)
     episodes = {}
     for i, trajectory in recordings.items():
-        episodes[i] = align(trajectory, robot.description)
+        episodes[i] = align(trajectory, robot.description, names[i])
         if robot.base is not None and trajectory.body is not None:
             episodes[i] = while_walking(with_sensed_base(episodes[i], robot, trajectory), trajectory)
         episodes[i] = thin(episodes[i], sample_hz or SAMPLES_A_PERIOD * robot.description.control_rate_hz)

@@ -24,7 +24,7 @@ from deal_hw.workflows.calibration.recordings import (
     aligned,
     common_rates,
     divide,
-    on_grid,
+    named_on_grid,
     read_tables,
     seconds_of,
     without,
@@ -191,12 +191,12 @@ def prepare_model(
     }
     robot = load_model(description, rates.step_s)
     fitted, held = parts
-    fit_recordings, held_recordings = (
-        [r for table in tables for r in on_grid(table, robot, rates)] for tables in (fitted, held)
+    fit_recordings, held_recordings = (named_on_grid(tables, robot, rates) for tables in (fitted, held))
+    require_base(robot, config.feet, [r for _, r in (*fit_recordings, *held_recordings)])
+    episodes, judge = (
+        [aligned(r, robot, config.feet, name) for name, r in recordings]
+        for recordings in (fit_recordings, held_recordings)
     )
-    require_base(robot, config.feet, [*fit_recordings, *held_recordings])
-    episodes = [aligned(r, robot, config.feet) for r in fit_recordings]
-    judge = [aligned(r, robot, config.feet) for r in held_recordings]
     episodes, judge = parts_to_calibrate(
         robot, space, episodes, judge, config, share=share, std=std, threads=threads, say=say
     )
@@ -205,7 +205,7 @@ def prepare_model(
         space=space,
         episodes=episodes,
         holdout=judge,
-        shown=fit_recordings[0].trajectory,
+        shown=fit_recordings[0][1].trajectory,
         telemetry=[
             f"{name}: {verdict.severity} {verdict.name}: {verdict.message}"
             for name, found in verdicts.items()

@@ -114,6 +114,17 @@ def _rows(table: Table, keep: Any) -> Table:
     return table.rows(keep)
 
 
+def named_on_grid(tables: Sequence[Table], robot: RobotModel, rates: Sampling) -> list[tuple[str, Recording]]:
+    """Return recordings on the grid with their names; a table that pauses gives several."""
+    found = []
+    for table in tables:
+        recordings = on_grid(table, robot, rates)
+        for number, recording in enumerate(recordings, 1):
+            part = f", part {number} of {len(recordings)}" if len(recordings) > 1 else ""
+            found.append((table.name + part, recording))
+    return found
+
+
 def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]:
     """Put a recording on the grid, with the gains of the model and commands in the actuators' unit."""
     from deal_hw.data.importing.grid import Gains, to_trajectories
@@ -132,12 +143,12 @@ def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]
     return to_trajectories(table, gains, rates.period_s)
 
 
-def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...]) -> SampledEpisode:
-    """Return a recording on the physics grid, with the base where the robot floats."""
+def aligned(recording: Recording, robot: RobotModel, feet: tuple[str, ...], name: str = "") -> SampledEpisode:
+    """Return a recording on the physics grid, called NAME, with the base where the robot floats."""
     from deal_hw.sim.recordings.episode import align, fill_gaps
     from deal_hw.sim.recordings.imu_base import with_base
 
-    episode = align(recording.trajectory, robot.description)
+    episode = align(recording.trajectory, robot.description, name)
     if recording.orientation is not None and recording.gyro is not None and robot.base is not None:
         episode = with_base(episode, robot, feet, recording.orientation, recording.gyro)
     return fill_gaps(episode)

@@ -1,0 +1,110 @@
+"""The report's first sentence, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.report.story import compared, percent, tell
+from deal_hw.calibration import CalibrationResult
+from deal_hw.parameters import Parameter, ParameterSpace
+
+NAN, INF = float("nan"), float("inf")
+
+
+def result(heldout: dict[str, float], **changes: Any) -> CalibrationResult:
+    """Return a result of one parameter with these held-out errors."""
+    space = ParameterSpace([Parameter.around("mass", "body_mass", ("arm",), "kg", 1.0)])
+    return CalibrationResult(
+        method="eki",
+        space=space,
+        estimate=np.ones(1),
+        interval=np.array([[0.9, 1.1]]),
+        heldout_nrmse=heldout,
+        **changes,
+    )
+
+
+@pytest.mark.parametrize(
+    ("nominal", "calibrated", "words"),
+    [
+        (0.264, 0.011, "24 times better than the nominal model"),
+        (0.05, 0.02, "2.5 times better than the nominal model"),
+        # 1 - 0.05 / 0.06 = 1/6.
+        (0.06, 0.05, "17 % better than the nominal model"),
+        (0.05, 0.0505, "no better than the nominal model"),
+        (0.05, 0.0495, "no better than the nominal model"),
+        (0.05, 0.06, "worse than the nominal model, with 1.2 times its error"),
+        (0.01, 0.24, "worse than the nominal model, with 24 times its error"),
+        (0.05, NAN, "worse than the nominal model: it diverges"),
+        (INF, 0.05, "better than the nominal model, which diverges"),
+        (0.5, 0.0, "more than 1000 times better than the nominal model"),
+    ],
+)
+def test_errors_are_compared_in_plain_words(nominal: float, calibrated: float, words: str) -> None:
+    """Better, no better and worse, by how many times or by how many percent."""
+    assert compared(nominal, calibrated) == words
+
+
+def test_the_sentence_tells_the_held_out_gain() -> None:
+    """26.4 % against 1.1 % is 24 times; the bars are 100 % and 1.1 / 26.4 = 4.17 % long."""
+    story = tell(result({"nominal": 0.264, "calibrated": 0.011, "null": 0.5}))
+    assert story.sentence.replace("\u00a0", " ") == (
+        "The calibrated simulator predicts motion that it was not given 24 times better than the nominal "
+        "model: its error is 1.1 % of the motion's range against 26 %."
+    )
+    assert [(bar.name, bar.words) for bar in story.bars] == [
+        ("nominal", percent(0.264)),
+        ("calibrated", "1.1\u00a0%"),
+    ]
+    assert [bar.share for bar in story.bars] == pytest.approx([100, 4.167], abs=1e-3)
+    assert story.floor is None and story.in_units == ""
+
+
+def test_a_model_that_got_worse_is_said_to_be_worse() -> None:
+    """The longest bar is then the calibrated one."""
+    story = tell(result({"nominal": 0.05, "calibrated": 0.06, "null": 0.5}))
+    assert "worse than the nominal model, with 1.2 times its error" in story.sentence
+    assert [bar.share for bar in story.bars] == pytest.approx([83.33, 100], abs=0.01)
+
+
+def test_a_model_that_diverges_has_no_number() -> None:
+    """Its bar is full and says so."""
+    story = tell(result({"nominal": 0.05, "calibrated": NAN}))
+    assert story.sentence.endswith("worse than the nominal model: it diverges.")
+    assert (story.bars[1].words, story.bars[1].share) == ("diverged", 100.0)
+
+
+def test_without_held_out_recordings_nothing_is_claimed() -> None:
+    """No gain and no bars; what is known of the fit is said. chi2 of 4 is twice the noise."""
+    story = tell(result({}, chi2=4.0))
+    assert (
+        story.sentence.startswith("Nothing says how well")
+        and "2.0 times the sensor's noise" in story.sentence
+    )
+    assert story.bars == () and "noise" not in tell(result({})).sentence
+
+
+def test_units_and_noise_stand_beside_the_gain() -> None:
+    """Noise of 0.5 % on a bar of 26.4 % is at 1.89 %; rad is said where all joints have it, else nothing."""
+    rmse: dict[str, Any] = {
+        "mean": {"nominal": 0.0266, "calibrated": 0.0011},
+        "unit": {"hip": "rad", "knee": "rad"},
+        "noise": {"nrmse": 0.005, "mean": 0.0004, "by_coordinate": {"hip": 0.0004, "knee": 0.0004}},
+    }
+    heldout = {"nominal": 0.264, "calibrated": 0.011}
+    story = tell(result(heldout, provenance={"heldout_rmse": rmse}))
+    assert story.in_units == "In rad, mean over the joints: nominal 0.027, calibrated 0.0011."
+    assert story.floor == pytest.approx(1.894, abs=1e-3) and story.floor_words == "0.5\u00a0%"
+    rmse["unit"]["hip"], rmse["noise"]["nrmse"] = "m", None
+    story = tell(result(heldout, provenance={"heldout_rmse": rmse}))
+    assert story.in_units == "" and story.floor is None
+    rmse["unit"]["hip"], rmse["mean"]["nominal"] = "rad", None
+    assert tell(result(heldout, provenance={"heldout_rmse": rmse})).in_units == ""
+
+
+def test_percent_has_two_digits() -> None:
+    """Also above 100 %."""
+    assert [percent(v) for v in (0.0012345, 0.5, 2.34)] == ["0.12\u00a0%", "50\u00a0%", "234\u00a0%"]
