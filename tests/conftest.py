@@ -14,12 +14,38 @@ REAL_TIME = {"cli", "contracts", "control", "drivers", "tools", "workflows"}
 """Folders of tests with processes that run in real time; two of these at once would disturb each other."""
 
 COMPUTING = (
+    "test_cartpole_protocol",
+    "test_cartpole_truth",
     "test_cli_calibrate_",
+    "test_cli_every_",
+    "test_cli_keys",
+    "test_contracts_parameters",
+    "test_contracts_policy",
+    "test_control_excitation",
+    "test_control_posture",
+    "test_control_replay_error",
+    "test_control_safety",
+    "test_control_velocity",
+    "test_control_waveforms",
+    "test_dds_types",
+    "test_dynamixel_packets",
+    "test_go2_descriptions",
+    "test_go2_device",
+    "test_go2_load",
+    "test_go2_messages",
+    "test_go2_motors",
+    "test_go2_odometry",
+    "test_go2_oracle",
+    "test_go2_protocol",
     "test_tools_check_readers",
     "test_tools_compare_rows",
     "test_tools_convert_so101",
     "test_tools_measure_size",
     "test_tools_structure",
+    "test_workflows_environments",
+    "test_workflows_refusals",
+    "test_workflows_robot",
+    "test_workflows_run_",
 )
 """Files of these folders that compute and nothing else, by how their names begin: they go to any worker."""
 
