@@ -9,8 +9,9 @@ from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 from deal_hw.viz import palette
 from deal_hw.viz.columns import Log
 
-AXIS_COLORS = ((240, 110, 110), (120, 210, 120), (110, 150, 250))
+AXIS_COLORS = (palette.ALARM, palette.CALIBRATED, palette.REAL)
 LEG_COLORS = (palette.REAL, palette.NOMINAL, palette.CALIBRATED, palette.OTHERS[0])
+SUPPLY = (("Charge", "%"), ("Voltage", "V"), ("Current", "A"))
 _AXES = ("x", "y", "z")
 
 
@@ -29,15 +30,24 @@ def log_body(log: Log, trajectory: Trajectory, body: BodyTrajectory, description
             log.line(path, name, colors[i % len(colors)])
             log.scalars(path, *clocks, values[:, i])
 
-    roll, pitch = roll_pitch(body.orientation)
-    traces("tilt", ("roll", "pitch"), np.degrees(np.stack([roll, pitch], axis=1)), AXIS_COLORS)
+    traces("tilt", ("roll", "pitch"), tilt(body), AXIS_COLORS)
     traces("gyro", _AXES, body.angular_velocity, AXIS_COLORS)
     traces("acceleration", _AXES, body.acceleration, AXIS_COLORS)
     legs = tuple(foot.removesuffix("_foot") for foot in description.feet)
     traces("feet", legs, body.foot_force, LEG_COLORS)
-    traces("temperature", trajectory.joint_names, body.temperature, (palette.REAL, *LEG_COLORS[1:]))
-    supply = np.stack([100.0 * body.battery, body.voltage, body.current], axis=1)
-    traces("battery", ("charge %", "voltage V", "current A"), supply, LEG_COLORS)
+    # The joints of a leg are in one plot.
+    traces("temperature", trajectory.joint_names, body.temperature, LEG_COLORS[:3])
+    traces("battery", tuple(f"{word.lower()} {unit}" for word, unit in SUPPLY), supply(body), LEG_COLORS)
+
+
+def tilt(body: BodyTrajectory) -> FloatArray:
+    """Return roll and pitch, (T, 2) [deg]."""
+    return np.degrees(np.stack(roll_pitch(body.orientation), axis=1))
+
+
+def supply(body: BodyTrajectory) -> FloatArray:
+    """Return charge, voltage and current in the units of `SUPPLY`, (T, 3)."""
+    return np.stack([100.0 * body.battery, body.voltage, body.current], axis=1)
 
 
 def roll_pitch(orientation: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-import urllib.parse
 from collections.abc import Iterator
 
-from deal_hw.viz.viewer import LOOPBACK, free_port, run_viewer, wait_until_listening
+from deal_hw.viz.viewer import LOOPBACK, WINDOW, free_port, run_viewer, wait_until_listening, web_address
 
 _START_S = 20.0
 
@@ -30,8 +29,10 @@ def live_viewer() -> Iterator[tuple[str, str]]:
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         web = free_port()
         arguments += ["--serve-web", "--web-viewer-port", str(web)]
-        address = f"http://{LOOPBACK}:{web}?url={urllib.parse.quote(data, safe='')}"
+        address = web_address(web, data)
         ports.append(web)
+    else:
+        arguments += WINDOW
     with run_viewer(arguments) as viewer:
         for wanted in ports:
             wait_until_listening(viewer, wanted, _START_S)

@@ -1,4 +1,4 @@
-"""The one set of colours, from Okabe and Ito (2008): told apart with any kind of colour vision."""
+"""The one set of colours, of Okabe and Ito (2008): told apart with any colour vision, on white and black."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ from collections.abc import Sequence
 
 Color = tuple[int, int, int]
 
-REAL: Color = (86, 180, 233)
+REAL: Color = (0, 114, 178)
 """Blue: what the robot reported."""
 NOMINAL: Color = (230, 159, 0)
 """Orange: what the user's model predicts."""
-CALIBRATED: Color = (0, 178, 130)
-"""Green: what the calibrated model predicts; a little lighter than the original for thin lines on black."""
-REQUESTED: Color = (150, 150, 150)
-SENT: Color = (240, 228, 66)
+CALIBRATED: Color = (0, 158, 115)
+"""Green: what the calibrated model predicts."""
+REQUESTED: Color = (140, 140, 140)
+SENT: Color = (204, 121, 167)
 ALARM: Color = (213, 94, 0)
-OTHERS: tuple[Color, ...] = ((204, 121, 167), (148, 103, 189), (230, 230, 230))
+OTHERS: tuple[Color, ...] = ((204, 121, 167), (86, 180, 233), (140, 140, 140))
 """For parameter sets of other names."""
+SKY: Color = (236, 239, 243)
+"""Behind the robot."""
 
 
 _KNOWN = {"real": REAL, "nominal": NOMINAL, "calibrated": CALIBRATED}

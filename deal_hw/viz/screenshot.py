@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,17 @@ from PIL import Image
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.viz.columns import DEVICE_TIMELINE
-from deal_hw.viz.viewer import LOOPBACK, Viewer, free_port, run_viewer, wait_until_listening
+from deal_hw.viz.viewer import LOOPBACK, Viewer, free_port, program, run_viewer, wait_until_listening
 
-DEFAULT_SIZE = (1600, 1000)
+DEFAULT_SIZE = (1280, 800)
 RENDERER_INSTALL = "apt-get install -y mesa-vulkan-drivers"
 _MENU_BAR_PX = 36
+_CONTROL = {
+    "protocolVersion": "2024-11-05",
+    "capabilities": {},
+    "clientInfo": {"name": "deal-hw", "version": "0"},
+}
+_LIGHT_BUTTON = {"content_contains": "Light", "role": "Button"}
 _START_S = 30.0
 _LOAD_S = 30.0
 _SETTLE_S = 1.0
@@ -46,6 +54,7 @@ def save_screenshot(
         try:
             wait_until_listening(viewer, port, _START_S)
             client = _wait_until_loaded(viewer, port)
+            _choose_light_theme(client, port)
             if at_s is not None:
                 client.set_time(DEVICE_TIMELINE, duration=at_s, play_state="paused")
             png = _settled(client)
@@ -73,6 +82,35 @@ def _wait_until_loaded(viewer: Viewer, port: int) -> Any:
             problem = "it loaded no recording"
         time.sleep(0.1)
     raise ConfigurationError(f"rerun's headless viewer was not ready within {_LOAD_S:g} s: {problem}")
+
+
+def _choose_light_theme(client: Any, port: int) -> None:
+    """Click "Light" on the settings page: the headless viewer reads no settings and has no option for it.
+
+    Rerun's own control program finds the button by its text. Where another version of rerun lacks it, the
+    picture is dark.
+    """
+    place = client.get_location()
+    client.run_command("ui.open_settings")
+    calls: tuple[dict[str, Any], ...] = (
+        {"method": "initialize", "params": _CONTROL},
+        {"method": "tools/call", "params": {"name": "click", "arguments": _LIGHT_BUTTON}},
+        # The pointer is drawn; up there it is cut off with the menu.
+        {"method": "tools/call", "params": {"name": "hover", "arguments": {"pos": {"x": 600, "y": 2}}}},
+    )
+    command = [str(program()), "viewer-mcp", "--endpoint", f"http://{LOOPBACK}:{port}"]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as control:
+        assert control.stdin is not None and control.stdout is not None
+        for number, call in enumerate(calls):
+            print(json.dumps({"jsonrpc": "2.0", "id": number, **call}), file=control.stdin, flush=True)
+            control.stdout.readline()
+            if number == 0:
+                ready = {"jsonrpc": "2.0", "method": "notifications/initialized"}
+                print(json.dumps(ready), file=control.stdin, flush=True)
+        control.stdin.close()
+    client.set_location(place)
 
 
 def _settled(client: Any) -> bytes:

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import os
-import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.viz.viewer import LOOPBACK, Viewer, check_port, free_port, run_viewer, wait_until_listening
+from deal_hw.viz.viewer import (
+    LOOPBACK,
+    WINDOW,
+    Viewer,
+    check_port,
+    free_port,
+    run_viewer,
+    wait_until_listening,
+    web_address,
+)
 
 DEFAULT_WEB_PORT = 9090
 _START_S = 20.0
@@ -38,8 +46,7 @@ def serve_web(rrd: Path, *, port: int = DEFAULT_WEB_PORT) -> Iterator[tuple[str,
     with run_viewer(arguments) as viewer:
         for wanted in (web_port, data_port):
             wait_until_listening(viewer, wanted, _START_S)
-        data = urllib.parse.quote(f"rerun+http://{LOOPBACK}:{data_port}/proxy", safe="")
-        yield f"http://{LOOPBACK}:{web_port}?url={data}", viewer
+        yield web_address(web_port, f"rerun+http://{LOOPBACK}:{data_port}/proxy"), viewer
 
 
 def check_display() -> None:
@@ -63,7 +70,7 @@ def open_window(rrd: Path) -> None:
     """
     _check_file(rrd)
     check_display()
-    with run_viewer([str(rrd), "--bind", LOOPBACK, "--port", str(free_port())]) as viewer:
+    with run_viewer([str(rrd), "--bind", LOOPBACK, "--port", str(free_port()), *WINDOW]) as viewer:
         if viewer.process.wait():
             viewer.check()
 

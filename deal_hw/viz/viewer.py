@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import importlib.util
+import json
 import os
 import socket
 import subprocess
 import tempfile
 import time
+import urllib.parse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +20,8 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 
 LOOPBACK = "127.0.0.1"
 """Rerun's default is every interface: a recording would be readable from the whole network."""
+WINDOW = ("--persist-state",)
+"""Arguments of a window: without it rerun reads no settings, and its theme is dark."""
 _STOP_S = 5.0
 
 
@@ -104,6 +109,7 @@ def run_viewer(
         environment.update(XDG_CONFIG_HOME=home, XDG_DATA_HOME=home)
         environment.setdefault("XDG_RUNTIME_DIR", home)
         subprocess.run([binary, "analytics", "disable"], env=environment, check=True, capture_output=True)
+        _write_settings(Path(home) / "rerun")
         log = Path(home) / "log.txt"
         with log.open("wb") as file:
             process = subprocess.Popen(
@@ -115,6 +121,17 @@ def run_viewer(
             _stop(process)
 
 
+def _write_settings(folder: Path) -> None:
+    """Write the settings that a window starts with; rerun takes none that another version wrote."""
+    settings = {
+        "egui": "(options:(theme_preference:Light))",
+        "app": "(app_options:(check_for_updates_on_startup:false))",
+        "rerun.version": importlib.metadata.version("rerun-sdk"),
+    }
+    folder.mkdir(exist_ok=True)
+    (folder / "app.ron").write_text(json.dumps(settings), encoding="utf-8")
+
+
 def _stop(process: subprocess.Popen[bytes]) -> None:
     process.terminate()
     try:
@@ -122,6 +139,16 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+def web_address(port: int, data: str) -> str:
+    """Return what to open in a browser, in the light theme.
+
+    Args:
+        port: Where rerun serves its web viewer.
+        data: Where the data come from.
+    """
+    return f"http://{LOOPBACK}:{port}?url={urllib.parse.quote(data, safe='')}&theme=light"
 
 
 def wait_until_listening(viewer: Viewer, port: int, timeout_s: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import json
 import re
 import socket
@@ -21,7 +22,7 @@ from deal_hw.install import install_line
 from deal_hw.viz import palette
 from deal_hw.viz.screenshot import RENDERER_INSTALL, save_screenshot
 from deal_hw.viz.serve import open_window, serve_web
-from deal_hw.viz.viewer import LOOPBACK, free_port, run_viewer, wait_until_listening
+from deal_hw.viz.viewer import LOOPBACK, free_port, run_viewer, wait_until_listening, web_address
 
 
 def test_web_is_served_on_loopback_only(shown: Any) -> None:
@@ -39,6 +40,18 @@ def test_web_is_served_on_loopback_only(shown: Any) -> None:
     assert server.process.poll() is not None
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((LOOPBACK, int(address.split(":")[2].split("?")[0])), timeout=1)
+
+
+def test_windows_and_pages_are_light() -> None:
+    """A window's settings choose the light theme and no look for updates; a page is told in its address."""
+    with run_viewer(["--serve-grpc", "--bind", LOOPBACK, "--port", str(free_port())]) as viewer:
+        home = Path(psutil.Process(viewer.process.pid).environ()["XDG_DATA_HOME"])
+        settings = json.loads((home / "rerun" / "app.ron").read_text(encoding="utf-8"))
+    assert settings["egui"] == "(options:(theme_preference:Light))"
+    assert settings["app"] == "(app_options:(check_for_updates_on_startup:false))"
+    # Rerun forgets settings of another version.
+    assert settings["rerun.version"] == importlib.metadata.version("rerun-sdk")
+    assert web_address(1, "rerun+http://a/proxy").endswith("?url=rerun%2Bhttp%3A%2F%2Fa%2Fproxy&theme=light")
 
 
 def test_a_taken_port_is_named(shown: Any) -> None:
@@ -85,7 +98,7 @@ def test_a_missing_recording_is_named(tmp_path: Path) -> None:
 
 
 def test_screenshot_shows_the_traces_or_says_what_is_missing(shown: Any, tmp_path: Path) -> None:
-    """With a renderer the picture has all three colours; without one the error names what installs it."""
+    """A renderer's picture is light and has all three colours; without one, what installs it is named."""
     picture = tmp_path / "pictures" / "episode.png"
     try:
         save_screenshot(shown.rrd, picture, at_s=0.3, size=(1200, 800))
@@ -96,6 +109,8 @@ def test_screenshot_shows_the_traces_or_says_what_is_missing(shown: Any, tmp_pat
         assert image.format == "PNG" and image.width == 1200 and 700 < image.height < 800
         colors = image.convert("RGB").getcolors(maxcolors=1_000_000)
     assert colors is not None
+    (_, most) = max(colors)
+    assert most == (255, 255, 255), "the theme is light"
     for wanted in (palette.REAL, palette.NOMINAL, palette.CALIBRATED):
         # Thin lines are blended with the background, so a palette keeps their colour nearly, not exactly.
         near = sum(count for count, rgb in colors if np.abs(np.subtract(rgb, wanted)).max() < 25)
