@@ -14,7 +14,7 @@ from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
-from deal_hw.workflows.inspect import InspectSettings, predicted
+from deal_hw.workflows.inspect import InspectSettings, check_file, predicted
 from deal_hw.workflows.options import Range, refuse
 
 
@@ -79,6 +79,9 @@ def inspect(config: Inspect) -> InspectReport:
         ConfigurationError: A setting cannot be used, or this machine cannot show it; the message says what
             would do.
     """
+    for file, suffix in ((config.save, ".rrd"), (config.screenshot, ".png")):
+        if file is not None:
+            check_file(file, suffix)
     path = episode_of(config.episode)
     episode = read_episode(path)
     window = not (config.save or config.screenshot or config.web)

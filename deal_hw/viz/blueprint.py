@@ -1,54 +1,103 @@
-"""How an inspected episode opens: 3D and summary at the left, traces stacked at the right, events below."""
+"""How an inspected episode opens: verdict, robot and details at the left, plots at the right.
+
+A plot's left edge is where its y labels end, and rerun has no setting for it. So time axes are in line where
+labels are equally wide, which plots of one quantity nearly are.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
+from deal_hw.data.recording.reader import CycleTable
 from deal_hw.description import RobotDescription
-from deal_hw.types import FloatArray, Trajectory
-from deal_hw.viz.backend import rrb
-from deal_hw.viz.columns import DEVICE_TIMELINE
+from deal_hw.sim.recordings.overlay import Overlay
+from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
+from deal_hw.viz import palette
+from deal_hw.viz.backend import rr, rrb
+from deal_hw.viz.body_log import LEG_COLORS, SUPPLY, supply, tilt
+from deal_hw.viz.columns import DEVICE_TIMELINE, command_device_times
+from deal_hw.viz.scales import Curve, clear_corner, time_columns, visible_range
 
-_STACKED_JOINTS = 3
-"""Robots with more joints get a grid of small plots instead of a stack."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plot:
+    """A plot of signals of one unit.
+
+    Attributes:
+        name: Title, with the unit.
+        origin: Entity that the contents start from.
+        contents: Entities in it.
+        curves: What is drawn.
+        within: The y axis reaches no farther than this.
+    """
+
+    name: str
+    origin: str
+    contents: tuple[str, ...] = ("$origin/**",)
+    curves: tuple[Curve, ...]
+    within: tuple[float, float] = (-np.inf, np.inf)
+
+    def view(self, rows: int, limits: tuple[float, float] | None = None) -> Any:
+        """Return the view; all of them share one time axis.
+
+        Args:
+            rows: So many plots are below each other.
+            limits: The y axis; by default that of the curves.
+        """
+        limits = limits or visible_range(self.curves, self.within, rows)
+        return rrb.TimeSeriesView(
+            origin=self.origin,
+            contents=list(self.contents),
+            name=self.name,
+            axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+            axis_y=rrb.ScalarAxis(range=limits, zoom_lock=False),
+            plot_legend=rrb.PlotLegend(rrb.Corner2D[clear_corner(self.curves, limits)]),
+        )
 
 
 def inspect_blueprint(
     trajectory: Trajectory,
     description: RobotDescription,
-    sets: tuple[str, ...],
+    overlay: Overlay | None = None,
+    cycles: CycleTable | None = None,
     bodies: FloatArray | None = None,
+    alarms: bool = False,
 ) -> Any:
     """Return the layout.
 
     Args:
         trajectory: The recording.
         description: The robot.
-        sets: Names of the parameter sets that are shown beside it.
+        overlay: Predictions to show beside it.
+        cycles: The control cycles.
         bodies: Where the robot's bodies are at the beginning, to look at, (B, 3) [m]; None: at the origin.
+        alarms: Whether there are alarms.
     """
     tabs = [
-        _motion(trajectory, description, sets),
-        _velocities(trajectory, description, sets),
+        _joints("position", trajectory, description, overlay),
+        _joints("velocity", trajectory, description, overlay),
         _commands(trajectory, description),
-        _plot("/loop_timing", "loop timing [ms]"),
     ]
     if trajectory.body is not None:
-        tabs.insert(0, _body(trajectory))
-    right = rrb.Tabs(*tabs, active_tab=0)
-    left = rrb.Vertical(
-        _robot(description, bodies),
-        rrb.TextDocumentView(origin="/summary", name="Summary"),
-        row_shares=[4, 7],
-    )
-    bottom = rrb.Horizontal(
-        rrb.TextLogView(origin="/events", name="Events"),
+        tabs.append(_body(trajectory, trajectory.body))
+    tabs.append(_loop_timing(trajectory, cycles))
+    details = rrb.Tabs(
+        rrb.TextDocumentView(origin="/summary", name="Parameters and errors"),
+        rrb.TextLogView(
+            origin="/events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+        ),
         rrb.StateTimelineView(origin="/status", name="Status"),
+        active_tab=0,
     )
+    verdict = rrb.TextDocumentView(origin="/verdict", name="Verdict and alarms")
+    left = rrb.Vertical(verdict, _robot(description, bodies), details, row_shares=[7 if alarms else 4, 4, 6])
+    right = rrb.Tabs(*tabs, active_tab=0)
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(left, right, column_shares=[2, 3]), bottom, row_shares=[9, 2]),
+        rrb.Horizontal(left, right, column_shares=[2, 3]),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=DEVICE_TIMELINE, play_state="paused", loop_mode="all"),
@@ -57,73 +106,162 @@ def inspect_blueprint(
     )
 
 
-def _plot(origin: str, name: str, contents: list[str] | None = None) -> Any:
-    return rrb.TimeSeriesView(
-        origin=origin,
-        contents=contents or ["$origin/**"],
-        name=name,
-        # Plots that move together are read together.
-        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
-    )
+def joint_groups(names: Sequence[str], most: int) -> dict[str, list[int]]:
+    """Return which joints share a tab, by the tab's name: legs, or some in their order.
+
+    Args:
+        names: The joints.
+        most: So many at most.
+    """
+    if len(names) <= most:
+        return {"": list(range(len(names)))}
+    legs: dict[str, list[int]] = {}
+    for j, name in enumerate(names):
+        legs.setdefault(name.split("_")[0], []).append(j)
+    if all(2 <= len(leg) <= most for leg in legs.values()):
+        return legs
+    parts = np.array_split(np.arange(len(names)), -(-len(names) // most))
+    return {" to ".join(dict.fromkeys((names[p[0]], names[p[-1]]))): p.tolist() for p in parts}
 
 
-def _stack(name: str, plots: list[Any], joints: int) -> Any:
-    return rrb.Vertical(*plots, name=name) if joints <= _STACKED_JOINTS else rrb.Grid(*plots, name=name)
+def _grids(name: str, plots: Sequence[Sequence[Plot]], trajectory: Trajectory, joints: Sequence[str]) -> Any:
+    """Return the plots of each joint, on tabs where there are many."""
+    columns = time_columns(trajectory.duration_s)
+    # Wide plots are two below each other; more were too low for labels.
+    most = max(columns * (1 + columns) // len(plots[0]), 1) if plots else 1
+    tabs = []
+    for group, members in joint_groups(joints, most).items():
+        shown = [plot for j in members for plot in plots[j]]
+        views = [plot.view(-(-len(shown) // columns)) for plot in shown]
+        tabs.append(rrb.Grid(*views, grid_columns=columns, name=group or name))
+    return tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, name=name, active_tab=0)
 
 
-def _motion(trajectory: Trajectory, description: RobotDescription, sets: tuple[str, ...]) -> Any:
-    plots = []
-    for joint, unit in zip(trajectory.joint_names, description.position_units, strict=True):
-        plots.append(_plot(f"/joints/{joint}/position", f"{joint} position [{unit}]"))
-        if sets:
-            plots.append(_plot(f"/joints/{joint}/error", f"{joint}: predicted minus real [{unit}]"))
-    return _stack("Motion", plots, len(trajectory.joint_names))
-
-
-def _velocities(trajectory: Trajectory, description: RobotDescription, sets: tuple[str, ...]) -> Any:
-    plots = []
-    for joint, unit in zip(trajectory.joint_names, description.position_units, strict=True):
-        plots.append(_plot(f"/joints/{joint}/velocity", f"{joint} velocity [{unit}/s]"))
-        if sets:
-            plots.append(
-                _plot(f"/joints/{joint}/velocity_error", f"{joint}: predicted minus real [{unit}/s]")
+def _joints(
+    quantity: Literal["position", "velocity"],
+    trajectory: Trajectory,
+    description: RobotDescription,
+    overlay: Overlay | None,
+) -> Any:
+    """Return a quantity of each joint; after it, where there are predictions, how far they are off."""
+    error, per_second = ("error", "") if quantity == "position" else ("velocity_error", "/s")
+    rows: list[list[Plot]] = []
+    for j, (joint, unit) in enumerate(zip(trajectory.joint_names, description.position_units, strict=True)):
+        measured = getattr(trajectory, quantity)[:, j]
+        low, high = _span(measured)
+        # The prediction of a model that diverges must not hide what was measured.
+        reach = high - low or np.inf
+        shown, errors = [(trajectory.device_s, measured)], []
+        if overlay is not None:
+            real = getattr(overlay, quantity)[..., j]
+            predicted = [getattr(p, quantity)[..., j] for p in overlay.predictions.values()]
+            shown += [(overlay.device_s, values) for values in predicted]
+            errors += [(overlay.device_s, values - real) for values in predicted]
+        row = [
+            Plot(
+                name=f"{joint} {quantity} [{unit}{per_second}]",
+                origin=f"/joints/{joint}/{quantity}",
+                curves=tuple(shown),
+                within=(low - reach, high + reach),
             )
-    return _stack("Velocity", plots, len(trajectory.joint_names))
+        ]
+        if errors:
+            row.append(
+                Plot(
+                    name=f"{joint}: predicted - measured [{unit}{per_second}]",
+                    origin=f"/joints/{joint}/{error}",
+                    curves=tuple(errors),
+                    within=(-reach, reach),
+                )
+            )
+        rows.append(row)
+    return _grids(quantity.capitalize(), rows, trajectory, trajectory.joint_names)
 
 
 def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
-    plots = []
-    for joint in trajectory.actuated:
+    rows = []
+    targets = command_device_times(trajectory)
+    for a, joint in enumerate(trajectory.actuated):
+        j = trajectory.joint_names.index(joint)
         unit = description.position_units[description.joint_names.index(joint)]
-        shown = [f"/commands/{joint}/**", f"/joints/{joint}/position/measured"]
-        plots.append(_plot("/", f"{joint}: target requested, target sent, position [{unit}]", shown))
-        plots.append(_plot(f"/joints/{joint}/effort", f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]"))
-    return _stack("Commands", plots, len(trajectory.actuated))
+        rows.append(
+            [
+                Plot(
+                    name=f"{joint}: target and position [{unit}]",
+                    origin="/",
+                    contents=(f"/commands/{joint}/**", f"/joints/{joint}/position/measured"),
+                    curves=(
+                        (targets, trajectory.requested_position[:, a]),
+                        (targets, trajectory.position_target[:, a]),
+                        (trajectory.device_s, trajectory.position[:, j]),
+                    ),
+                ),
+                Plot(
+                    name=f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]",
+                    origin=f"/joints/{joint}/effort",
+                    curves=((trajectory.device_s, trajectory.effort[:, a]),),
+                ),
+            ]
+        )
+    return _grids("Commands", rows, trajectory, trajectory.actuated)
 
 
-def _body(trajectory: Trajectory) -> Any:
-    legs = [
-        _plot("/", f"{leg}: joint positions [rad]", [f"/joints/{joint}/position/**" for joint in joints])
-        for leg, joints in _legs(trajectory.joint_names).items()
+def _loop_timing(trajectory: Trajectory, cycles: CycleTable | None) -> Any:
+    def plot(name: str, entities: dict[str, FloatArray]) -> Plot:
+        curves = tuple((np.arange(len(v), dtype=float), 1e3 * v) for v in entities.values())
+        contents = tuple(f"/loop_timing/{entity}" for entity in entities)
+        return Plot(name=name, origin="/loop_timing", contents=contents, curves=curves)
+
+    periods = {
+        "state_period": np.diff(trajectory.receive_s),
+        "command_period": np.diff(trajectory.sent_s),
+    }
+    plots = [plot("Time between samples and between commands [ms]", periods)]
+    if cycles is not None:
+        delays = {"lateness": cycles.start_s - cycles.deadline_s, "state_age": cycles.state_age_s}
+        plots.append(plot("Lateness of cycles, age of the state [ms]", delays))
+    return rrb.Vertical(*(one.view(len(plots)) for one in plots), name="Loop timing")
+
+
+def _body(trajectory: Trajectory, body: BodyTrajectory) -> Any:
+    time_s = trajectory.device_s
+
+    def plot(name: str, group: str, values: FloatArray, *names: str, rows: int = 2) -> Any:
+        parts = [rr.escape_entity_path_part(one) for one in names]
+        contents = tuple(f"/body/{group}/{part}" for part in parts) or ("$origin/**",)
+        curves = tuple((time_s, column) for column in values.T)
+        return Plot(name=name, origin=f"/body/{group}", contents=contents, curves=curves).view(rows)
+
+    imu = [
+        plot("Roll, pitch [deg]", "tilt", tilt(body)),
+        plot("Angular velocity [rad/s]", "gyro", body.angular_velocity),
+        plot("Specific force [m/s²]", "acceleration", body.acceleration),
+        plot("Foot force [robot's units]", "feet", body.foot_force),
     ]
-    plots = [
-        _plot("/body/tilt", "Roll, pitch [deg]"),
-        _plot("/body/gyro", "Angular velocity [rad/s]"),
-        _plot("/body/acceleration", "Specific force [m/s²]"),
-        _plot("/body/feet", "Foot force [robot's units]"),
-        _plot("/body/battery", "Battery"),
-        _plot("/body/temperature", "Motor temperature [°C]"),
+    warm = [
+        plot(
+            f"{group} motor temperature [°C]".strip(),
+            "temperature",
+            body.temperature[:, members],
+            *(trajectory.joint_names[j] for j in members),
+        )
+        for group, members in joint_groups(trajectory.joint_names, len(LEG_COLORS)).items()
     ]
-    return rrb.Grid(*legs, *plots, grid_columns=2, name="Body")
+    battery = [
+        plot(f"{word} [{unit}]", "battery", values[:, None], f"{word.lower()}_{unit}", rows=3)
+        for (word, unit), values in zip(SUPPLY, supply(body).T, strict=True)
+    ]
+    tabs = [
+        rrb.Grid(*imu, grid_columns=2, name="IMU and feet"),
+        rrb.Grid(*warm, grid_columns=2, name="Temperature"),
+        rrb.Vertical(*battery, name="Battery"),
+    ]
+    return rrb.Tabs(*tabs, name="Body", active_tab=0)
 
 
-def _legs(joints: tuple[str, ...]) -> dict[str, list[str]]:
-    """Return joints by what their names begin with."""
-    found: dict[str, list[str]] = {}
-    for joint in joints:
-        found.setdefault(joint.split("_")[0], []).append(joint)
-    return found
+def _span(values: FloatArray) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
 
 
 def _robot(description: RobotDescription, bodies: FloatArray | None) -> Any:
@@ -147,9 +285,9 @@ def _robot(description: RobotDescription, bodies: FloatArray | None) -> Any:
     )
     return rrb.Spatial3DView(
         origin="/world",
-        name="Robot: real solid, predictions as ghosts",
+        name="Robot: measured solid, predictions as ghosts",
         eye_controls=eye,
         # A robot on the floor needs one to stand on.
         line_grid=rrb.LineGrid3D(visible=description.floating_base is not None, spacing=0.25),
-        background=rrb.Background(kind=rrb.components.BackgroundKind.SolidColor, color=(24, 26, 30)),
+        background=rrb.Background(kind=rrb.components.BackgroundKind.SolidColor, color=palette.SKY),
     )

@@ -13,7 +13,7 @@ Entities, J joints and any number of parameter sets (``nominal``, ``calibrated``
     /events                                    text log
     /body/{tilt,gyro,acceleration}/...         IMU, for robots with legs; also
     /body/{feet,temperature,battery}/...
-    /summary                                   markdown
+    /{verdict,summary}                         markdown
     /world/{surroundings,real,<set>}/...       3D
 
 Rerun draws traces in the order of their paths: "measured" comes before "predicted", so that it stays below.
@@ -39,7 +39,7 @@ from deal_hw.viz.blueprint import inspect_blueprint
 from deal_hw.viz.body_log import log_body
 from deal_hw.viz.columns import Log, command_device_times, host_to_device
 from deal_hw.viz.robot_view import log_robot, log_surroundings
-from deal_hw.viz.summary import summary_markdown
+from deal_hw.viz.summary import summary_markdown, verdict_markdown
 
 APPLICATION = "deal-hw inspect"
 _BREAK_S = 1e-6
@@ -55,6 +55,7 @@ def write_episode(
     cycles: CycleTable | None = None,
     overlay: Overlay | None = None,
     result: CalibrationResult | None = None,
+    verdict: str = "",
     name: str = "",
     note: str = "",
 ) -> None:
@@ -67,16 +68,18 @@ def write_episode(
         cycles: The control cycles, for loop timing and safety states.
         overlay: Predictions to show beside it.
         result: The calibration whose parameters are listed.
+        verdict: Whether that can be used, in markdown.
         name: Name of the recording in the viewer.
-        note: One more sentence for the summary.
+        note: One more sentence for the verdict, such as why there are no predictions.
     """
-    sets = () if overlay is None else tuple(overlay.predictions)
+    alarms = () if result is None else result.alarms
     with rr.RecordingStream(APPLICATION, send_properties=False) as stream:
         stream.save(path)
         robot = load_model(description)
         base = sensed_base(robot, trajectory)
         poses = body_poses(robot, trajectory.position, base)
-        layout = inspect_blueprint(trajectory, description, sets, _first_known(poses[0]))
+        bodies = _first_known(poses[0])
+        layout = inspect_blueprint(trajectory, description, overlay, cycles, bodies, alarms=bool(alarms))
         stream.send_blueprint(layout, make_active=True, make_default=True)
         stream.send_recording_name(name or str(trajectory.metadata.get("purpose", "episode")))
         log = Log(stream)
@@ -91,8 +94,11 @@ def write_episode(
         if overlay is not None:
             log_overlay(log, trajectory, overlay)
         log_scene(log, trajectory, robot, base, poses, overlay)
-        text = summary_markdown(trajectory, description, overlay, result, note)
-        stream.log("/summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+        for entity, text in (
+            ("/verdict", verdict_markdown(overlay, verdict, alarms, note)),
+            ("/summary", summary_markdown(trajectory, description, overlay, result)),
+        ):
+            stream.log(entity, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
         stream.disconnect()
 
 
@@ -102,12 +108,12 @@ def log_samples(log: Log, trajectory: Trajectory, description: RobotDescription)
     for j, joint in enumerate(trajectory.joint_names):
         for quantity, values in (("position", trajectory.position), ("velocity", trajectory.velocity)):
             path = f"/joints/{joint}/{quantity}/measured"
-            log.line(path, "real", palette.REAL, width=3.0)
+            log.line(path, "measured", palette.REAL, width=3.5)
             log.scalars(path, *clocks, values[:, j])
         if joint in trajectory.actuated:
             log.line(f"/joints/{joint}/effort", f"{joint} effort", palette.REAL)
             log.scalars(f"/joints/{joint}/effort", *clocks, trajectory.effort[:, j])
-    log.line("/loop_timing/state_period", "between samples [ms]", palette.REAL, step=True)
+    log.line("/loop_timing/state_period", "between samples", palette.REAL, step=True)
     log.scalars(
         "/loop_timing/state_period", clocks[0][1:], clocks[1][1:], 1e3 * np.diff(trajectory.receive_s)
     )
@@ -123,7 +129,7 @@ def log_commands(log: Log, trajectory: Trajectory) -> None:
         ):
             log.line(f"/commands/{joint}/{what}", what, color, width=width, step=True)
             log.scalars(f"/commands/{joint}/{what}", device_s, sent_s, values[:, a])
-    log.line("/loop_timing/command_period", "between commands [ms]", palette.NOMINAL, step=True)
+    log.line("/loop_timing/command_period", "between commands", palette.NOMINAL, step=True)
     log.scalars("/loop_timing/command_period", device_s[1:], sent_s[1:], 1e3 * np.diff(sent_s))
 
 
@@ -132,10 +138,10 @@ def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
     host_s = cycles.start_s
     device_s = host_to_device(trajectory, host_s)
     for name, label, values, color in (
-        ("lateness", "start of a cycle after its deadline [ms]", host_s - cycles.deadline_s, palette.SENT),
+        ("lateness", "lateness of a cycle", host_s - cycles.deadline_s, palette.SENT),
         (
             "state_age",
-            "age of the state when a command was computed [ms]",
+            "age of the state",
             cycles.state_age_s,
             palette.CALIBRATED,
         ),
@@ -196,16 +202,16 @@ def log_overlay(log: Log, trajectory: Trajectory, overlay: Overlay) -> None:
     receive_s = _broken_times(overlay.receive_s, trajectory.receive_s)
     for name, prediction in overlay.predictions.items():
         color = palette.color_of(name, list(overlay.predictions))
-        for quantity, values in (
-            ("position/predicted", prediction.position),
-            ("velocity/predicted", prediction.velocity),
-            ("error", overlay.position_error(name)),
-            ("velocity_error", overlay.velocity_error(name)),
+        for quantity, legend, values in (
+            ("position/predicted", name, prediction.position),
+            ("velocity/predicted", name, prediction.velocity),
+            ("error", f"{name} - measured", overlay.position_error(name)),
+            ("velocity_error", f"{name} - measured", overlay.velocity_error(name)),
         ):
             traces = np.pad(overlay.broken(values), ((1, 1), (0, 0)), constant_values=np.nan)
             for j, joint in enumerate(overlay.joint_names):
                 path = f"/joints/{joint}/{quantity}/{name}"
-                log.line(path, name, color)
+                log.line(path, legend, color)
                 log.scalars(path, device_s, receive_s, traces[:, j])
 
 

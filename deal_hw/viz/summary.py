@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from deal_hw.calibration import CalibrationResult
+from collections.abc import Sequence
+
+import numpy as np
+
+from deal_hw.calibration import Alarm, CalibrationResult
 from deal_hw.description import RobotDescription
 from deal_hw.sim.recordings.overlay import Overlay, Prediction
 from deal_hw.types import Trajectory
@@ -11,30 +15,57 @@ _WIDE = 3
 """Robots with more joints get a row for each instead of a column."""
 
 
+def verdict_markdown(
+    overlay: Overlay | None, verdict: str, alarms: Sequence[Alarm] = (), note: str = ""
+) -> str:
+    """Return what stands at the top, as markdown: is the calibration of use, and what speaks against it.
+
+    Args:
+        overlay: Predictions, if there are any.
+        verdict: Whether the calibration can be used; empty where none is shown.
+        alarms: Its alarms; what was seen is a line each.
+        note: One more sentence, such as why there is no overlay.
+    """
+    parts = [
+        verdict or "No calibration is shown: `--calibration` takes the folder of one.",
+        f"**{note}**" if note else "",
+        "" if overlay is None else _mean_errors(overlay),
+        "\n".join(f"{number}. {alarm.seen}" for number, alarm in enumerate(alarms, start=1)),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
 def summary_markdown(
     trajectory: Trajectory,
     description: RobotDescription,
     overlay: Overlay | None,
     result: CalibrationResult | None,
-    note: str = "",
 ) -> str:
-    """Return the summary as markdown.
+    """Return the details as markdown: errors of each joint, parameters, and what the alarms mean.
 
     Args:
         trajectory: The recording.
         description: The robot.
         overlay: Predictions, if there are any.
         result: The calibration, if there is one.
-        note: One more sentence, such as why there is no overlay.
     """
     parts = [_recording(trajectory, description)]
-    if note:
-        parts.append(f"**{note}**")
     if overlay is not None:
         parts.append(_errors(overlay, description))
     if result is not None:
         parts += [_parameters(result), _verdict(result)]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _mean_errors(overlay: Overlay) -> str:
+    shares = ", ".join(
+        f"{name} {100 * float(np.nanmean(prediction.position_nrmse)):.2g} %"
+        for name, prediction in overlay.predictions.items()
+    )
+    return (
+        f"**Error of predictions over {overlay.window_s:.2f} s:** {shares} of the position's range "
+        "(mean over the joints)."
+    )
 
 
 def _recording(trajectory: Trajectory, description: RobotDescription) -> str:
@@ -95,8 +126,8 @@ def _parameters(result: CalibrationResult) -> str:
     lines = [
         f"**Parameters by {result.method}.** {'; '.join(facts)}",
         "",
-        "| parameter | nominal | estimate | 90 % interval | unit | |",
-        "|---|---|---|---|---|---|",
+        "| parameter | nominal | estimate | 90 % interval | |",
+        "|---|---|---|---|---|",
     ]
     for k, p in enumerate(result.space):
         verdict = result.verdicts[k] if result.verdicts else ""
@@ -104,13 +135,17 @@ def _parameters(result: CalibrationResult) -> str:
         # What the data cannot tell has no value, whatever number the search ended at.
         estimate = "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}"
         lines.append(
-            f"| {p.name} | {p.nominal:.4g} | {estimate} | {low:.4g} to {high:.4g} | {p.unit} | "
+            f"| {p.name} [{p.unit}] | {p.nominal:.3g} | {estimate} | {low:.3g} to {high:.3g} | "
             f"{'' if verdict == 'identifiable' else verdict} |"
         )
     return "\n".join(lines)
 
 
 def _verdict(result: CalibrationResult) -> str:
-    lines = [f"- alarm: {alarm.seen} {alarm.means} **{alarm.do}**" for alarm in result.alarms]
+    lines = [
+        f"{number}. {alarm.seen} {alarm.means} **{alarm.do}**"
+        for number, alarm in enumerate(result.alarms, start=1)
+    ]
+    lines = ["**Alarms.**", "", *lines, ""] if lines else []
     lines += [f"- the data cannot see: {direction}" for direction in result.null_directions]
     return "\n".join(lines)

@@ -94,17 +94,25 @@ class Inspection:
             lines.append(f"{name:>10}: position error over {window_s:.2f} s, of the range: {shares}")
         return "\n".join(lines)
 
+    def verdict(self) -> str:
+        """Return whether the calibration can be used, as markdown; empty where none is shown."""
+        if self.result is None:
+            return ""
+        from deal_hw.calib.validation.verdict import trust
+
+        found = trust(self.result)
+        return f"**{found.colour}:** {found.seen} {found.means} **{found.do}**"
+
     def save(self, path: File) -> Path:
         """Write a rerun recording (.rrd) and return its path.
 
         Raises:
-            ConfigurationError: The path is a folder.
+            ConfigurationError: The path is a folder, or ends otherwise.
         """
         from deal_hw.viz.episode_log import write_episode
 
         path = Path(path)
-        if path.is_dir():
-            raise ConfigurationError(f"{path} is a folder; name a file, such as {path / 'episode.rrd'}")
+        check_file(path, ".rrd")
         path.parent.mkdir(parents=True, exist_ok=True)
         write_episode(
             path,
@@ -113,6 +121,7 @@ class Inspection:
             cycles=self.episode.cycles,
             overlay=self.overlay,
             result=self.result,
+            verdict=self.verdict(),
             name=f"{self.path.parent.parent.name}/{self.path.stem}",
             note=self.note,
         )
@@ -125,9 +134,13 @@ class Inspection:
             path: The file.
             at_s: Device time that it shows [s]; by default where the nominal model errs most.
             rrd: What :meth:`save` wrote, where that was called.
+
+        Raises:
+            ConfigurationError: The path is a folder, or ends otherwise; or there is no renderer.
         """
         from deal_hw.viz.screenshot import save_screenshot
 
+        check_file(Path(path), ".png")
         if at_s is None and self.overlay is not None:
             at_s = self.overlay.worst_moment_s("nominal")
         with self.saved(rrd) as file:
@@ -159,6 +172,22 @@ class Inspection:
         rows = self.rows()
         cells = [[v if isinstance(v, str) else f"{100 * v:.2g} %" for v in row.values()] for row in rows]
         return html_table(list(rows[0]), cells) if rows else html_table((self.note,), [])
+
+
+def check_file(path: Path, suffix: str) -> None:
+    """Check that a file of a kind can be written there.
+
+    Args:
+        path: The file.
+        suffix: What it must end in, such as ".png".
+
+    Raises:
+        ConfigurationError: It is a folder, or ends in something else.
+    """
+    if path.is_dir():
+        raise ConfigurationError(f"{path} is a folder; name a file, such as {path / ('episode' + suffix)}")
+    if path.suffix.lower() != suffix:
+        raise ConfigurationError(f"{path} does not end in {suffix}; name it {path.with_suffix(suffix)}")
 
 
 @from_settings(InspectSettings)

@@ -98,7 +98,17 @@ def shown(
         requested_position=np.zeros((100, 1)),
     )
     rrd = tmp_path_factory.mktemp("viz") / "episode.rrd"
-    write_episode(rrd, trajectory, DESCRIPTION, cycles=cycles, overlay=overlay, result=result, name="shown")
+    verdict = "**amber:** look at it"
+    write_episode(
+        rrd,
+        trajectory,
+        DESCRIPTION,
+        cycles=cycles,
+        overlay=overlay,
+        result=result,
+        verdict=verdict,
+        name="shown",
+    )
     return Shown(trajectory, cycles, overlay, result, rrd)
 
 

@@ -135,23 +135,27 @@ def test_the_robot_stands_on_the_floor_and_leans(
         np.testing.assert_allclose(ghost[outside], real[outside], atol=1e-6)
 
 
-def test_the_layout_opens_with_the_body(recording: Trajectory) -> None:
-    """A tab of legs, IMU, feet, battery, temperature; none where there is no body."""
-    assert tabs(inspect_blueprint(recording, DRIVER, ())) == [
-        "Body",
-        "Motion",
-        "Velocity",
-        "Commands",
-        "loop timing [ms]",
-    ]
+def test_the_layout_has_a_tab_for_the_body(recording: Trajectory) -> None:
+    """IMU, feet, temperatures, battery are on it; there is none where there is no body."""
+    names = ["Position", "Velocity", "Commands", "Body", "Loop timing"]
+    assert tabs(inspect_blueprint(recording, DRIVER)) == names
     bare = dataclasses.replace(recording, body=None)
-    assert tabs(inspect_blueprint(bare, ON_STAND, ("nominal",)))[0] == "Motion"
+    assert tabs(inspect_blueprint(bare, ON_STAND)) == [name for name in names if name != "Body"]
+
+
+def test_a_leg_is_a_tab_of_three_rows(recording: Trajectory, overlay: Overlay) -> None:
+    """Twelve joints are four tabs; each joint has its position, and beside it how far predictions are off."""
+    position = inspect_blueprint(recording, DRIVER, overlay).root_container.contents[1].contents[0]
+    assert [leg.name for leg in position.contents] == ["FL", "FR", "RL", "RR"]
+    for leg in position.contents:
+        assert leg.grid_columns == 2 and len(leg.contents) == 6
+        assert leg.contents[0].name == f"{leg.name}_hip_joint position [rad]"
+        assert leg.contents[1].name == f"{leg.name}_hip_joint: predicted - measured [rad]"
 
 
 def tabs(blueprint: Any) -> list[str]:
     """Return the names of the tabs at the right."""
-    top = blueprint.root_container.contents[0]
-    return [view.name for view in top.contents[1].contents]
+    return [view.name for view in blueprint.root_container.contents[1].contents]
 
 
 def test_an_episode_without_a_body_has_no_traces_of_one(recording: Trajectory, tmp_path: Path) -> None:

@@ -184,16 +184,24 @@ def test_colours_are_the_palette(rrd: Rrd) -> None:
         assert rrd.column(paths[1], "Boxes3D:colors", static=True) == [[packed]]
 
 
+def test_verdict_and_alarms_are_a_line_each(rrd: Rrd, shown: Any) -> None:
+    """Above the fold stands what was seen; what it means and what to do is in the details."""
+    (text,) = rrd.column("/verdict", "TextDocument:text", static=True)[0]
+    nominal = 100 * shown.overlay.predictions["nominal"].position_nrmse.mean()
+    assert text.startswith("**amber:** look at it") and f"nominal {nominal:.2g} %" in text
+    assert "\n1. backlash of 2 mm\n" in text and "play in the gear" not in text
+
+
 def test_summary_lists_errors_and_parameters(rrd: Rrd, shown: Any) -> None:
     """Every parameter is there with nominal value, estimate and interval; alarms, too."""
     (text,) = rrd.column("/summary", "TextDocument:text", static=True)[0]
     assert "**cartpole, collect:**" in text and "restarted every 0.20 s" in text
     # cart.mass: nominal 0.3 kg, estimate 0.6 x 0.3 = 0.18 kg, interval 0.162 to 0.198 kg, weak.
-    assert "| cart.mass | 0.3 | 0.18 | 0.162 to 0.198 | kg | weak |" in text
+    assert "| cart.mass [kg] | 0.3 | 0.18 | 0.162 to 0.198 | weak |" in text
     assert all(name in text for name in shown.result.space.names)
     assert "latency 8.0 ms (7.0 to 9.0)" in text and "pole.length 0.3 m" in text
     assert (
-        "alarm: backlash of 2 mm play in the gear **mend it**" in text
+        "1. backlash of 2 mm play in the gear **mend it**" in text
         and "the data cannot see: all masses together" in text
     )
 
@@ -219,6 +227,6 @@ def test_episode_without_predictions(trajectory: Trajectory, tmp_path: Path) -> 
     )
     write_episode(tmp_path / "bare.rrd", bare, DESCRIPTION, note="No predictions: never armed.")
     got = Rrd(tmp_path / "bare.rrd")
-    assert "No predictions: never armed." in got.column("/summary", "TextDocument:text", static=True)[0][0]
+    assert "No predictions: never armed." in got.column("/verdict", "TextDocument:text", static=True)[0][0]
     assert not any("predicted" in path or path.startswith("/world/nominal") for path in got.entities())
     assert len(got.scalars("/joints/cart/position/measured")[2]) == len(bare.device_s)

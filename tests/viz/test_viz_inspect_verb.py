@@ -158,6 +158,28 @@ def test_wrong_files_are_named(episode_file: Path, tmp_path: Path) -> None:
     assert not save.exists()
 
 
+def test_files_are_called_what_they_are(episode_file: Path, tmp_path: Path) -> None:
+    """A picture is a PNG and a recording an RRD: other endings are refused before anything is computed."""
+    gone = tmp_path / "none.mcap"
+    with pytest.raises(ConfigurationError, match=r"a\.jpg does not end in \.png; name it .*a\.png"):
+        inspect(Inspect(episode=gone, screenshot=tmp_path / "a.jpg"))
+    with pytest.raises(ConfigurationError, match=r"a\.mp4 does not end in \.rrd; name it .*a\.rrd"):
+        inspect(Inspect(episode=gone, save=tmp_path / "a.mp4"))
+    found = deal_hw.inspect(episode_file)
+    with pytest.raises(ConfigurationError, match=r"does not end in \.png"):
+        found.screenshot(tmp_path / "a.jpg")
+    with pytest.raises(ConfigurationError, match=r"is a folder; name a file, such as .*episode\.png"):
+        found.screenshot(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_verdict_is_that_of_the_calibration(episode_file: Path, result: CalibrationResult) -> None:
+    """The colour comes first, what to do last; without a calibration there is none."""
+    found = deal_hw.inspect(episode_file, calibration=result)
+    assert found.verdict().startswith("**amber:** ") and found.verdict().endswith("**")
+    assert deal_hw.inspect(episode_file).verdict() == ""
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
