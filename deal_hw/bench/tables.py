@@ -1,12 +1,9 @@
-"""Tables, lines and figures of benches whose truth is known, and of the bench on real recordings."""
+"""Tables and lines of benches whose truth is known, and of the bench on real recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-from deal_hw.errors import MissingExtraError
 
 
 def line(row: Mapping[str, Any]) -> str:
@@ -25,43 +22,6 @@ def line(row: Mapping[str, Any]) -> str:
             f"oracle {row['angle_error_oracle']:.4f} rad"
         )
     return text
-
-
-def figure(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Draw parameter errors and, where policies were trained, their pole angles.
-
-    Args:
-        path: Of the PNG.
-        rows: Rows without errors, at least one.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as err:
-        raise MissingExtraError("matplotlib", "bench") from err
-    trained = [row for row in rows if "angle_error_retrained" in row]
-    figure = Figure(figsize=(7.5, 3.6), layout="constrained")
-    panels = figure.subplots(1, 1 + bool(trained), width_ratios=(3, 2)[: 1 + bool(trained)], squeeze=False)[0]
-    left = panels[0]
-    groups = list(dict.fromkeys(_group(row) for row in rows))
-    # Only what tells the groups apart is worth a label's room.
-    told = [i for i, column in enumerate(zip(*groups, strict=True)) if len(set(column)) > 1] or [-1]
-    for i, group in enumerate(groups):
-        # An exact result has no place on a log scale.
-        values = [max(row["log_error_x100"], 1e-3) for row in rows if _group(row) == group]
-        left.plot([i] * len(values), values, "o", alpha=0.6, color=f"C{i}")
-    labels = [" ".join(group[i] for i in told) for group in groups]
-    left.set_xticks(range(len(groups)), labels, rotation=30, ha="right")
-    left.set_yscale("log")
-    left.set_ylabel("100 mean |ln(p / p*)|")
-    left.set_title("parameter error, one point a seed (below 1e-3: drawn at 1e-3)", fontsize=10)
-    for row in trained:
-        right = panels[1]
-        values = [row[f"angle_error_{name}"] for name in ("udr", "retrained", "oracle")]
-        right.plot(range(3), values, "o-", alpha=0.5, color="C0", linewidth=0.8)
-        right.set_xticks(range(3), ["UDR", "retrained", "oracle"])
-        right.set_yscale("log")
-        right.set_title("pole-angle error [rad]", fontsize=10)
-    figure.savefig(path, dpi=130)
 
 
 def print_real(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -138,7 +98,12 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
     Console(width=150).print(table)
 
 
+def method_name(row: Mapping[str, Any]) -> str:
+    """Return a row's method, and whether a refinement followed where that is a choice."""
+    method = str(row["method"])
+    return f"{method} + refinement" if row.get("refined") and method != "default" else method
+
+
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a line of the summary stands for."""
-    method = row["method"] + (" + refinement" if row.get("refined") and row["method"] != "default" else "")
-    return row.get("task", "cartpole"), row["profile"], f"{row['range_ratio']:g}", method
+    return row.get("task", "cartpole"), row["profile"], f"{row['range_ratio']:g}", method_name(row)

@@ -261,10 +261,10 @@ def _budget(config: Bench) -> Budget:
 
 
 def _draw(out: Path, rows: Sequence[Row]) -> None:
-    from deal_hw.bench.tables import figure
+    from deal_hw.bench.figures import draw
 
     if good := [row for row in rows if not row["error"]]:
-        figure(out.with_suffix(".png"), good)
+        draw(out.with_suffix(".png"), good)
 
 
 def _loop(config: Bench, out: Path) -> _Table:
@@ -361,7 +361,7 @@ def _real(config: Bench, out: Path) -> _Table:
         budget=_budget(config),
         quiet=config.quiet,
     )
-    return _Table(cells=cells, line=tables.line, summary=tables.print_real)
+    return _Table(cells=cells, line=tables.line, summary=tables.print_real, draw=_draw)
 
 
 def _verdict(config: Bench, out: Path) -> _Table:

@@ -1,0 +1,228 @@
+"""Figures of benches: what each method ends at, beside what needs no data, and what policies do then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from deal_hw.bench.tables import method_name
+from deal_hw.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Row = Mapping[str, Any]
+
+NO_DATA = ("midpoint", "midpoint-linear", "nominal", "deal-paper-flat")
+"""Methods that do not look at the recording."""
+POLICIES = {
+    "udr": "uniform\nrandomisation",
+    "retrained": "the calibrated\ndistribution",
+    "oracle": "the truth",
+}
+"""Under what a policy was trained, by the end of its fields' names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FigureSettings:
+    """Settings of the figures.
+
+    Attributes:
+        colors: Of range ratios, after Okabe and Ito (2008): told apart with any colour vision.
+        markers: Of the same, for print without colours.
+        floor: Smaller parameter errors are drawn here: an exact result has no place on a log scale.
+        decades: An axis is logarithmic where its values span more than this factor.
+        width: Of a panel [inches].
+        height: Of a panel's title and labels [inches].
+        mark_height: What each method adds to that [inches].
+        dpi: Of the PNG.
+    """
+
+    colors: tuple[str, ...] = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+    markers: tuple[str, ...] = ("o", "s", "^", "D")
+    floor: float = 1e-3
+    decades: float = 10.0
+    width: float = 5.6
+    height: float = 1.5
+    mark_height: float = 0.5
+    dpi: int = 110
+
+
+SETTINGS = FigureSettings()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Panel:
+    """One panel.
+
+    Attributes:
+        title: What was calibrated.
+        field: What is drawn of a row.
+        label: Of the axis of values.
+        mark: What a mark is, with the range ratio.
+        rows: Whose.
+        baselines: Fields of what needs no method, by name.
+        floor: Smaller values are drawn here.
+    """
+
+    title: str
+    field: str
+    label: str
+    mark: str
+    rows: Sequence[Row]
+    baselines: Mapping[str, str]
+    floor: float = 0.0
+
+    def values(self, rows: Sequence[Row], field: str) -> Any:
+        """Return a field of rows that have it."""
+        known = [row[field] for row in rows if row.get(field) is not None]
+        return np.maximum(np.array(known, dtype=float), self.floor)
+
+
+def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -> None:
+    """Draw the rows of a bench; a panel for each task and profile, and one for policies where there are any.
+
+    Where no row has a value (every prediction diverged), nothing is drawn.
+
+    Args:
+        path: Of the PNG.
+        rows: Rows without errors, at least one.
+        settings: Colours and sizes.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as err:
+        raise MissingExtraError("matplotlib", "bench") from err
+    panels = _panels(rows, settings)
+    trained = [row for row in rows if "angle_error_retrained" in row]
+    count = len(panels) + bool(trained)
+    if not count:
+        return
+    columns = min(count, 2)
+    lines = -(-count // columns)
+    marks = max(len({method_name(row) for row in rows}), len(POLICIES))
+    height = settings.height + settings.mark_height * marks
+    figure = Figure(figsize=(settings.width * columns, height * lines), layout="constrained")
+    places = [figure.add_subplot(lines, columns, number + 1) for number in range(count)]
+    ratios = sorted({float(row["range_ratio"]) for row in rows})
+    for panel, axes in zip(panels, places, strict=False):
+        _methods(axes, panel, ratios, settings)
+    if trained:
+        _policies(places[-1], trained)
+    # One legend for all panels: a colour means the same in each.
+    named = [pair for axes in places for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    told = {label: handle for handle, label in sorted(named, key=lambda pair: "no data" in pair[1])}
+    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=columns + 1, fontsize=9)
+    figure.savefig(path, dpi=settings.dpi)
+
+
+def _panels(rows: Sequence[Row], settings: FigureSettings) -> list[_Panel]:
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row.get("task", "cartpole"), row.get("split") or row["profile"]), []).append(row)
+    panels = []
+    for (task, what), part in found.items():
+        if part[0]["bench"] == "real":
+            panel = _Panel(
+                title=f"{task}, held out: {what}",
+                field="heldout_rmse_calibrated",
+                label="held-out RMSE [rad or m]",
+                mark="calibrated model",
+                rows=part,
+                baselines={"nominal model": "heldout_rmse_nominal", "nothing moves": "heldout_rmse_null"},
+            )
+        else:
+            panel = _Panel(
+                title=f"{task}, profile {what}",
+                field="log_error_x100",
+                label="100 x mean |ln(estimate / truth)|",
+                mark="range ratio {:g}",
+                rows=part,
+                baselines={"midpoint of the range": "null_log_error_x100"},
+                floor=settings.floor,
+            )
+        if panel.values(part, panel.field).size:
+            panels.append(panel)
+    return panels
+
+
+def _methods(axes: Axes, panel: _Panel, ratios: Sequence[float], settings: FigureSettings) -> None:
+    """Draw a line for each method; range ratios are below each other in it."""
+    names = list(dict.fromkeys(method_name(row) for row in panel.rows))
+    numbers = set()
+    for r, ratio in enumerate(ratios):
+        color, marker = settings.colors[r % len(settings.colors)], settings.markers[r % len(settings.markers)]
+        shift = 0.6 * ((r + 0.5) / len(ratios) - 0.5)
+        mine = [row for row in panel.rows if row["range_ratio"] == ratio]
+        word = panel.mark.format(ratio)
+        for m, name in enumerate(names):
+            values = panel.values([row for row in mine if method_name(row) == name], panel.field)
+            if values.size:
+                numbers.add(values.size)
+                _spread(axes, m + shift, values, color, marker, word)
+        for line, (baseline, field) in enumerate(panel.baselines.items()):
+            if (values := panel.values(mine, field)).size:
+                style, of = ("--", ":")[line % 2], f", {word}" if len(ratios) > 1 else ""
+                axes.axvline(
+                    np.median(values), color=color, ls=style, lw=1, label=f"{baseline}{of} (no data)"
+                )
+    marked = [f"{name}\n(no data)" if name in NO_DATA else name for name in names]
+    axes.set_yticks(range(len(names)), marked)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    cut = panel.floor and min(panel.values(panel.rows, panel.field)) <= panel.floor
+    _finish(
+        axes, panel.title, numbers, f"{panel.label}{f' (at least {panel.floor:g})' * bool(cut)}", "method"
+    )
+
+
+def _policies(axes: Axes, rows: Sequence[Row]) -> None:
+    """Draw how far policies let the pole lean; a thin line joins those of one robot."""
+    table = np.array([[row[f"angle_error_{name}"] for name in POLICIES] for row in rows], dtype=float)
+    axes.plot(table.T, range(len(POLICIES)), color="0.7", lw=0.8, zorder=0)
+    for m, values in enumerate(table.T):
+        _spread(axes, m, values, "black", "o", "_")
+    axes.set_yticks(range(len(POLICIES)), list(POLICIES.values()))
+    axes.set_ylim(len(POLICIES) - 0.6, -0.4)
+    _finish(axes, "policies on the robot", {len(rows)}, "mean |pole angle| [rad]", "trained under")
+
+
+def _spread(axes: Axes, y: float, values: Any, color: str, marker: str, label: str) -> None:
+    """Draw each seed, and their median with a bar from the smallest to the largest."""
+    axes.plot(values, np.full(len(values), y), marker, ms=4, alpha=0.35, color=color, mec="none")
+    middle = float(np.median(values))
+    axes.errorbar(
+        middle,
+        y,
+        xerr=[[middle - values.min()], [values.max() - middle]],
+        fmt=marker,
+        ms=7,
+        color=color,
+        capsize=4,
+        label=label,
+    )
+
+
+def _finish(axes: Axes, title: str, numbers: set[int], label: str, upwards: str) -> None:
+    """Name the axes, and say of how many seeds the bars are."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    low, high = axes.dataLim.intervalx
+    if low > 0 and high / low > SETTINGS.decades:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high / low > 100 else (1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes.set_xlim(left=0)
+    seeds = f"{min(numbers)} to {max(numbers)} seeds" if len(numbers) > 1 else f"{max(numbers)} seeds"
+    what = "1 seed" if numbers == {1} else f"median, smallest, largest of {seeds}"
+    axes.set_title(f"{title}\n{what}", fontsize=10)
+    axes.set_xlabel(label)
+    axes.set_ylabel(upwards)
+    axes.grid(axis="x", color="0.9", lw=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
