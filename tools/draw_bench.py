@@ -3,7 +3,8 @@
     python tools/draw_bench.py docs/measured/loop_sensor.json docs/measured/loop_realistic.json
     python tools/draw_bench.py docs/measured/searches_sensor.json --name deal-paper=deal-paper-replay
 
-Each figure lies beside its rows, as a PNG of their name. Methods of older rows get today's names, as in compare_rows.py.
+Each figure lies beside its rows, as a PNG of their name. Methods of older rows get today's
+names, as in compare_rows.py.
 """
 
 from __future__ import annotations

@@ -29,7 +29,11 @@ from deal_hw.workflows.options import CARTPOLE, Checked, Only, Range, Seed, refu
 from deal_hw.workflows.running.report import RunReport
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
+
+END_WIDTH = 110
+"""Width of the demo's last words [columns]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +202,9 @@ def demo(config: Demo) -> DemoReport:
         summary = _summary(done, stages)
         folder.write("summary.json", summary)
         folder.finish(seconds=stages.seconds)
-    _print(summary, done, config.folder)
+    from rich.console import Console
+
+    print_end(Console(width=END_WIDTH), summary, done.found.result, config.folder)
     return DemoReport(summary=summary, folder=config.folder)
 
 
@@ -251,6 +257,7 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
     values = loop_timing.to_json() if loop_timing is not None else {}
     periods = {f"period_{key}": values["period"][f"{key}_s"] for key in ("p50", "p99", "max") if values}
     return {
+        "sentence": done.sentence,
         "parameters": {
             p.name: {
                 "estimate": float(result.estimate[k]),
@@ -276,21 +283,25 @@ def _summary(done: Demonstrated, stages: Stages) -> dict[str, Any]:
         "alarms": [str(alarm) for alarm in result.alarms],
         "seconds": stages.seconds,
         "cpu_seconds": stages.cpu_seconds,
-        "paths": dict(done.paths),
+        "paths": {"episode": str(done.episode), **done.paths},
     }
 
 
-def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
-    """Say in a sentence what came of it, show what was found beside the truth, and how to look at it."""
-    from rich.console import Console
+def print_end(console: Console, summary: Mapping[str, Any], result: CalibrationResult, folder: Path) -> None:
+    """Say in a sentence what came of it, show what was found beside the truth, and how to look at it.
+
+    Args:
+        console: Where to print.
+        summary: What ``summary.json`` holds.
+        result: The calibration.
+        folder: The run folder.
+    """
     from rich.table import Table
 
-    console = Console(width=110)
-    console.print(f"\n{done.sentence}", markup=False)
+    console.print(f"\n{summary['sentence']}", markup=False)
     table = Table(title="what the calibrator found of a robot it could not look inside")
     for name in ("parameter", "unit", "nominal", "estimate", "90 % interval", "truth"):
         table.add_column(name, justify="left" if name in ("parameter", "unit") else "right")
-    result = done.found.result
     for k, (name, row) in enumerate(summary["parameters"].items()):
         found = (
             "no value" if result.verdicts[k : k + 1] == ("not identifiable",) else f"{row['estimate']:.4g}"
@@ -299,16 +310,17 @@ def _print(summary: dict[str, Any], done: Demonstrated, folder: Path) -> None:
             table, name, row["unit"], f"{row['nominal']:.4g}", found, (row["low"], row["high"]), row["truth"]
         )
     for name, row in summary["known"].items():
-        table.add_row(name, "", "", f"{row['value']:.4g}", "not fitted", f"{row['truth']:.4g}")
+        unit = escape(result.space[name].unit)
+        table.add_row(name, unit, "", f"{row['value']:.4g}", "not fitted", f"{row['truth']:.4g}")
     latency = summary["latency_s"]
     low, high = (1e3 * end for end in result.latency_interval_s)
     _add(table, "latency", "ms", "0", f"{1e3 * latency['found']:.1f}", (low, high), 1e3 * latency["true"])
     console.print(table)
     for command in (
-        f"deal-hw inspect {done.episode} --calibration {folder / 'calibration'}",
+        f"deal-hw inspect {summary['paths']['episode']} --calibration {folder / 'calibration'}",
         f"python3 -m webbrowser {folder / 'calibration' / 'report.html'}",
     ):
-        console.print(command, markup=False, soft_wrap=True)
+        console.print(command, markup=False, highlight=False, soft_wrap=True)
 
 
 def _add(
