@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import subprocess
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ _LIGHT_BUTTON = {"content_contains": "Light", "role": "Button"}
 _START_S = 30.0
 _LOAD_S = 30.0
 _SETTLE_S = 1.0
+_CLICK_S = 20.0
 
 
 def save_screenshot(
@@ -103,13 +106,18 @@ def _choose_light_theme(client: Any, port: int) -> None:
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as control:
         assert control.stdin is not None and control.stdout is not None
-        for number, call in enumerate(calls):
-            print(json.dumps({"jsonrpc": "2.0", "id": number, **call}), file=control.stdin, flush=True)
-            control.stdout.readline()
-            if number == 0:
-                ready = {"jsonrpc": "2.0", "method": "notifications/initialized"}
-                print(json.dumps(ready), file=control.stdin, flush=True)
-        control.stdin.close()
+        late = threading.Timer(_CLICK_S, control.kill)
+        late.start()
+        with contextlib.suppress(BrokenPipeError):
+            for number, call in enumerate(calls):
+                print(json.dumps({"jsonrpc": "2.0", "id": number, **call}), file=control.stdin, flush=True)
+                control.stdout.readline()
+                if number == 0:
+                    ready = {"jsonrpc": "2.0", "method": "notifications/initialized"}
+                    print(json.dumps(ready), file=control.stdin, flush=True)
+            control.stdin.close()
+        control.wait()
+        late.cancel()
     client.set_location(place)
 
 

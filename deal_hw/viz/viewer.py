@@ -7,6 +7,7 @@ import importlib.metadata
 import importlib.util
 import json
 import os
+import platform
 import socket
 import subprocess
 import tempfile
@@ -20,8 +21,11 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 
 LOOPBACK = "127.0.0.1"
 """Rerun's default is every interface: a recording would be readable from the whole network."""
-WINDOW = ("--persist-state",)
-"""Arguments of a window: without it rerun reads no settings, and its theme is dark."""
+WINDOW = ("--persist-state",) if platform.system() == "Linux" else ()
+"""Arguments of a window: without it rerun reads no settings, and its theme is the desktop's, else dark.
+
+Elsewhere its settings are in no folder that we can choose, and the user's own stay as they are.
+"""
 _STOP_S = 5.0
 
 

@@ -44,7 +44,9 @@ def test_web_is_served_on_loopback_only(shown: Any) -> None:
 
 def test_windows_and_pages_are_light() -> None:
     """A window's settings choose the light theme and no look for updates; a page is told in its address."""
-    with run_viewer(["--serve-grpc", "--bind", LOOPBACK, "--port", str(free_port())]) as viewer:
+    port = free_port()
+    with run_viewer(["--serve-grpc", "--bind", LOOPBACK, "--port", str(port)]) as viewer:
+        wait_until_listening(viewer, port, 20)
         home = Path(psutil.Process(viewer.process.pid).environ()["XDG_DATA_HOME"])
         settings = json.loads((home / "rerun" / "app.ron").read_text(encoding="utf-8"))
     assert settings["egui"] == "(options:(theme_preference:Light))"
