@@ -184,25 +184,23 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
     for a, joint in enumerate(trajectory.actuated):
         j = trajectory.joint_names.index(joint)
         unit = description.position_units[description.joint_names.index(joint)]
-        rows.append(
-            [
-                Plot(
-                    name=f"{joint}: target and position [{unit}]",
-                    origin="/",
-                    contents=(f"/commands/{joint}/**", f"/joints/{joint}/position/measured"),
-                    curves=(
-                        (targets, trajectory.requested_position[:, a]),
-                        (targets, trajectory.position_target[:, a]),
-                        (trajectory.device_s, trajectory.position[:, j]),
-                    ),
-                ),
-                Plot(
-                    name=f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]",
-                    origin=f"/joints/{joint}/effort",
-                    curves=((trajectory.device_s, trajectory.effort[:, a]),),
-                ),
-            ]
+        target = Plot(
+            name=f"{joint}: target and position [{unit}]",
+            origin="/",
+            contents=(f"/commands/{joint}/**", f"/joints/{joint}/position/measured"),
+            curves=(
+                (targets, trajectory.requested_position[:, a]),
+                (targets, trajectory.position_target[:, a]),
+                (trajectory.device_s, trajectory.position[:, j]),
+            ),
         )
+        effort = Plot(
+            name=f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]",
+            origin=f"/joints/{joint}/effort",
+            curves=((trajectory.device_s, trajectory.effort[:, a]),),
+        )
+        # Few imported recordings have efforts.
+        rows.append([target, effort] if np.isfinite(trajectory.effort).any() else [target])
     return _grids("Commands", rows, trajectory, trajectory.actuated)
 
 
@@ -224,39 +222,35 @@ def _loop_timing(trajectory: Trajectory, cycles: CycleTable | None) -> Any:
 
 
 def _body(trajectory: Trajectory, body: BodyTrajectory) -> Any:
-    time_s = trajectory.device_s
+    """Return what was sensed of the body; an imported recording has of all this the IMU alone."""
+    tabs: dict[str, list[Plot]] = {}
 
-    def plot(name: str, group: str, values: FloatArray, *names: str, rows: int = 2) -> Any:
+    def add(tab: str, name: str, group: str, values: FloatArray, *names: str) -> None:
+        if not np.isfinite(values).any():
+            return
         parts = [rr.escape_entity_path_part(one) for one in names]
         contents = tuple(f"/body/{group}/{part}" for part in parts) or ("$origin/**",)
-        curves = tuple((time_s, column) for column in values.T)
-        return Plot(name=name, origin=f"/body/{group}", contents=contents, curves=curves).view(rows)
+        curves = tuple((trajectory.device_s, column) for column in values.T)
+        plot = Plot(name=name, origin=f"/body/{group}", contents=contents, curves=curves)
+        tabs.setdefault(tab, []).append(plot)
 
-    imu = [
-        plot("Roll, pitch [deg]", "tilt", tilt(body)),
-        plot("Angular velocity [rad/s]", "gyro", body.angular_velocity),
-        plot("Specific force [m/s²]", "acceleration", body.acceleration),
-        plot("Foot force [robot's units]", "feet", body.foot_force),
-    ]
-    warm = [
-        plot(
-            f"{group} motor temperature [°C]".strip(),
-            "temperature",
-            body.temperature[:, members],
-            *(trajectory.joint_names[j] for j in members),
-        )
-        for group, members in joint_groups(trajectory.joint_names, len(LEG_COLORS)).items()
-    ]
-    battery = [
-        plot(f"{word} [{unit}]", "battery", values[:, None], f"{word.lower()}_{unit}", rows=3)
-        for (word, unit), values in zip(SUPPLY, supply(body).T, strict=True)
-    ]
-    tabs = [
-        rrb.Grid(*imu, grid_columns=2, name="IMU and feet"),
-        rrb.Grid(*warm, grid_columns=2, name="Temperature"),
-        rrb.Vertical(*battery, name="Battery"),
-    ]
-    return rrb.Tabs(*tabs, name="Body", active_tab=0)
+    add("IMU and feet", "Roll, pitch [deg]", "tilt", tilt(body))
+    add("IMU and feet", "Angular velocity [rad/s]", "gyro", body.angular_velocity)
+    add("IMU and feet", "Specific force [m/s²]", "acceleration", body.acceleration)
+    add("IMU and feet", "Foot force [robot's units]", "feet", body.foot_force)
+    warm = trajectory.joint_names[: body.temperature.shape[1]]
+    for leg, members in joint_groups(warm, len(LEG_COLORS)).items():
+        joints = [warm[j] for j in members]
+        name = f"{leg} motor temperature [°C]".strip()
+        add("Temperature", name, "temperature", body.temperature[:, members], *joints)
+    for (word, unit), values in zip(SUPPLY, supply(body).T, strict=True):
+        add("Battery", f"{word} [{unit}]", "battery", values[:, None], f"{word.lower()}_{unit}")
+    grids = []
+    for tab, plots in tabs.items():
+        columns = 1 if len(plots) < 4 else 2
+        views = [plot.view(-(-len(plots) // columns)) for plot in plots]
+        grids.append(rrb.Grid(*views, grid_columns=columns, name=tab))
+    return rrb.Tabs(*grids, name="Body", active_tab=0)
 
 
 def _span(values: FloatArray) -> tuple[float, float]:

@@ -97,6 +97,13 @@ def test_a_prediction_that_runs_away_leaves_the_plot(shown: Any) -> None:
     assert high - low < 5 * np.ptp(real)
 
 
+def test_efforts_that_were_not_recorded_have_no_plot(shown: Any) -> None:
+    """An imported recording may have none."""
+    silent = dataclasses.replace(shown.trajectory, effort=np.full_like(shown.trajectory.effort, np.nan))
+    names = {view.name for view in views(inspect_blueprint(silent, DESCRIPTION).root_container)}
+    assert "cart: target and position [m]" in names and "cart effort [N]" not in names
+
+
 def test_joints_share_tabs() -> None:
     """By leg where names tell them, else in their order; few joints need no tabs."""
     assert joint_groups(("a", "b"), 2) == {"": [0, 1]}

@@ -153,6 +153,28 @@ def test_a_leg_is_a_tab_of_three_rows(recording: Trajectory, overlay: Overlay) -
         assert leg.contents[1].name == f"{leg.name}_hip_joint: predicted - measured [rad]"
 
 
+def test_what_was_not_sensed_has_no_plot(recording: Trajectory) -> None:
+    """Of an imported recording's body only the IMU is known: no feet, temperatures and battery are drawn."""
+    body = body_of(recording)
+    unknown = np.full(len(recording.device_s), np.nan)
+    bare = dataclasses.replace(
+        body,
+        foot_force=np.empty((len(unknown), 0)),
+        temperature=np.empty((len(unknown), 0)),
+        battery=unknown,
+        voltage=unknown,
+        current=unknown,
+    )
+    layout = inspect_blueprint(dataclasses.replace(recording, body=bare), DRIVER)
+    (found,) = [tab for tab in layout.root_container.contents[1].contents if tab.name == "Body"]
+    assert [view.name for view in found.contents[0].contents] == [
+        "Roll, pitch [deg]",
+        "Angular velocity [rad/s]",
+        "Specific force [m/s²]",
+    ]
+    assert len(found.contents) == 1
+
+
 def tabs(blueprint: Any) -> list[str]:
     """Return the names of the tabs at the right."""
     return [view.name for view in blueprint.root_container.contents[1].contents]
