@@ -212,8 +212,9 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         counts = ", ".join(
             f"{colours.count(c)} {c}" for c in ("green", "amber", "red", "said", "refused") if c in colours
         )
-        known: dict[str, str] = {**FAULTS, **{name: words for name, (words, *_) in SHARED.items()}}
-        words = f"{fault}: {known[fault]}" if fault else "the model is right"
+        shared = _shared(fault)
+        known = SHARED[shared][0] if shared else FAULTS[own] if (own := _fault(fault)) else ""
+        words = f"{fault}: {known}" if known else "the model is right"
         text = f"{words}: {len(mine)} robots, {counts}"
         if fault:
             text += f"; named {sum(bool(r['named']) for r in mine)} times"

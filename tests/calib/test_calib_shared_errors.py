@@ -29,16 +29,19 @@ SAMPLES, JOINTS, ACTUATED = 7, 4, (0, 1, 3)
 def episode() -> SampledEpisode:
     """Return a recording of four joints, the third without a motor."""
     rng = np.random.default_rng(0)
-    sent = {name: np.ones((SAMPLES, 3)) for name in ("stiffness", "damping", "effort_limit", "speed_limit")}
+    sent = np.ones((SAMPLES, 3))
     return SampledEpisode(
         step_s=0.005,
         sample=np.arange(SAMPLES),
         position=rng.normal(size=(SAMPLES, JOINTS)),
         velocity=rng.normal(size=(SAMPLES, JOINTS)),
         target=rng.normal(size=(SAMPLES, 3)),
-        start_setpoint=rng.normal(size=3),
+        stiffness=sent,
+        damping=sent,
+        effort_limit=sent,
+        speed_limit=sent,
         usable=np.ones(SAMPLES, dtype=bool),
-        **sent,
+        start_setpoint=rng.normal(size=3),
     )
 
 
