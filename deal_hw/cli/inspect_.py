@@ -14,7 +14,7 @@ from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.viz.serve import DEFAULT_WEB_PORT, check_display, open_window, serve_web
-from deal_hw.workflows.inspect import InspectSettings, predicted
+from deal_hw.workflows.inspect import InspectSettings, check_picture, predicted
 from deal_hw.workflows.options import Range, refuse
 
 
@@ -52,6 +52,8 @@ class Inspect(InspectSettings):
         super().__post_init__()
         if self.web_port != DEFAULT_WEB_PORT and not self.web:
             refuse(["--web-port"], "only --web opens a port")
+        if self.screenshot is not None:
+            check_picture(self.screenshot)
         if self.at is not None and self.screenshot is None:
             refuse(["--at"], "only --screenshot shows a single moment")
 

@@ -48,6 +48,16 @@ class InspectSettings(Checked):
     """Total latency in the predictions [s]; by default the calibration's, or 0."""
 
 
+def check_picture(path: File) -> None:
+    """Check that a picture's name says what is written.
+
+    Raises:
+        ConfigurationError: It does not end in .png.
+    """
+    if Path(path).suffix.lower() != ".png":
+        raise ConfigurationError(f"--screenshot {path}: pictures are PNG; name a file that ends in .png")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Inspection:
     """A recording with predictions beside it.
@@ -122,10 +132,11 @@ class Inspection:
         """Write a picture (.png) and return its path; needs a Vulkan renderer, but no desktop.
 
         Args:
-            path: The file.
+            path: The file, see :func:`check_picture`.
             at_s: Device time that it shows [s]; by default where the nominal model errs most.
             rrd: What :meth:`save` wrote, where that was called.
         """
+        check_picture(path)
         from deal_hw.viz.screenshot import save_screenshot
 
         if at_s is None and self.overlay is not None:
