@@ -74,7 +74,7 @@ class SharedError:
         kind: What is wrong.
         joints: At which joints; none for the clock.
         undo: What would mend the recordings.
-        words: The error, such as "elbow were in degrees".
+        words: The error, such as "positions of elbow were in degrees".
         do: How to mend it.
     """
 
@@ -180,37 +180,40 @@ def shared_errors(problem: Problem) -> Iterator[SharedError]:
     single = [(j,) for j in range(J)]
     alike = [tuple(j for j in range(J) if units[j] == unit) for unit in units]
     for group in dict.fromkeys((*single, *alike)):
-        where, at = _where(names, group), tuple(names[j] for j in group)
+        where, of, at = _where(names, group)
         factor, unit, short = UNITS[units[group[0]]]
         yield SharedError(
             "unit",
             at,
             scaled(factor, group),
             f"{where} were in {unit}",
-            f"Set unit: {short} for {where} in the column map.",
+            f"Set unit: {short}{of} in the column map.",
         )
         yield SharedError(
             "unit",
             at,
             scaled(1 / factor, group),
             f"{where} were converted from {unit}, and had not been in {unit}",
-            f"Set unit: {units[group[0]]} for {where} in the column map.",
+            f"Set unit: {units[group[0]]}{of} in the column map.",
         )
     for group in dict.fromkeys((*single, tuple(range(J)))):
-        where, at = _where(names, group), tuple(names[j] for j in group)
+        where, of, at = _where(names, group)
         for scale in (1 / f, f):
             yield SharedError(
                 "scale",
                 at,
                 scaled(scale, group),
                 f"{where} were multiplied by {1 / scale:g}",
-                f"Multiply commands and positions of {where} by {scale:g}.",
+                f"Multiply commands and positions{of} by {scale:g}.",
             )
 
 
-def _where(names: Sequence[str], group: Sequence[int]) -> str:
-    """Return a group of joints in words."""
-    return "all positions" if len(group) == len(names) > 1 else ", ".join(names[j] for j in group)
+def _where(names: Sequence[str], group: Sequence[int]) -> tuple[str, str, tuple[str, ...]]:
+    """Return whose positions, which of them, and the names of a group of joints."""
+    at = tuple(names[j] for j in group)
+    if len(group) == len(names) > 1:
+        return "all positions", "", at
+    return f"positions of {', '.join(at)}", f" for {', '.join(at)}", at
 
 
 def find_shared_error(problem: Problem, local: Refined | None) -> FoundError | None:

@@ -36,9 +36,13 @@ SHARED: Mapping[SharedFault, tuple[str, ...]] = {
     "swapped": ("the last two joints are swapped", "{before} and {last} were swapped"),
     "fast-clock": ("the clock runs twice as fast", "the clock were 2 times too fast"),
     "slow-clock": ("the clock runs half as fast", "the clock were 2 times too slow"),
-    "degrees": ("the last joint is in degrees", "{last} were in degrees", "{last}: positions reach"),
+    "degrees": (
+        "the last joint is in degrees",
+        "positions of {last} were in degrees",
+        "{last}: positions reach",
+    ),
     "doubled": ("all positions are doubled", "{all} were multiplied by 2"),
-    "doubled-joint": ("the last joint's positions are doubled", "{last} were multiplied by 2"),
+    "doubled-joint": ("the last joint's positions are doubled", "positions of {last} were multiplied by 2"),
 }
 """Faults of recordings that commands and measurements share: in words, and what names them to the user."""
 
@@ -290,7 +294,7 @@ def has_shared(kind: str, fault: SharedFault) -> bool:
 def shared_words(kind: str, fault: SharedFault) -> tuple[str, ...]:
     """Return phrases one of which a calibration says where it names a fault of the recordings."""
     names = [joint.name for joint in KINDS[kind].joints]
-    every = names[0] if len(names) == 1 else "all positions"
+    every = f"positions of {names[0]}" if len(names) == 1 else "all positions"
     before = names[max(len(names) - 2, 0)]
     return tuple(words.format(last=names[-1], before=before, all=every) for words in SHARED[fault][1:])
 

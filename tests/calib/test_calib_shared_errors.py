@@ -117,7 +117,7 @@ def test_candidates_are_few_and_each_mends_what_it_says(tmp_path: Path) -> None:
     }
     assert counts == {"sign": 2, "order": 1, "clock": 2, "unit": 6, "scale": 6}
     assert len({e.undo for e in found}) == len({e.words for e in found}) == len(found)
-    degrees = next(e for e in found if e.words == "elbow were in degrees")
+    degrees = next(e for e in found if e.words == "positions of elbow were in degrees")
     assert degrees.undo.scale == pytest.approx((1.0, math.pi / 180)) and "unit: deg for elbow" in degrees.do
 
 
@@ -126,8 +126,8 @@ def test_a_slide_is_in_millimetres_and_no_pair_of_a_hinge(tmp_path: Path) -> Non
     found = list(shared_errors(problem("cart-pole", None, tmp_path, 3.0)))
     words = {e.words for e in found}
     assert {
-        "slide were in millimetres",
-        "pole were in degrees",
+        "positions of slide were in millimetres",
+        "positions of pole were in degrees",
         "all positions were multiplied by 2",
     } <= words
     assert not any(e.kind == "order" for e in found)

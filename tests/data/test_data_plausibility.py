@@ -147,6 +147,18 @@ def test_degrees_of_a_joint_without_limits(make_table: MakeTable) -> None:
     assert verdict(wheel, "limits", free).severity is Severity.OK
 
 
+def test_a_free_joint_without_limits_may_turn(make_table: MakeTable) -> None:
+    """The pole of a cart that turned over: 51 rad are no degrees; with a motor, or limits, they may be."""
+    sound = make_table()
+    position = sound.position * [1, 1, 80]
+    pole = {"position": position, "actuated": ("hip", "knee"), "target": sound.target[:, :2]}
+    free = np.array([*LIMITS[:2], [-np.inf, np.inf]])
+    assert verdict(make_table(**pole), "units", free).severity is Severity.OK
+    assert verdict(make_table(**pole), "units", LIMITS).severity is Severity.FAIL
+    motor = make_table(position=position, target=sound.target * [1, 1, 80])
+    assert verdict(motor, "units", free).severity is Severity.FAIL
+
+
 @pytest.mark.parametrize(
     ("factors", "clock", "words"),
     [

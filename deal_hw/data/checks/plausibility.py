@@ -384,6 +384,9 @@ def _beyond_limits(table: Table, limits: FloatArray | None) -> list[str]:
         low, high = (-np.inf, np.inf) if limits is None else limits[index]
         reach = float(np.nanmax(np.abs(values)))
         bounded = np.isfinite(low) and np.isfinite(high)
+        if not bounded and index not in table.actuated_index:
+            # A pole may turn over and over.
+            continue
         furthest = max(abs(low), abs(high)) if bounded else 4 * np.pi
         if table.units[index] == "rad" and reach > 3 * furthest and reach < 1000:
             kind = f"degrees, or {_normal_range(values)}" if reach <= 105 else "degrees"
