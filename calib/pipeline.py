@@ -370,7 +370,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     problem, local = run.problem, run.local
     suspect = None
     asked = run.settings.diagnosis and run.settings.local_first
-    if asked and (local is None or unexplained(local)):
+    if asked and (local is None or unexplained(local, MISMATCH.white_samples)):
         suspect = find_shared_error(problem, local)
     if suspect is not None:
         run.say(BEFORE_SEARCH, str(suspect.alarm))

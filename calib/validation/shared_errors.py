@@ -114,7 +114,7 @@ class FoundError:
             f"The recordings look as if {words}, in commands and measurements alike: mended, motion that was "
             f"not fitted is predicted with chi2 {self.chi2:.3g} {before}.",
             "The parameters would make up for that error; no comparison of the two channels shows it.",
-            f"Check it at the robot. {' Or: '.join(error.do for error in self.errors)}",
+            f"{' Or: '.join(error.do for error in self.errors)} Check it at the robot.",
         )
 
     def confirmed(self, theta: FloatArray, latency_s: float) -> bool:
