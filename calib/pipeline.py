@@ -31,6 +31,7 @@ from deal_hw.calib.uncertainty.intervals import (
 )
 from deal_hw.calib.uncertainty.time_steps import averaged, scan_latency
 from deal_hw.calib.validation.cross_validation import Choice, choose
+from deal_hw.calib.validation.shared_errors import find_shared_error
 from deal_hw.calib.validation.verdict import Validation, judge, unexplained
 from deal_hw.calibration import (
     BEFORE_SEARCH,
@@ -200,7 +201,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             if local is not None and progress is not None:
                 local = with_rows(local)
                 foretell(problem, local, progress)
-            found = self.fits.best(dataclasses.replace(run, local=local))
+            found = with_shared_error(self.fits, dataclasses.replace(run, local=local))
         searched, known = found.searched, found.known
         # What the search says of its own interval does not hold for these.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
@@ -355,6 +356,29 @@ def to_the_noise(
         known=known,
         facts=facts,
     )
+
+
+def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
+    """Return what a way of fitting ends with, and whether commands and measurements share an error.
+
+    It is said before the search, and again where the search's end predicts no better.
+
+    Args:
+        fits: The way.
+        run: The calibration, with its local fit.
+    """
+    problem, local = run.problem, run.local
+    suspect = None
+    asked = run.settings.diagnosis and run.settings.local_first
+    if asked and (local is None or unexplained(local, MISMATCH.white_samples)):
+        suspect = find_shared_error(problem, local)
+    if suspect is not None:
+        run.say(BEFORE_SEARCH, str(suspect.alarm))
+    found = fits.best(run)
+    if suspect is None or not suspect.confirmed(found.theta, found.latency_s):
+        return found
+    known = dataclasses.replace(found.known, alarms=(suspect.alarm, *found.known.alarms))
+    return dataclasses.replace(found, known=known, facts={**found.facts, "shared_error": suspect.to_json()})
 
 
 def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> None:

@@ -195,6 +195,9 @@ def trust(result: CalibrationResult) -> Trust:
         f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise." if result.chi2 >= 0 else ""
     )
     mismatch = result.chi2 > MISMATCH.chi2
+    if "shared_error" in result.provenance:
+        first = result.alarms[0]
+        return Trust("red", first.seen, first.means, f"Do not use it. {first.do}")
     if nominal is None or calibrated is None:
         record = "Record one more motion and name it with --holdout."
         if mismatch:

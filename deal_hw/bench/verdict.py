@@ -2,6 +2,8 @@
 
 Robots in plain MuJoCo, each with a truth of its own, are calibrated as a user would: from CSV files and an
 MJCF, with default settings. Without a fault the model can explain all; each fault is something it lacks.
+Faults of the recordings, which commands and measurements share, are chosen by name: a calibration ends there
+when it has said which.
 """
 
 from __future__ import annotations
@@ -15,16 +17,20 @@ import numpy as np
 
 from deal_hw.bench.rows import Cells, Row
 from deal_hw.calib.validation.verdict import SETTINGS, trust
-from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_robots import (
     CAUSES,
     FAULTS,
     KINDS,
+    SHARED,
     SIGN_WORDS,
     Fault,
     PlainRobot,
+    SharedFault,
+    has_shared,
     make_robot,
+    shared_words,
     write,
 )
 from deal_hw.workflows.calibration.model import Recordings
@@ -46,18 +52,23 @@ def cells(
     Args:
         seeds: Of the truths.
         kinds: Names in `KINDS`; all by default.
-        faults: "none" and names in `FAULTS`; all by default.
+        faults: "none", names in `FAULTS` (these are all by default) and in `SHARED`.
 
     Raises:
         UnknownNameError: There is no such robot or fault.
     """
-    known = {NONE: RIGHT} | {fault: fault for fault in FAULTS}
+    usual = {NONE: RIGHT} | {fault: fault for fault in FAULTS}
+    known = usual | {fault: fault for fault in SHARED}
     for what, given, names in (("robot", kinds, KINDS), ("fault", faults, known)):
         for name in given:
             if name not in names:
                 raise UnknownNameError(what, name, names)
     return [
-        (kind, known[fault], seed) for fault in faults or known for seed in seeds for kind in kinds or KINDS
+        (kind, known[fault], seed)
+        for fault in faults or usual
+        for seed in seeds
+        for kind in kinds or KINDS
+        if (shared := _shared(fault)) is None or has_shared(kind, shared)
     ]
 
 
@@ -75,18 +86,19 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
 
     Args:
         kind: A name in `KINDS`.
-        fault: A name in `FAULTS`, or "".
+        fault: A name in `FAULTS` or `SHARED`, or "".
         seed: Of the truth, and of everything random in the calibration.
         budget: What a search may use.
         threads: Simulation threads.
     """
-    robot = make_robot(kind, seed, _fault(fault))
+    robot = make_robot(kind, seed, _fault(fault) or _shared(fault))
+    said: list[str] = []
     row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as name:
         model, fit, held_out = write(robot, Path(name))
         config = CalibrateSettings(recordings=Recordings(model=model, data=tuple(fit)), holdout=(held_out,))
         try:
-            work = prepare(config)
+            work = prepare(config, say=said.append)
             method = usual_method(config, work)
             result = calibrate_episodes(
                 work.robot,
@@ -97,15 +109,22 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
                 budget=budget,
                 rng=np.random.default_rng(seed),
                 threads=threads,
+                progress=_ends_when_named if _shared(fault) else None,
             )
+        except _NamedError as end:
+            said.append(str(end))
+            row |= {"colour": "said", "named": names(kind, fault, [], said), "said": said}
+            return row
         except DealHwError as err:
             # Refused before any work: as good as red, if it says why.
-            return row | {"colour": "refused", "named": names(fault, [], [str(err)]), "refusal": str(err)}
+            named = names(kind, fault, [], [str(err)])
+            return row | {"colour": "refused", "named": named, "refusal": str(err)}
     causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[: SETTINGS.causes]]
     return row | {
         "causes": causes,
         "colour": trust(result).colour,
-        "named": names(fault, causes, [*map(str, result.alarms), *work.telemetry]),
+        "named": names(kind, fault, causes, [*map(str, result.alarms), *work.telemetry, *said]),
+        "said": said,
         "alarms": [str(alarm) for alarm in result.alarms],
         "search": result.provenance.get("search", ""),
         "chi2": result.chi2,
@@ -120,14 +139,30 @@ def _fault(name: str) -> Fault | None:
     return next((fault for fault in FAULTS if fault == name), None)
 
 
-def names(fault: str, causes: Sequence[str], sentences: Sequence[str]) -> bool:
+def _shared(name: str) -> SharedFault | None:
+    return next((fault for fault in SHARED if fault == name), None)
+
+
+class _NamedError(Exception):
+    """A calibration has said what is wrong with the recordings; what it finds after that says no more."""
+
+
+def _ends_when_named(progress: Progress) -> None:
+    if progress.stage == BEFORE_SEARCH and "alike" in progress.message:
+        raise _NamedError(progress.message)
+
+
+def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]) -> bool:
     """Return whether the fault was named; True where there is none.
 
     Args:
-        fault: A name in `FAULTS`, or "".
+        kind: A name in `KINDS`.
+        fault: A name in `FAULTS` or `SHARED`, or "".
         causes: The causes that alarms name, the likeliest first.
         sentences: Refusals, warnings and alarms.
     """
+    if (shared := _shared(fault)) is not None:
+        return any(words in text for words in shared_words(kind, shared) for text in sentences)
     known = _fault(fault)
     if known is None:
         return True
@@ -169,17 +204,19 @@ def line(row: Mapping[str, Any]) -> str:
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a line for each fault: colours, how often it was named."""
     found = []
-    for fault in (RIGHT, *FAULTS):
+    for fault in (RIGHT, *FAULTS, *SHARED):
         mine = [r for r in rows if r["fault"] == fault and not r["error"]]
         if not mine:
             continue
         colours = [str(r["colour"]) for r in mine]
         counts = ", ".join(
-            f"{colours.count(c)} {c}" for c in ("green", "amber", "red", "refused") if c in colours
+            f"{colours.count(c)} {c}" for c in ("green", "amber", "red", "said", "refused") if c in colours
         )
-        words = f"{fault}: {FAULTS[known]}" if (known := _fault(fault)) else "the model is right"
+        shared = _shared(fault)
+        known = SHARED[shared][0] if shared else FAULTS[own] if (own := _fault(fault)) else ""
+        words = f"{fault}: {known}" if known else "the model is right"
         text = f"{words}: {len(mine)} robots, {counts}"
-        if known:
+        if fault:
             text += f"; named {sum(bool(r['named']) for r in mine)} times"
         else:
             held = [r["coverage90"] for r in mine if r.get("coverage90") is not None]

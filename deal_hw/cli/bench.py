@@ -82,7 +82,9 @@ class Bench:
     cart-pole, torque-arm, so101, go2-suspended; verdict: pendulum, double-pendulum, arm, cart-pole, leg."""
 
     faults: Annotated[str, Only(("verdict",))] = ""
-    """Faults, comma separated (none, friction, backlash, jitter, mass, sign); by default all."""
+    """Faults, comma separated; by default none, friction, backlash, jitter, mass, sign. Faults of recordings
+    that commands and measurements share: mirrored, swapped, fast-clock, slow-clock, degrees, doubled,
+    doubled-joint; these calibrations end when they have said which."""
 
     task: Annotated[str, TASKS] = "cartpole"
     """Tasks, comma separated: cartpole, ant, humanoid, go2, allegro."""

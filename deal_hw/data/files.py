@@ -161,5 +161,6 @@ def episode_of(path: Path | str) -> Path:
     files = sorted((dataset_of(path) / "episodes").glob("*.mcap"))
     if len(files) == 1:
         return files[0]
-    example = files[0] if files else dataset_of(path) / "episodes" / "000000.mcap"
-    raise DatasetError(f"{path} is a folder with {len(files)} episodes; name one of them, such as {example}")
+    if not files:
+        raise DatasetError(f"{path} is a folder without an episode; record one with `deal-hw collect`")
+    raise DatasetError(f"{path} is a folder with {len(files)} episodes; name one of them, such as {files[0]}")

@@ -18,6 +18,9 @@ from deal_hw.errors import UnknownNameError
 from deal_hw.types import FloatArray
 
 Fault = Literal["friction", "backlash", "jitter", "mass", "sign"]
+SharedFault = Literal[
+    "mirrored", "swapped", "fast-clock", "slow-clock", "degrees", "doubled", "doubled-joint"
+]
 
 FAULTS: Mapping[Fault, str] = {
     "friction": "dry friction is four times as high at rest and falls with speed (Stribeck)",
@@ -27,6 +30,21 @@ FAULTS: Mapping[Fault, str] = {
     "sign": "the last servo turns the other way",
 }
 """Faults by name, as they are described to people."""
+
+SHARED: Mapping[SharedFault, tuple[str, ...]] = {
+    "mirrored": ("the last joint has the other sign", "the sign of {last}", "{last} hangs against gravity"),
+    "swapped": ("the last two joints are swapped", "{before} and {last} were swapped"),
+    "fast-clock": ("the clock runs twice as fast", "the clock were 2 times too fast"),
+    "slow-clock": ("the clock runs half as fast", "the clock were 2 times too slow"),
+    "degrees": (
+        "the last joint is in degrees",
+        "positions of {last} were in degrees",
+        "{last}: positions reach",
+    ),
+    "doubled": ("all positions are doubled", "{all} were multiplied by 2"),
+    "doubled-joint": ("the last joint's positions are doubled", "positions of {last} were multiplied by 2"),
+}
+"""Faults of recordings that commands and measurements share: in words, and what names them to the user."""
 
 CAUSES: Mapping[Fault, tuple[str, ...]] = {
     "friction": ("friction",),
@@ -129,7 +147,7 @@ class PlainRobot:
         robot: MJCF of the robot.
         truth: The robot's values by the names that ``deal-hw calibrate --model`` gives them.
         delay_s: Mean delay of the commands, a whole number of physics steps [s].
-        fault: What the model lacks, or None.
+        fault: What the model lacks, or what is wrong with its recordings, or None.
         seed: Drew the truth; draws motions and noise.
     """
 
@@ -138,11 +156,11 @@ class PlainRobot:
     robot: str
     truth: Mapping[str, float]
     delay_s: float
-    fault: Fault | None
+    fault: Fault | SharedFault | None
     seed: int
 
 
-def make_robot(kind: str, seed: int, fault: Fault | None = None) -> PlainRobot:
+def make_robot(kind: str, seed: int, fault: Fault | SharedFault | None = None) -> PlainRobot:
     """Return a robot with a truth of its own.
 
     Raises:
@@ -238,6 +256,7 @@ def record(robot: PlainRobot, number: int, seconds: float) -> str:
             data.qfrc_applied[dof] = -extra * np.tanh(speed / 0.01)
         mujoco.mj_step(model, data)
     measured = positions + NOISE * rng.standard_normal(positions.shape)
+    time, measured, commands = _shared(robot.fault, time, measured, commands)
     names = [model.joint(i).name for i in range(model.njnt)]
     moved = [model.joint(int(i)).name for i in joint]
     header = ",".join(["time", *names, *(f"{name}.command" for name in moved)])
@@ -246,6 +265,38 @@ def record(robot: PlainRobot, number: int, seconds: float) -> str:
         for t, position, command in zip(time, measured, commands, strict=True)
     ]
     return "\n".join([header, *lines]) + "\n"
+
+
+def _shared(
+    fault: str | None, time: FloatArray, measured: FloatArray, commands: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a recording with what commands and measurements share; a free last joint has no command."""
+    time, measured, commands = time.copy(), measured.copy(), commands.copy()
+    last = [measured[:, -1], *([commands[:, -1]] if commands.shape == measured.shape else [])]
+    factors = {"mirrored": -1.0, "degrees": 180 / np.pi, "doubled-joint": 2.0}
+    for values in last:
+        values *= factors.get(fault or "", 1.0)
+    if fault == "swapped":
+        measured[:, -2:], commands[:, -2:] = measured[:, :-3:-1].copy(), commands[:, :-3:-1].copy()
+    if fault == "doubled":
+        measured, commands = 2 * measured, 2 * commands
+    return time * {"fast-clock": 2.0, "slow-clock": 0.5}.get(fault or "", 1.0), measured, commands
+
+
+def has_shared(kind: str, fault: SharedFault) -> bool:
+    """Return whether a robot has joints enough, and of one sort, for a fault of its recordings."""
+    joints = KINDS[kind].joints
+    if fault == "swapped":
+        return len(joints) > 1 and all(joint.kp for joint in joints[-2:])
+    return fault != "doubled-joint" or len(joints) > 1
+
+
+def shared_words(kind: str, fault: SharedFault) -> tuple[str, ...]:
+    """Return phrases one of which a calibration says where it names a fault of the recordings."""
+    names = [joint.name for joint in KINDS[kind].joints]
+    every = f"positions of {names[0]}" if len(names) == 1 else "all positions"
+    before = names[max(len(names) - 2, 0)]
+    return tuple(words.format(last=names[-1], before=before, all=every) for words in SHARED[fault][1:])
 
 
 def _motion(rng: np.random.Generator, time: FloatArray, count: int) -> FloatArray:

@@ -75,7 +75,7 @@ def test_a_fault_is_named_by_its_cause_only(
     fault: str, causes: list[str], sentences: list[str], named: bool
 ) -> None:
     """A sentence that lists all usual causes names none."""
-    assert names(fault, causes, sentences) is named
+    assert names("pendulum", fault, causes, sentences) is named
 
 
 def test_cells_begin_with_right_models() -> None:

@@ -212,6 +212,36 @@ SETTINGS: Lines = [
     ("demo --out folder/../run", "does not hold a former demo; name another folder with --out"),
     ("emulate go2 --transport zenoh --port tcp/192.0.2.1:0 --duration-s 0", "port 'tcp/192.0.2.1:0': "),
 ]
+NO_EFFECT = "would have no effect: a dataset says it; that goes with --model and --data"
+REVIEWED: Lines = [
+    ("calibrate run/dataset --parameters nothere.yaml", f"--parameters {NO_EFFECT}"),
+    ("calibrate run/dataset --columns nothere.yaml", f"--columns {NO_EFFECT}"),
+    ("calibrate run/dataset --leave-out nosuch 0 99", f"--leave-out {NO_EFFECT}"),
+    ("calibrate run/dataset --fit-seconds 2", f"--fit-seconds {NO_EFFECT}"),
+    ("calibrate run/dataset --feet toe", f"--feet {NO_EFFECT}"),
+    ("calibrate run/dataset --holdout-part 0.3", f"--holdout-part {NO_EFFECT}"),
+    (f"{MODEL} rec.csv --parameters nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
+    (f"{MODEL} rec.csv --columns nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
+    (f"{MODEL} rec.csv --leave-out nosuch 0 99", "no such recording; they are rec.csv"),
+    ("deploy cartpole --port p --velocity 0.1,0,0", "only robots with legs take that, and robot 'cartpole'"),
+    ("collect cartpole --port p --out o --profile chirp --excite multisine", "leave one of the two out"),
+    ("inspect nothere.mcap", "nothere.mcap cannot be read: there is no such file"),
+    ("inspect blank", "blank is a folder without an episode; record one with `deal-hw collect`"),
+    (
+        "inspect run/dataset/episodes/000000.mcap --screenshot x.jpg",
+        "x.jpg does not end in .png; name it x.png",
+    ),
+    ("calibrate run --episodes 7", "dataset run/dataset has 1 episodes; there is no number 7"),
+    ("train --udr --distribution scale.json", "--distribution and --udr exclude each other: leave one"),
+    (
+        "calibrate",
+        "or a model and its recordings (deal-hw calibrate --model robot.xml --data rec.csv), one of",
+    ),
+    ("deploy cartpole --port /dev/null", "/dev/null cannot be opened as a serial port: it is a file or"),
+    ("collect cartpole --port /dev/null --out o", "another device; ports at hand"),
+    ("doctor cartpole", "name a robot and its port, such as `deal-hw doctor go2 --port enp2s0`, or neither"),
+]
+"""What a review found to be accepted in silence, or refused without a hint."""
 DATA: Lines = [
     ("data export blank --out o", "no recording to export"),
     ("data export run/dataset --out text.txt", "text.txt cannot be written: Not a directory"),
@@ -247,10 +277,53 @@ COLUMNS: Lines = [
 ]
 
 
-@pytest.mark.parametrize(("line", "words"), [*SETTINGS, *DATA], ids=lambda text: text[:60])
+@pytest.mark.parametrize(("line", "words"), [*SETTINGS, *REVIEWED, *DATA], ids=lambda text: text[:60])
 def test_a_line_that_cannot_be_is_refused(line: str, words: str, refused: Callable[[str, str], None]) -> None:
     """A setting, a file or a robot that is not what the verb needs."""
     refused(line, words)
+
+
+def test_a_folder_with_one_episode_stands_for_it(
+    place: Path, refused: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`inspect DATASET` goes on to what lacks, a desktop, and not to "Is a directory"."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for folder in ("run", "run/dataset"):
+        refused(f"inspect {folder}", "there is no desktop to open a window on; use --web and a browser")
+
+
+def test_a_policy_of_another_robot_is_refused_in_short(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What differs is named, lists by their first entries, and what to give: 1,500 characters before."""
+    monkeypatch.chdir(place)
+    policy = shipped.shipped_policy("cartpole")
+    assert main(["deploy", "go2", "--port", "lo", "--policy", str(policy)]) == EXIT_ERROR
+    said = capsys.readouterr().err
+    assert "policy has 'cartpole', robot has 'go2'" in said and "trained for 'go2'" in said
+    assert len(said) < 600 and len(said.splitlines()) == 1
+
+
+def test_a_recording_too_short_to_calibrate_is_told_before_it_is_made(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`collect --seconds 1` says what calibrate needs."""
+    monkeypatch.chdir(place)
+    assert main(shlex.split("collect cartpole --port p --out o --seconds 1")) == EXIT_ERROR
+    said = capsys.readouterr().err
+    assert "too short for `deal-hw calibrate`" in said and "(--seconds 4)" in said
+
+
+def test_a_quiet_calibration_prints_nothing(
+    place: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither results nor what was guessed: errors alone are printed."""
+    monkeypatch.chdir(place)
+    line = f"calibrate --model arm.xml --data rec.csv --out {tmp_path} --method nominal --quiet --no-report"
+    assert main([*shlex.split(line), "--no-advise", "--threads", "1"]) == 0
+    said = capsys.readouterr()
+    assert said.out == "" and said.err == ""
 
 
 @pytest.mark.parametrize(("entry", "words"), ENTRIES)

@@ -135,6 +135,61 @@ def test_degrees(make_table: MakeTable) -> None:
     assert found.severity is Severity.FAIL and "degrees" in found.message
 
 
+def test_degrees_of_a_joint_without_limits(make_table: MakeTable) -> None:
+    """A servo's joint that turns 23 rad may be in degrees: a warning. A free one, or a wheel, may turn so."""
+    sound = make_table()
+    free = np.array([[-np.inf, np.inf]] * 3)
+    wide = {name: 40 * getattr(sound, name) for name in ("position", "target")}
+    found = verdict(make_table(**wide), "limits", free)
+    assert found.severity is Severity.WARN and "in degrees?" in found.message and "hip 23" in found.message
+    assert verdict(sound, "limits", free).severity is Severity.OK
+    wheel = make_table(position=wide["position"], target=np.roll(sound.target, 150, axis=0)[:, ::-1])
+    assert verdict(wheel, "limits", free).severity is Severity.OK
+
+
+def test_a_free_joint_without_limits_may_turn(make_table: MakeTable) -> None:
+    """The pole of a cart that turned over: 51 rad are no degrees; with a motor, or limits, they may be."""
+    sound = make_table()
+    position = sound.position * [1, 1, 80]
+    pole = {"position": position, "actuated": ("hip", "knee"), "target": sound.target[:, :2]}
+    free = np.array([*LIMITS[:2], [-np.inf, np.inf]])
+    assert verdict(make_table(**pole), "units", free).severity is Severity.OK
+    assert verdict(make_table(**pole), "units", LIMITS).severity is Severity.FAIL
+    motor = make_table(position=position, target=sound.target * [1, 1, 80])
+    assert verdict(motor, "units", free).severity is Severity.FAIL
+
+
+@pytest.mark.parametrize(
+    ("factors", "clock", "words"),
+    [
+        ((1.0, 1.2, 0.8), 1.0, ""),
+        ((57.3, 57.3, 57.3), 1.0, "degrees and radians"),
+        ((1.0, 1 / 57.3, 1.0), 1.0, "degrees and radians"),
+        ((1.0, -1.0, 1.0), 1.0, "sign"),
+        ((1.0, 0.5, 1.0), 1.0, "unit of its positions"),
+        ((1.0, 1.0, 1.0), 2.0, "is the clock right"),
+        ((1.0, 1.0, 1.0), 0.5, "is the clock right"),
+    ],
+)
+def test_velocities_are_slopes(
+    make_table: MakeTable, factors: tuple[float, ...], clock: float, words: str
+) -> None:
+    """Another unit, sign or clock is a warning that says by how much; a fifth is a filter's."""
+    sound = make_table()
+    velocity = np.gradient(sound.position, sound.time_s, axis=0) * factors
+    time_s = clock * sound.time_s
+    found = verdict(make_table(velocity=velocity, time_s=time_s, command_s=time_s), "velocity")
+    assert found.severity is (Severity.WARN if words else Severity.OK) and words in found.message
+
+
+def test_velocities_of_noise_say_nothing(make_table: MakeTable) -> None:
+    """Velocities that are not like the slopes, not numbers, or constant, are not compared."""
+    rng = np.random.default_rng(0)
+    shape = make_table().position.shape
+    for velocity in (rng.normal(size=shape), np.full(shape, np.nan), np.zeros(shape)):
+        assert verdict(make_table(velocity=velocity), "velocity").severity is Severity.OK
+
+
 def test_millimetres(make_table: MakeTable) -> None:
     """A slide's command in mm against its measurement in m is refused by the factor of 1000."""
     sound = make_table()

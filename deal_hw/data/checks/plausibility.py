@@ -15,6 +15,7 @@ import numpy as np
 
 from deal_hw.data.checks.joint_match import match
 from deal_hw.data.checks.slip import slip_verdict
+from deal_hw.data.checks.speed import speed_verdict
 from deal_hw.data.importing.table import Table
 from deal_hw.data.recording.spikes import DEFAULT_SPIKES, SpikeSettings, find_spikes, sound
 from deal_hw.data.recording.telemetry_checks import CheckResult, Severity, spikes_verdict
@@ -36,6 +37,10 @@ FROZEN_S = 0.5
 DEGREES = 180 / np.pi
 SCALE_TOLERANCE = 0.25
 """A ratio of spans this near to a known factor is taken for it."""
+FURTHEST = 2 * np.pi
+"""A servo's joint without limits seldom turns farther [rad]."""
+FOLLOWS = 0.8
+"""Correlation from which on a joint follows its command [-]."""
 OUTSIDE = 0.05
 """Share of the limits' span by which positions may lie outside (compliance, a soft stop)."""
 FLAT = 0.1
@@ -68,7 +73,7 @@ def examine(
         return (*first, rate)
     jumps = spikes_verdict(table.time_s, table.position, table.joint_names, table.units, spikes)
     table = despiked(table, spikes)
-    middle = [rate, _gaps(clock), jumps, _frozen(table), _commands(table)]
+    middle = [rate, _gaps(clock), jumps, _frozen(table), speed_verdict(table), _commands(table)]
     if not table.command_s.size:
         return (*first, *middle)
     return (
@@ -379,6 +384,9 @@ def _beyond_limits(table: Table, limits: FloatArray | None) -> list[str]:
         low, high = (-np.inf, np.inf) if limits is None else limits[index]
         reach = float(np.nanmax(np.abs(values)))
         bounded = np.isfinite(low) and np.isfinite(high)
+        if not bounded and index not in table.actuated_index:
+            # A pole may turn over and over.
+            continue
         furthest = max(abs(low), abs(high)) if bounded else 4 * np.pi
         if table.units[index] == "rad" and reach > 3 * furthest and reach < 1000:
             kind = f"degrees, or {_normal_range(values)}" if reach <= 105 else "degrees"
@@ -417,6 +425,19 @@ def _inside_limits(table: Table, limits: FloatArray | None) -> CheckResult:
             span = f"{np.nanmin(table.position[:, index]):.3g}..{np.nanmax(table.position[:, index]):.3g}"
             found.append(f"{name} {outside:.0%} of the time ({span}, the model has {low:.3g}..{high:.3g})")
             severe |= outside > 0.5
+    held = held_target(table)
+    far = [
+        f"{name} {reach:.3g} rad"
+        for column, (name, index) in enumerate(zip(table.actuated, table.actuated_index, strict=True))
+        if table.units[index] == "rad"
+        and not np.isfinite(limits[index]).all()
+        # A wheel does not follow its effort.
+        and _correlation(held[:, column], table.position[:, index]) > FOLLOWS
+        and (reach := float(np.nanmax(np.abs(table.position[:, index])))) > FURTHEST
+    ]
+    if not found and far:
+        text = f"joints without limits that turn more than once: {', '.join(far)}; in degrees?"
+        return _verdict("limits", Severity.WARN, text)
     if not found:
         return _verdict("limits", Severity.OK, "positions lie inside the model's limits")
     text = (

@@ -28,6 +28,7 @@ MOTOR_CHECKS = (
     "gaps",
     "spikes",
     "frozen",
+    "velocity",
     "limits",
     "orientation",
     "actuation",

@@ -209,10 +209,11 @@ def check_source(*, dataset: bool, model: bool) -> None:
         ConfigurationError: There is none, or two.
     """
     if dataset == model:
+        how = "not both" if dataset else "one of the two"
         raise ConfigurationError(
             "name a dataset (deal-hw calibrate runs/first/dataset), or a model and its recordings "
-            "(deal-hw calibrate --model robot.xml --data rec.csv), not both; in Python dataset=..., or "
-            "model=... and data=[...]"
+            f"(deal-hw calibrate --model robot.xml --data rec.csv), {how}; "
+            "in Python dataset=..., or model=... and data=[...]"
         )
 
 

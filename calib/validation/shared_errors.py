@@ -1,0 +1,308 @@
+"""Errors that commands and measurements share: a sign, two joints' order, a unit, a scale, the clock.
+
+No comparison of the two channels shows them. What can is the model: gravity, what joints do to each other,
+and how fast masses move. So each error is undone in turn, and the model is fitted to recordings without it.
+The one that then predicts motion that no fit has seen, where the recordings as they are cannot be predicted,
+is named. Many cannot be told: parameters or a symmetry take them up (docs/explanation/calibration.md).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from deal_hw.calib.data.channel_change import ChannelChange
+from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
+from deal_hw.calib.uncertainty.intervals import MISMATCH
+from deal_hw.calibration import Alarm
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.sim.recordings.parts import spread, stretches
+from deal_hw.types import FloatArray
+
+Kind = Literal["sign", "order", "clock", "unit", "scale"]
+
+DEGREES = 180 / math.pi
+UNITS = {"rad": (1 / DEGREES, "degrees", "deg"), "m": (1e-3, "millimetres", "mm")}
+"""What a value is multiplied by that was written in the unit named, and how a column map writes that unit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SharedErrorSettings:
+    """Settings of :func:`find_shared_error`.
+
+    Attributes:
+        factor: Clocks and positions are tried so many times as fast or large, and one part of that [-].
+        stretch_s: Recordings are divided into stretches of this length [s]: every other one is predicted,
+        part_s: and so much of them, evenly spread, is fitted and as much predicted [s].
+        window_s: Windows of the fits [s]; windows of other clocks have as many samples.
+        tried: So many candidates are fitted, those that the model's own values predict best.
+        iterations: Most steps of each fit.
+        evidence: Held-out deviance that a candidate must gain [-], as in the diagnosis,
+        decisive: and the share of the held-out squared residual that it must explain [-];
+        noticed: where it leaves nothing but noise, so much is enough [-].
+        alike: Candidates are named together whose held-out squared residual is within this factor of the
+            best one's [-].
+    """
+
+    factor: float = 2.0
+    stretch_s: float = 1.0
+    part_s: float = 4.0
+    window_s: float = 0.2
+    tried: int = 5
+    iterations: int = 8
+    evidence: float = 20.0
+    decisive: float = 0.5
+    noticed: float = 0.2
+    alike: float = 1.1
+
+
+SETTINGS = SharedErrorSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class SharedError:
+    """An error that commands and measurements may share.
+
+    Attributes:
+        kind: What is wrong.
+        joints: At which joints; none for the clock.
+        undo: What would mend the recordings.
+        words: The error, such as "positions of elbow were in degrees".
+        do: How to mend it.
+    """
+
+    kind: Kind
+    joints: tuple[str, ...]
+    undo: ChannelChange
+    words: str
+    do: str
+
+
+@dataclass(frozen=True, slots=True)
+class FoundError:
+    """A shared error without which the recordings are predicted far better.
+
+    Attributes:
+        errors: The error, and those that predict as well.
+        chi2: Mean squared residual over the noise's without it, on motion that was not fitted.
+        before: The same of the recordings as they are.
+        deviance: Held-out deviance that undoing it gains.
+        test: The recordings as they are, on that motion.
+        length: Samples of a window.
+    """
+
+    errors: tuple[SharedError, ...]
+    chi2: float
+    before: float
+    deviance: float
+    test: Problem
+    length: int
+
+    @property
+    def alarm(self) -> Alarm:
+        """For people."""
+        words = ", or ".join(error.words for error in self.errors)
+        before = f"instead of {self.before:.3g}" if np.isfinite(self.before) else "where it diverged before"
+        return Alarm(
+            f"The recordings look as if {words}, in commands and measurements alike: mended, motion that was "
+            f"not fitted is predicted with chi2 {self.chi2:.3g} {before}.",
+            "The parameters would make up for that error; no comparison of the two channels shows it.",
+            f"{' Or: '.join(error.do for error in self.errors)} Check it at the robot.",
+        )
+
+    def confirmed(self, theta: FloatArray, latency_s: float) -> bool:
+        """Return whether an estimate predicts the recordings as they are no better than that.
+
+        Args:
+            theta: Physical parameters, (K,).
+            latency_s: Total latency [s].
+        """
+        chi2 = _predicted(self.test, theta, latency_s, self.length)[0]
+        return _decides(chi2, self.chi2, _samples(self.test, self.length))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "errors": [{"kind": e.kind, "joints": list(e.joints), "words": e.words} for e in self.errors],
+            "chi2": self.chi2,
+            "chi2_as_recorded": self.before if np.isfinite(self.before) else None,
+            "deviance": self.deviance if np.isfinite(self.deviance) else None,
+        }
+
+
+def shared_errors(problem: Problem) -> Iterator[SharedError]:
+    """Yield the errors that a recording of a robot may have in both channels.
+
+    Args:
+        problem: The problem.
+    """
+    facts = problem.robot.description
+    names, units, J = facts.joint_names, facts.position_units, len(facts.joint_names)
+    same = ChannelChange.none(J)
+
+    def scaled(factor: float, joints: Sequence[int]) -> ChannelChange:
+        scale = tuple(factor if j in joints else 1.0 for j in range(J))
+        return ChannelChange(source=same.source, scale=scale)
+
+    for j, name in enumerate(names):
+        yield SharedError(
+            "sign",
+            (name,),
+            scaled(-1.0, [j]),
+            f"the sign of {name} were turned",
+            f"Set sign: -1 for {name} in the column map.",
+        )
+    for i, j in itertools.combinations(range(J), 2):
+        if units[i] == units[j] and (i in facts.actuated_index) == (j in facts.actuated_index):
+            source = list(same.source)
+            source[i], source[j] = j, i
+            yield SharedError(
+                "order",
+                (names[i], names[j]),
+                ChannelChange(source=tuple(source), scale=same.scale),
+                f"{names[i]} and {names[j]} were swapped",
+                f"Change the columns of {names[i]} and {names[j]} in the column map.",
+            )
+    f = SETTINGS.factor
+    for clock, words in (
+        (1 / f, f"the clock were {f:g} times too fast"),
+        (f, f"the clock were {f:g} times too slow"),
+    ):
+        undo = ChannelChange(source=same.source, scale=same.scale, clock=clock)
+        yield SharedError("clock", (), undo, words, f"Multiply all times by {clock:g}.")
+    single = [(j,) for j in range(J)]
+    alike = [tuple(j for j in range(J) if units[j] == unit) for unit in units]
+    for group in dict.fromkeys((*single, *alike)):
+        where, of, at = _where(names, group)
+        factor, unit, short = UNITS[units[group[0]]]
+        yield SharedError(
+            "unit",
+            at,
+            scaled(factor, group),
+            f"{where} were in {unit}",
+            f"Set unit: {short}{of} in the column map.",
+        )
+        yield SharedError(
+            "unit",
+            at,
+            scaled(1 / factor, group),
+            f"{where} were converted from {unit}, and had not been in {unit}",
+            f"Set unit: {units[group[0]]}{of} in the column map.",
+        )
+    for group in dict.fromkeys((*single, tuple(range(J)))):
+        where, of, at = _where(names, group)
+        for scale in (1 / f, f):
+            yield SharedError(
+                "scale",
+                at,
+                scaled(scale, group),
+                f"{where} were multiplied by {1 / scale:g}",
+                f"Multiply commands and positions{of} by {scale:g}.",
+            )
+
+
+def _where(names: Sequence[str], group: Sequence[int]) -> tuple[str, str, tuple[str, ...]]:
+    """Return whose positions, which of them, and the names of a group of joints."""
+    at = tuple(names[j] for j in group)
+    if len(group) == len(names) > 1:
+        return "all positions", "", at
+    return f"positions of {', '.join(at)}", f" for {', '.join(at)}", at
+
+
+def find_shared_error(problem: Problem, local: Refined | None) -> FoundError | None:
+    """Return the error without which recordings are predicted that cannot be predicted as they are.
+
+    Args:
+        problem: The problem.
+        local: The fit of the recordings as they are; None where it diverged.
+    """
+    if problem.robot.base is not None or problem.noise_free:
+        return None
+    settings = SETTINGS
+    parts = [s for e in problem.episodes for s in stretches(e, settings.stretch_s) if s.usable.any()]
+    seen, unseen = (spread(parts[k::2], settings.part_s) for k in (0, 1))
+    length = samples_in(problem, settings.window_s)
+    same = ChannelChange.none(len(problem.robot.description.joint_names))
+    if not unseen:
+        return None
+    try:
+        test = same.on(problem, unseen)
+        count = _samples(test, length)
+        as_recorded = _fitted(problem, same, seen, unseen, length)
+        if local is not None:
+            as_recorded = min(as_recorded, _predicted(test, local.theta, local.latency_s, length)[0])
+    except InsufficientDataError:
+        return None
+    ranked = sorted(shared_errors(problem), key=lambda e: _screened(problem, e.undo, seen, length))
+    found = {e: _fitted(problem, e.undo, seen, unseen, length) for e in ranked[: settings.tried]}
+    best = min(found, key=lambda e: found[e])
+    if not _decides(as_recorded, found[best], count):
+        return None
+    alike = sorted((e for e in found if found[e] <= settings.alike * found[best]), key=lambda e: found[e])
+    deviance = count * math.log(as_recorded / found[best])
+    return FoundError(tuple(alike), found[best], as_recorded, deviance, test, length)
+
+
+def _decides(before: float, after: float, count: int) -> bool:
+    """Return whether a candidate predicts so much better that it is named."""
+    settings = SETTINGS
+    share = settings.noticed if after <= MISMATCH.chi2 else settings.decisive
+    if not np.isfinite(after) or not after < (1 - share) * before:
+        return False
+    return not np.isfinite(before) or count * math.log(before / after) > settings.evidence
+
+
+def _samples(test: Problem, length: int) -> int:
+    return sum(data.measured.size for data in test.windows(length))
+
+
+def _screened(
+    problem: Problem, change: ChannelChange, episodes: Sequence[SampledEpisode], length: int
+) -> float:
+    """Return how far the model's own values are off recordings so changed, in most samples."""
+    try:
+        changed = change.on(problem, episodes)
+        every = []
+        for data in changed.windows(length):
+            nominal, latency_s = problem.space.nominal[None], np.array([problem.first_latency_s])
+            predicted = changed.predict(nominal, latency_s, data).observed[0]
+            every.append(np.abs(predicted - data.measured).ravel() / data.std.ravel())
+    except InsufficientDataError:
+        return math.inf
+    return float(np.median(np.nan_to_num(np.concatenate(every), nan=np.inf)))
+
+
+def _fitted(
+    problem: Problem,
+    change: ChannelChange,
+    seen: Sequence[SampledEpisode],
+    unseen: Sequence[SampledEpisode],
+    length: int,
+) -> float:
+    """Return the held-out chi2 of a fit to recordings so changed; infinite where simulations diverge."""
+    try:
+        train = change.on(problem, seen)
+        window_s = length * train.episodes[0].period_s
+        fit = refine(
+            train,
+            problem.space.nominal,
+            problem.first_latency_s,
+            (window_s,),
+            iterations=SETTINGS.iterations,
+            fixed_latency=problem.fixed_latency_s is not None,
+        )
+        return _predicted(change.on(problem, unseen), fit.theta, fit.latency_s, length)[0]
+    except (InsufficientDataError, CalibrationError):
+        return math.inf
+
+
+def _predicted(test: Problem, theta: FloatArray, latency_s: float, length: int) -> tuple[float, int]:
+    found = at_parameters(test, theta, latency_s, length)
+    return (found.chi2 if np.isfinite(found.chi2) else math.inf), found.normal.count

@@ -1,0 +1,183 @@
+"""Errors that commands and measurements share: changes of channels, and which of them are named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deal_hw.calib.data.channel_change import ChannelChange
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import local_fit, refine
+from deal_hw.calib.validation.shared_errors import find_shared_error, shared_errors
+from deal_hw.calib.validation.verdict import trust, unexplained
+from deal_hw.calibration import Budget, Progress
+from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
+from deal_hw.workflows.calibration.model import Recordings
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.settings import CalibrateSettings, prepare
+
+SAMPLES, JOINTS, ACTUATED = 7, 4, (0, 1, 3)
+
+
+def episode() -> SampledEpisode:
+    """Return a recording of four joints, the third without a motor."""
+    rng = np.random.default_rng(0)
+    sent = np.ones((SAMPLES, 3))
+    return SampledEpisode(
+        step_s=0.005,
+        sample=np.arange(SAMPLES),
+        position=rng.normal(size=(SAMPLES, JOINTS)),
+        velocity=rng.normal(size=(SAMPLES, JOINTS)),
+        target=rng.normal(size=(SAMPLES, 3)),
+        stiffness=sent,
+        damping=sent,
+        effort_limit=sent,
+        speed_limit=sent,
+        usable=np.ones(SAMPLES, dtype=bool),
+        start_setpoint=rng.normal(size=3),
+    )
+
+
+factors = st.sampled_from([-1.0, 0.5, 2.0, math.pi / 180, 180 / math.pi, -3.0])
+changes = st.builds(
+    ChannelChange,
+    # Motors change places among each other.
+    source=st.permutations(ACTUATED).map(lambda p: (p[0], p[1], 2, p[2])),
+    scale=st.tuples(*[factors] * JOINTS),
+    clock=st.sampled_from([0.5, 1.0, 2.0, 3.0]),
+)
+
+
+def same(a: SampledEpisode, b: SampledEpisode) -> bool:
+    """Return whether two recordings agree to rounding."""
+    names = ("position", "velocity", "target", "start_setpoint", "step_s")
+    return all(np.allclose(getattr(a, n), getattr(b, n), rtol=1e-9, atol=1e-12) for n in names)
+
+
+@given(changes, st.booleans())
+def test_a_change_undone_is_the_recording(change: ChannelChange, efforts: bool) -> None:
+    """The inverse undoes it, and is undone by it; both one after the other are no change."""
+    if efforts:
+        # Efforts take the sign only, which is its own inverse.
+        change = dataclasses.replace(change, clock=1.0)
+    recorded = episode()
+    changed = change.of(recorded, ACTUATED, efforts=efforts)
+    assert same(change.inverse.of(changed, ACTUATED, efforts=efforts), recorded)
+    none = change.then(change.inverse)
+    assert none.source == tuple(range(JOINTS))
+    assert np.allclose([*none.scale, none.clock], 1.0)
+    assert change.inverse.inverse.source == change.source
+
+
+@given(changes, changes)
+def test_two_changes_are_one(first: ChannelChange, second: ChannelChange) -> None:
+    """One after the other is the same as both as one."""
+    recorded = episode()
+    one_by_one = second.of(first.of(recorded, ACTUATED, efforts=False), ACTUATED, efforts=False)
+    assert same(first.then(second).of(recorded, ACTUATED, efforts=False), one_by_one)
+
+
+def test_a_change_takes_each_channel_of_a_joint_along() -> None:
+    """The joint without a motor has no command; a slower clock makes velocities smaller."""
+    recorded = episode()
+    change = ChannelChange(source=(1, 0, 2, 3), scale=(1.0, 1.0, -1.0, 2.0), clock=2.0)
+    found = change.of(recorded, ACTUATED, efforts=False)
+    assert np.array_equal(found.position[:, 0], recorded.position[:, 1])
+    assert np.array_equal(found.target[:, 0], recorded.target[:, 1])
+    assert np.array_equal(found.position[:, 2], -recorded.position[:, 2])
+    assert np.array_equal(found.target[:, 2], 2 * recorded.target[:, 2])
+    assert np.array_equal(found.velocity[:, 3], recorded.velocity[:, 3])
+    assert found.step_s == 0.01
+    efforts = change.of(recorded, ACTUATED, efforts=True)
+    assert np.array_equal(efforts.target[:, 2], recorded.target[:, 2])
+
+
+def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds: float = 4.0) -> Problem:
+    """Return the problem of a simulated robot's recordings."""
+    robot = make_robot(kind, 3, fault)
+    model, paths, held_out = write(robot, folder, seconds=seconds)
+    work = prepare(
+        CalibrateSettings(recordings=Recordings(model=model, data=tuple(paths)), holdout=(held_out,))
+    )
+    return Problem(work.robot, work.space, work.episodes, threads=1)
+
+
+def test_candidates_are_few_and_each_mends_what_it_says(tmp_path: Path) -> None:
+    """Two joints: two signs, one pair, two clocks, three groups of units, three of scales; all differ."""
+    found = list(shared_errors(problem("double-pendulum", None, tmp_path, 3.0)))
+    counts = {
+        kind: sum(e.kind == kind for e in found) for kind in ("sign", "order", "clock", "unit", "scale")
+    }
+    assert counts == {"sign": 2, "order": 1, "clock": 2, "unit": 6, "scale": 6}
+    assert len({e.undo for e in found}) == len({e.words for e in found}) == len(found)
+    degrees = next(e for e in found if e.words == "positions of elbow were in degrees")
+    assert degrees.undo.scale == pytest.approx((1.0, math.pi / 180)) and "unit: deg for elbow" in degrees.do
+
+
+def test_a_slide_is_in_millimetres_and_no_pair_of_a_hinge(tmp_path: Path) -> None:
+    """Cart-pole: units by joint, scales of one joint or both, no swap of a motor and a free joint."""
+    found = list(shared_errors(problem("cart-pole", None, tmp_path, 3.0)))
+    words = {e.words for e in found}
+    assert {
+        "positions of slide were in millimetres",
+        "positions of pole were in degrees",
+        "all positions were multiplied by 2",
+    } <= words
+    assert not any(e.kind == "order" for e in found)
+
+
+@pytest.mark.slow
+def test_a_right_recording_has_no_shared_error(tmp_path: Path) -> None:
+    """Nothing explains it better, although the mirror image explains it as well."""
+    right = problem("pendulum", None, tmp_path)
+    fit = refine(right, right.space.nominal, 0.0, (0.2,), iterations=8)
+    assert find_shared_error(right, fit) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["friction", "backlash"])
+def test_a_fault_of_the_robot_is_no_error_of_the_recording(fault: Fault, tmp_path: Path) -> None:
+    """The model does not explain these, and no change of the recordings mends that."""
+    wrong = problem("pendulum", fault, tmp_path)
+    fit = refine(wrong, wrong.space.nominal, 0.0, (0.2,), iterations=8)
+    assert unexplained(fit) and find_shared_error(wrong, fit) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["mirrored", "swapped"])
+def test_a_shared_error_is_named(fault: SharedFault, tmp_path: Path) -> None:
+    """A double pendulum: the error is named and the alarm says what to mend."""
+    wrong = problem("double-pendulum", fault, tmp_path)
+    found = find_shared_error(wrong, local_fit(wrong))
+    assert found is not None and found.chi2 < 1.3 < found.before
+    assert any(words in str(found.alarm) for words in shared_words("double-pendulum", fault))
+    assert found.to_json()["chi2_as_recorded"] == found.before
+
+
+@pytest.mark.slow
+def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
+    """A pendulum whose clock ran twice as fast: said before the search, the first alarm, the verdict."""
+    wrong = problem("pendulum", "fast-clock", tmp_path, 4.0)
+    said: list[Progress] = []
+    result = calibrate_episodes(
+        wrong.robot,
+        wrong.space,
+        wrong.episodes,
+        (),
+        method="default",
+        budget=Budget(population=8, generations=2),
+        rng=np.random.default_rng(0),
+        threads=1,
+        progress=said.append,
+    )
+    assert any("the clock were 2 times too fast" in p.message for p in said)
+    verdict = trust(result)
+    assert verdict.colour == "red" and "Multiply all times by 0.5" in verdict.do
+    assert result.provenance["shared_error"]["errors"][0]["kind"] == "clock"
