@@ -224,7 +224,7 @@ REVIEWED: Lines = [
     (f"{MODEL} rec.csv --columns nothere.yaml", "nothere.yaml cannot be read: there is no such file"),
     (f"{MODEL} rec.csv --leave-out nosuch 0 99", "no such recording; they are rec.csv"),
     ("deploy cartpole --port p --velocity 0.1,0,0", "only robots with legs take that, and robot 'cartpole'"),
-    ("collect cartpole --port p --out o --profile chirp --excite multisine", "leave one of the two out"),
+    ("collect cartpole --port p --out o --motion chirp --excite multisine", "leave one of the two out"),
     ("inspect nothere.mcap", "nothere.mcap cannot be read: there is no such file"),
     ("inspect blank", "blank is a folder without an episode; record one with `deal-hw collect`"),
     (
