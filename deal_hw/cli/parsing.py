@@ -73,7 +73,8 @@ class Rules:
         if field.default is False:
             marks.append(tyro.conf.FlagCreatePairsOff)
         text = field.helptext() if callable(field.helptext) else field.helptext
-        kind: Any = Annotated[(field.type, *marks)]
+        annotated = (field.type, *marks)
+        kind: Any = Annotated[annotated]
         return dataclasses.replace(field, type=kind, helptext=" ".join(text.split()) if text else text)
 
 
