@@ -66,6 +66,10 @@ LINES = (
     "data import fit.csv --out imported --robot arm.yaml",
     "data export dataset --out exported",
     "data export dataset --out exported --format foxglove",
+    "demo",
+    "demo --transport dynamixel",
+    "demo go2",
+    "demo go2 --on-stand",
     "bench loop",
     "bench go2-loop",
     "bench fixed-range --methods eki",
@@ -137,7 +141,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "steps": ("1000",),
     "task": ("ant",),
     "track_to": ("track.csv",),
-    "transport": ("serial",),
+    "transport": ("can",),
     "trainer": ("ppo",),
     "truth_from": ("truth.json",),
     "watch_save": ("watch.rrd",),
@@ -164,7 +168,7 @@ def cases() -> Iterator[Any]:
     for line in LINES:
         verb, *words = line.split()
         config = getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].config)
-        for option in options(sub_verb(config, words[0]), VALUES):
+        for option in options(sub_verb(config, words[0] if words else ""), VALUES):
             if option.name not in TOLD_ELSEWHERE and not {option.flag, *option.words[:1]} & set(words):
                 yield pytest.param(line, option, id=f"{line} {option.name}")
 
@@ -258,6 +262,19 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     # The model is the test's own: it needs no process that tries it first.
     monkeypatch.setattr("deal_hw.sim.engine.compiling._try", lambda path: None)
     experiment = types.SimpleNamespace(afresh=note("afresh"), space=None, refused=0)
+    demos = [importlib.import_module(f"deal_hw.cli.demo_{robot}") for robot in ("cartpole", "go2")]
+    emulated = contextlib.nullcontext(types.SimpleNamespace(port="p"))
+    files = {"distribution.json": Path("distribution.json")}
+    for demo in demos:
+        monkeypatch.setattr(demo, "EmulatorProcess", note("emulator", emulated))
+        monkeypatch.setattr(demo, "first_episode", note("first_episode", ends=True))
+        monkeypatch.setattr(
+            demo, "calibrate", note("calibrate", types.SimpleNamespace(files=files, result=None))
+        )
+        for name in ("collect", "train", "deploy"):
+            monkeypatch.setattr(demo, name, note(name, types.SimpleNamespace(episodes=())))
+    monkeypatch.setattr(demos[1], "on_floor", lambda distribution: distribution)
+    monkeypatch.setattr(demos[1], "trust", lambda result: types.SimpleNamespace(colour="green"))
     _calibrate(monkeypatch, did)
     for target in ("save_screenshot", "serve_web", "open_window", "check_display"):
         place = "deal_hw.viz.screenshot" if target == "save_screenshot" else "deal_hw.cli.inspect_"
@@ -345,7 +362,9 @@ def outcome(
             return error
         except SeenError:
             pass
-        files = {str(path.relative_to(folder)): contents(path) for path in folder.rglob("*")}
+        # The record of a run repeats the settings.
+        written = [path for path in folder.rglob("*") if path.name != "run.json"]
+        files = {str(path.relative_to(folder)): contents(path) for path in written}
         return (done.copy(), capsys.readouterr().out, files)
 
     return run
