@@ -20,6 +20,7 @@ from deal_hw.calib.uncertainty.intervals import SETTINGS as INTERVALS
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation_plan import (
+    OF_FAMILY,
     ExcitationDesign,
     ExcitationPlan,
     describe_design,
@@ -132,10 +133,11 @@ def options(design: ExcitationDesign) -> str:
     """Return the options of `deal-hw design-excitation` that make a design of the menu."""
     effort, speed = design.effort[0], design.speed[0]
     limits = f" --effort {effort:.3g} --speed {speed:.3g} --split 0" if (effort, speed) != (1.0, 1.0) else ""
-    return (
-        f"--family {design.family} --seconds {design.seconds:g} --amplitude {design.amplitude:g} "
-        f"--high-hz {design.high_hz:.3g}{limits} --seed {design.seed}"
-    )
+    own = OF_FAMILY[design.family]
+    high = f" --high-hz {design.high_hz:.3g}" if "high_hz" in own else ""
+    seed = f" --seed {design.seed}" if "seed" in own else ""
+    size = f"--seconds {design.seconds:g} --amplitude {design.amplitude:g}"
+    return f"--family {design.family} {size}{high}{limits}{seed}"
 
 
 def _variants(

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
@@ -40,6 +41,10 @@ _CHECKED = 1000
 """Moments of a run at which a signal is looked at before it is played."""
 Family = Literal["multisine", "chirp", "steps"]
 FAMILIES = get_args(Family)
+OF_FAMILY: Mapping[Family, tuple[str, ...]] = MappingProxyType(
+    {"multisine": ("low_hz", "high_hz", "seed"), "chirp": ("low_hz", "high_hz"), "steps": ("seed",)}
+)
+"""What of a design only some families have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

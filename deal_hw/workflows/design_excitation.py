@@ -12,6 +12,7 @@ import numpy as np
 from deal_hw.control.behaviours import Behaviour
 from deal_hw.control.excitation import RichBehaviour, RichConfig
 from deal_hw.control.excitation_plan import (
+    OF_FAMILY,
     ExcitationBehaviour,
     ExcitationDesign,
     ExcitationPlan,
@@ -38,15 +39,8 @@ if TYPE_CHECKING:
     from deal_hw.calib.design.excitation_search import Optimum
 
 BALANCE_S = 0.6
-_SINES = ("amplitude", "low_hz", "high_hz", "effort", "speed", "split")
-DESIGNS = {
-    "multisine": (*_SINES, "seed"),
-    "chirp": _SINES,
-    "steps": ("amplitude", "effort", "speed", "split", "seed"),
-    "sway": ("amplitude", "low_hz", "high_hz", "seed"),
-}
-"""What each family that is not searched can be told."""
-GIVEN_DESIGN = _SINES
+LIMITS = ("effort", "speed", "split")
+GIVEN_DESIGN = ("amplitude", "low_hz", "high_hz", *LIMITS)
 Notify = Callable[[int, int, str], None]
 SEARCH = ("calibration", "space", "range_ratio", "criterion", "draws", "confirm", "candidates", "rounds")
 
@@ -180,7 +174,10 @@ def run(config: ExcitationSettings, notify: Notify | None = None) -> ExcitationR
             given(config, default, (*SEARCH, "threads")),
             f"--family {config.family} is not searched; use --family optimal",
         )
-        others = [name for name in (*_SINES, "seed") if name not in DESIGNS[config.family]]
+        own = (
+            ("low_hz", "high_hz", "seed") if config.family == "sway" else (*LIMITS, *OF_FAMILY[config.family])
+        )
+        others = [name for name in (*GIVEN_DESIGN[1:], "seed") if name not in own]
         refuse(given(config, default, others), f"--family {config.family} has nothing of it")
         if config.effort == default.effort and config.speed == default.speed:
             refuse(given(config, default, ("split",)), "it says from when on --effort or --speed holds")
