@@ -259,8 +259,8 @@ def correlation_matrix(result: CalibrationResult) -> FloatArray | None:
     return np.asarray(result.covariance / np.maximum(np.outer(std, std), 1e-300))
 
 
-def correlations(matrix: FloatArray, names: Sequence[str]) -> Markup:
-    """Draw correlations, (K, K): rows and columns are numbered as the names are."""
+def correlations(matrix: FloatArray) -> Markup:
+    """Draw correlations, (K, K): rows and columns are numbered as the parameters are."""
     K = len(matrix)
     cells: dict[tuple[str, int], list[str]] = {}
     marks = []

@@ -117,7 +117,7 @@ def render(inputs: ReportInputs) -> str:
         residuals=[(shown, *charts.residuals(shown)) for shown in inputs.residuals],
         advice=advice_rows(result),
         scan=charts.latency_scan(_mapping(provenance.get("latency_scan")), inputs.tick_s),
-        correlations=None if matrix is None else charts.correlations(matrix, result.space.names),
+        correlations=None if matrix is None else charts.correlations(matrix),
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
         told=charts.SETTINGS.told,
         trace=charts.trace(result.trace),

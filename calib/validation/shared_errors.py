@@ -124,7 +124,7 @@ class FoundError:
             theta: Physical parameters, (K,).
             latency_s: Total latency [s].
         """
-        chi2 = _predicted(self.test, theta, latency_s, self.length)[0]
+        chi2 = _predicted(self.test, theta, latency_s, self.length)
         return _decides(chi2, self.chi2, _samples(self.test, self.length))
 
     def to_json(self) -> dict[str, Any]:
@@ -237,7 +237,7 @@ def find_shared_error(problem: Problem, local: Refined | None) -> FoundError | N
         count = _samples(test, length)
         as_recorded = _fitted(problem, same, seen, unseen, length)
         if local is not None:
-            as_recorded = min(as_recorded, _predicted(test, local.theta, local.latency_s, length)[0])
+            as_recorded = min(as_recorded, _predicted(test, local.theta, local.latency_s, length))
     except InsufficientDataError:
         return None
     ranked = sorted(shared_errors(problem), key=lambda e: _screened(problem, e.undo, seen, length))
@@ -298,11 +298,12 @@ def _fitted(
             iterations=SETTINGS.iterations,
             fixed_latency=problem.fixed_latency_s is not None,
         )
-        return _predicted(change.on(problem, unseen), fit.theta, fit.latency_s, length)[0]
+        return _predicted(change.on(problem, unseen), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):
         return math.inf
 
 
-def _predicted(test: Problem, theta: FloatArray, latency_s: float, length: int) -> tuple[float, int]:
-    found = at_parameters(test, theta, latency_s, length)
-    return (found.chi2 if np.isfinite(found.chi2) else math.inf), found.normal.count
+def _predicted(test: Problem, theta: FloatArray, latency_s: float, length: int) -> float:
+    """Return the chi2 of predictions; infinite where they diverge."""
+    chi2 = at_parameters(test, theta, latency_s, length).chi2
+    return chi2 if np.isfinite(chi2) else math.inf

@@ -236,7 +236,7 @@ def test_every_panel_names_recording_unit_and_lines() -> None:
 def test_correlations_are_drawn_with_a_sign_and_the_strongest_are_named() -> None:
     """Both signs differ in more than colour; correlations near 0 are left out."""
     matrix = np.array([[1.0, -0.9, 0.02], [-0.9, 1.0, 0.85], [0.02, 0.85, 1.0]])
-    drawn = correlations(matrix, ("a", "b", "c"))
+    drawn = correlations(matrix)
     squares = {sign: d.count("z") for sign, d in re.findall(r'class="(plus|minus)".*?d="([^"]*)"', drawn)}
     assert squares["minus"] == 2 and len(re.findall(r"M\d\.3 ", drawn)) == 2
     assert sum(d.count("z") for d in re.findall(r'd="([^"]*)"', drawn)) == 3 + 2 + 2
