@@ -1,11 +1,11 @@
-"""Where feet touch the floor: the strategy beside the one solver, start states following by secants.
+"""Solver for feet in contact with the floor: a strategy beside the one solver, with secants for start states.
 
-Feet that stick and slip kink every prediction, so the full Gauss-Newton step of all start states at once
-hardly ever helps, and a solver that insists on it stops with start states that explain nothing: measured on
-sensed Go2 targets, windows started from smoothed states cost six times the noise at the true parameters, and
-what was left was correlated over 5 to 13 samples. Given the parameters, though, windows do not depend on each
-other. So after a step of the parameters each window takes that way of following which suits it best, then a
-damped step of its own, and predictions are linearised by secants.
+Feet that stick and slip make kinks in every prediction. A full Gauss-Newton step of all start states at once
+rarely helps, and a solver that requires it stops at poor start states. On Go2 targets with sensor noise,
+windows from smoothed start states cost six times the noise at the true parameters. Their residuals were
+correlated over 5 to 13 samples. But given the parameters, windows are independent. So after each parameter
+step every window takes its best start-state update, then a damped step of its own. Predictions are linearised
+by secants.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from deal_hw.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContactSettings:
-    """Settings of the strategy where feet touch the floor.
+    """Settings of :func:`solve_contacts`.
 
     Attributes:
-        start_dampings: Levenberg's damping of start states, in units of the smoothed states' standard
+        start_dampings: Levenberg damping of start states, in units of the smoothed states' standard
             deviations; each window takes the best.
-        follow: How far start states follow a parameter step: kinks make the derivative too long as often as
-            right.
-        stretches: Secants, in turns: forward, backward, far and near ones miss different kinks.
-        gain: A cost that falls by less is noise of the kinks.
-        patience: So many runs of the solver without gain are the last.
+        follow: Shares of the linear start-state update after a parameter step. Because of kinks the full
+            update is too long as often as right.
+        stretches: Secant lengths, used in turn: forward, backward, far and near ones miss different kinks.
+        gain: A smaller decrease of the cost is noise from kinks.
+        patience: Most consecutive runs of the solver without gain.
         start_iterations: Most steps of start states alone.
     """
 
@@ -49,11 +49,11 @@ CONTACTS = ContactSettings()
 def solve_contacts(
     shooting: Shooting, point: Point, iterations: int, *, fixed_latency: bool
 ) -> tuple[Point, Normal, int]:
-    """Solve for parameters and start states; the best point that was seen is handed back.
+    """Solve for parameters and start states; return the best point seen.
 
     Args:
         shooting: The windows.
-        point: Where to start.
+        point: Start.
         iterations: Most derivatives of the solver.
         fixed_latency: Keep the latency.
     """
@@ -74,7 +74,7 @@ def solve_contacts(
 
 @dataclass(frozen=True, slots=True)
 class _Followed:
-    """Where start states followed to: the point, normal equations and gains before, residuals there, (M,)."""
+    """A point with updated start states; normal equations and gains before, residuals (M,) after."""
 
     point: Point
     normal: Normal
@@ -83,15 +83,15 @@ class _Followed:
 
 
 class Sticking:
-    """The residual as a function of the parameters, start states of feet that stick and slip following.
+    """The residual as a function of the parameters; start states of sticking and slipping feet follow them.
 
     Args:
         shooting: The windows.
-        point: Where to start.
+        point: Start.
         stretch: Factor on the secants' steps; negative for backward ones.
 
     Attributes:
-        best: The point that cost least so far.
+        best: The point of the lowest cost so far.
         best_cost: Its cost.
     """
 
@@ -117,7 +117,7 @@ class Sticking:
         return self._shooting.derivative(self._here.normal)
 
     def _followed(self, point: Point) -> _Followed:
-        """Return where start states settle from a point, with what is known there."""
+        """Improve the start states at a point once, and linearise."""
         normal = self._shooting.normal(point, keep=True, stretch=self._stretch)
         point, gains = _settled(self._shooting, point, normal)
         found = _Followed(point, normal, gains, self._shooting.vector(point))
@@ -132,7 +132,7 @@ def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, fl
 
     Args:
         shooting: The windows.
-        point: Where to start.
+        point: Start.
         iterations: Most steps.
 
     Returns:
@@ -151,7 +151,7 @@ def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, fl
 def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, list[FloatArray]]:
     """Return the point after each window's best damped step, and the gains there, (W, S, P) each.
 
-    A gain is by what start states follow the parameters.
+    A gain is the derivative of the best start states by the parameters.
     """
     scale = np.maximum(shooting.state_std, 1e-12)
     gains, ways = [], []
@@ -168,7 +168,7 @@ def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, l
 
 
 def _moved(shooting: Shooting, point: Point, value: FloatArray, ways: Sequence[FloatArray]) -> Point:
-    """Return the point at parameters and latency (K + 1,), each window moved by the best way, (D, W, S)."""
+    """Return the point at ``value``, (K + 1,), each window moved by its best step of (D, W, S)."""
     C = shooting.problem.coordinates
     each = [
         shooting.best_starts(e, value, x + way[..., :C], v + way[..., C:])

@@ -1,4 +1,4 @@
-"""What a calibration writes: the report's page, and the result folder with numbers, trace and model."""
+"""Output of a calibration: the report's page, and the result folder with numbers, trace and model."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ REPORT = "report.html"
 TEMPLATE = "report.html.j2"
 
 _HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "split_half")
-"""Provenance with a place of its own on the page."""
+"""Provenance that the page shows elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +73,10 @@ def write_report(path: Path, inputs: ReportInputs) -> None:
 
 
 def render(inputs: ReportInputs) -> str:
-    """Return the page; all that comes from the user is escaped."""
+    """Return the page; everything from the user is escaped."""
     from jinja2 import Environment, StrictUndefined
 
-    # StrictUndefined: a name that the template has and this module lacks is an error, not a gap.
+    # StrictUndefined: a template name that this module lacks is an error, not a gap.
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -93,7 +93,7 @@ def render(inputs: ReportInputs) -> str:
     return environment.from_string(_asset(TEMPLATE)).render(
         inputs=inputs,
         result=result,
-        # Ours, and not HTML: quotes in them stay quotes.
+        # Our own files, not HTML: quotes in them stay quotes.
         style=Markup(_asset("report.css")),
         script=Markup(script),
         script_digest=script_digest(script),
@@ -142,7 +142,7 @@ def _asset(name: str) -> str:
 
 
 def script_digest(script: str) -> str:
-    """Return what the page's policy calls its one script: it runs no other, whatever a name holds."""
+    """Return the digest of the page's only script, for its policy, which forbids all others."""
     digest = hashlib.sha256(f"\n{script}".encode()).digest()
     return f"sha256-{base64.b64encode(digest).decode()}"
 
@@ -156,7 +156,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
     ]
     rows = []
     for k, p in enumerate(space):
-        # To the share of the range to which the alarm looks.
+        # Rounded to the share of the range that the alarm uses.
         bound = {0.0: "lower", 100.0: "upper"}.get(round(float(at[3][k]), 4), "")
         prior = ""
         if p.prior_mean is not None and p.prior_std is not None:
@@ -185,13 +185,13 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
 
 
 def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, str, list[float | None]]]]:
-    """Return predictors, and of each joint (and of their mean) its unit and the error of each.
+    """Return the predictors, and for each joint and their mean the unit and each predictor's error.
 
-    An error is None where a prediction diverged. The sensor's noise stands beside them where it is known.
-    The mean is left out where joints have different units.
+    An error is None where a prediction diverged. The sensor's noise follows where it is known. The mean is
+    left out where joints have different units.
 
     Args:
-        rmse: ``provenance.heldout_rmse``; empty where nothing was held out.
+        rmse: ``provenance.heldout_rmse``; empty if nothing was held out.
     """
     by_joint, noise = _mapping(rmse.get("by_coordinate")), _mapping(rmse.get("noise"))
     means = _mapping(rmse.get("mean"))
@@ -207,7 +207,7 @@ def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, st
 
 
 def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
-    """Return the table of what to record next, in words."""
+    """Return the table of advised recordings, in words."""
     return [
         {
             "parameter": str(row["parameter"]),
@@ -220,7 +220,7 @@ def advice_rows(result: CalibrationResult) -> list[dict[str, str]]:
 
 
 def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
-    """Return a standard deviation in the parameter's own scale in words."""
+    """Format a standard deviation in the parameter's own scale."""
     if std is None:
         return "–"
     parameter = result.space[name]
@@ -228,13 +228,13 @@ def _spread(result: CalibrationResult, name: str, std: float | None) -> str:
 
 
 def with_value(result: CalibrationResult) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return which parameters have a value, (K,): what the data cannot tell gets none on the page."""
+    """Return which parameters have a value on the page, (K,): unidentified ones have none."""
     K = len(result.space)
     return np.array([v != "not identifiable" for v in result.verdicts] or [True] * K, dtype=bool)
 
 
 def short(value: float, digits: int = 4) -> str:
-    """Return a number with so many digits."""
+    """Format a number with so many digits."""
     return f"{value:.{digits}g}" if math.isfinite(value) else "–"
 
 
@@ -254,13 +254,13 @@ def write_result(
     """Write everything a calibration found; all of it appears, or none.
 
     Args:
-        folder: Where to write; made if need be.
+        folder: The output folder; made if needed.
         robot: The nominal model.
-        result: What was found.
-        report: What the report shows; None to write none.
+        result: The result.
+        report: Data of the report; None to write none.
 
     Returns:
-        The files by name; included files of the model that changed are among them.
+        The files by name; changed included files of the model are among them.
 
     Raises:
         DatasetError: The folder cannot be written.
@@ -293,7 +293,7 @@ def write_result(
                 )
                 names += [file.name for file in written]
             except ConfigurationError as err:
-                # A model that cannot be written must not cost the numbers.
+                # An error in the model must not cost the numbers.
                 unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
     except OSError as err:
         raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err

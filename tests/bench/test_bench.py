@@ -181,7 +181,7 @@ def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
         bench(settings)
         (row,) = json.loads(out.read_text())["rows"]
         errors[shown] = row["error"]
-    assert "needs the policy that moved the robot" in errors["excite"] and errors["policy"] == ""
+    assert "needs the policy that produced all commands" in errors["excite"] and errors["policy"] == ""
 
 
 def test_a_profile_that_a_task_lacks_is_kept_in_the_row(tmp_path: Path) -> None:

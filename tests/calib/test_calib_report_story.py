@@ -81,7 +81,7 @@ def test_without_held_out_recordings_nothing_is_claimed() -> None:
     """No gain and no bars; what is known of the fit is said. chi2 of 4 is twice the noise."""
     story = tell(result({}, chi2=4.0))
     assert (
-        story.sentence.startswith("Nothing says how well")
+        story.sentence.startswith("It is not known how well")
         and "2.0 times the sensor's noise" in story.sentence
     )
     assert story.bars == () and "noise" not in tell(result({})).sentence
