@@ -236,15 +236,7 @@ class OutputErrorFits(Fits):
         searched: CalibrationResult,
         only: str | None = None,
     ) -> dict[str, Member]:
-        """Return every candidate's estimate.
-
-        Args:
-            run: The calibration.
-            problem: All data, or those of a fold.
-            short: The fit over short windows.
-            searched: The search's result.
-            only: Name of the one candidate to compute; None for all.
-        """
+        """Return every candidate's estimate, or ``only`` one; ``short`` is the fit over short windows."""
         settings = self.settings
         windows_s = settings.windows_s if run.settings.cross_validation else (settings.long_s,)
         found: dict[str, Member] = {"search": (searched.estimate, searched.latency_s), "short": short}

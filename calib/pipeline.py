@@ -303,12 +303,7 @@ def to_the_noise(
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
-    Args:
-        run: The calibration.
-        searched: Result of the search, or its substitute.
-        refined: Result of the refinement.
-        choice: Result of cross-validation, if it ran.
-        restarts: Searches after the first.
+    ``searched`` is the search's result or its substitute, ``choice`` that of cross-validation, if it ran.
     """
     problem = run.problem
     scan = None
@@ -376,10 +371,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
 def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> None:
     """Report before the search which parameters the recordings do not show (Fisher information at ``local``).
 
-    Args:
-        problem: Recordings and simulator.
-        local: The local fit, with linearised residuals.
-        progress: Receives the report.
+    The local fit has linearised residuals.
     """
     # Model error does not reduce the information in the motion: only noise counts.
     noise_only = dataclasses.replace(local, chi2=1.0)
@@ -395,12 +387,8 @@ def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> No
 def conclusive(problem: Problem, fit: Refined, longest: float = MISMATCH.correlation_samples) -> bool:
     """Return whether noise explains the residual of a fit, so that no other check is needed.
 
-    A residual scale that the user chose proves nothing: then only unseen data can judge.
-
-    Args:
-        problem: Recordings and simulator.
-        fit: The fit.
-        longest: Longest autocorrelation time of a residual that counts as noise [samples].
+    A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the
+    longest autocorrelation time of a residual that counts as noise [samples].
     """
     chosen = problem.known_std is not None and problem.robot.base is None
     return not chosen and not unexplained(fit, longest)

@@ -92,8 +92,7 @@ class BoSettings:
 class TrustRegion(Kept):
     """The side of the box for the next batch, in widths of the range (TuRBO, algorithm 1).
 
-    Args:
-        failures: Generations without a better point after which the box is halved.
+    It is halved after ``failures`` generations without a better point.
     """
 
     KEPT = ("length", "_good", "_bad")
@@ -120,14 +119,8 @@ class TrustRegion(Kept):
 class GaussianProcessSearch(Kept):
     """Points in the unit cube, proposed from a Gaussian process of the scores of earlier ones.
 
-    All draws come from one seed and the generation's number, so points and scores are the whole state.
-
-    Args:
-        count: Coordinates C.
-        population: Points of the first generation; of every generation if the fitness changes.
-        settings: Sizes.
-        seed: Seeds all draws.
-        stationary: Whether a point's fitness stays the same; if not, earlier points are scored again.
+    All draws come from one seed and the generation's number, so points and scores are the whole state. Unless
+    the fitness is ``stationary``, each generation has the whole population and scores earlier points again.
     """
 
     KEPT = ("_points", "_fitness", "_generation", "_seed", "scored", "fallbacks", "region")
@@ -238,13 +231,8 @@ def _largest_improvement(
 ) -> FloatArray | None:
     """Return the batch of the largest qLogEI, (batch, C), or None where the process could not be fitted.
 
-    Args:
-        points: (n, C) in the unit cube.
-        value: The modelled value, (n,).
-        batch: Points to return.
-        side: Mean side of the box around the best point; None for the unit cube.
-        seed: Seeds all draws.
-        settings: Iterations and draws.
+    Points, (n, C), are in the unit cube, with the modelled values (n,). ``side`` is the mean side of the box
+    around the best point; None for the unit cube.
     """
     _require_botorch()
     import torch

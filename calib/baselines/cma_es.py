@@ -59,12 +59,6 @@ class RestartedCma(Kept):
 
     pycma's state can only be stored by pickling. So the costs are stored, and replaying them restores the
     state.
-
-    Args:
-        count: Coordinates C.
-        population: Members of the first run.
-        settings: Step sizes and growth.
-        seed: Seeds all draws.
     """
 
     def __init__(self, count: int, population: int, settings: CmaSettings, seed: int) -> None:
@@ -112,13 +106,9 @@ class RestartedCma(Kept):
         return self._asked
 
     def tell(self, cost: FloatArray) -> bool:
-        """Update, and begin the next run if this one has ended.
+        """Update with costs, (population,), lower is better; return whether a new run began.
 
-        Args:
-            cost: Lower is better, (population,); members that are not finite count as worse than the worst.
-
-        Returns:
-            Whether a new run began.
+        Members that are not finite count as worse than the worst.
         """
         asked = self.ask()
         if cost.shape != (len(asked),):
@@ -245,13 +235,9 @@ class Best(Kept):
         self.population = np.stack([np.zeros(count), np.ones(count)])
 
     def tell(self, unit: FloatArray, fitness: FloatArray, run: int, *, keep: bool) -> None:
-        """Update with a population.
+        """Update with a population of a run, (n, C), and its fitness, (n,); -inf where a member diverged.
 
-        Args:
-            unit: The population, (n, C).
-            fitness: Its fitness, (n,); -inf where a member diverged.
-            run: The run it belongs to.
-            keep: Whether earlier fitness is comparable with this one.
+        ``keep`` says whether earlier fitness is comparable with this one.
         """
         top = int(np.argmax(fitness))
         if fitness[top] > self.fitness or (not keep and np.isfinite(fitness[top])):

@@ -61,10 +61,7 @@ def elite_weights(population: int, elites: int) -> FloatArray:
 class EliteGaussian(Kept):
     """A diagonal Gaussian in the unit cube that is fitted to the best members of its own sample.
 
-    Args:
-        population: The first members, (N, C), drawn uniformly.
-        survive_rate: Share of elites.
-        rng: Draws all later members.
+    The first members, (N, C), are drawn uniformly.
     """
 
     KEPT = ("_population", "mean", "std")
@@ -83,13 +80,10 @@ class EliteGaussian(Kept):
         return self._population.copy()
 
     def tell(self, fitness: FloatArray) -> None:
-        """Fit the elites and draw the next population.
+        """Fit the elites and draw the next population; fitness (N,), not finite for no elite.
 
         The published program takes the first half of the random start as its first elite, without a look at
         fitness; here the first generation is scored like the others.
-
-        Args:
-            fitness: Higher is better, (N,); members that are not finite are never elites.
         """
         usable = np.flatnonzero(np.isfinite(fitness))
         if usable.size:

@@ -166,14 +166,9 @@ class LeastSquaresBaseline(OneShotSearch):
 
 
 def textbook_covariance(space: ParameterSpace, jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return s^2 inv(J'J) with the range as a flat prior, which keeps insensitive parameters finite.
+    """Return s^2 inv(J'J), (K, K), from derivatives (R, K) in each parameter's own scale, and residuals (R,).
 
-    A parameter's own prior is added.
-
-    Args:
-        space: The parameters.
-        jacobian: Derivatives in each parameter's own scale, (R, K).
-        residual: (R,).
+    The range is a flat prior, which keeps insensitive parameters finite. A parameter's own prior is added.
     """
     variance = float(residual @ residual) / max(len(residual) - len(space), 1)
     information = jacobian.T @ jacobian / max(variance, np.finfo(float).tiny)
@@ -229,13 +224,7 @@ def _minimise(error: OneStep, weight: float, start: FloatArray, ends: Mapping[st
 
 
 class OneStep:
-    """Differences between each recorded state and its prediction from one control period before.
-
-    Args:
-        problem: Data and simulator.
-        latency_s: The assumed latency [s].
-        diverged: See :class:`LeastSquaresSettings`.
-    """
+    """Differences between each recorded state and its prediction from one control period before."""
 
     def __init__(self, problem: Problem, latency_s: float, diverged: float = 1e3) -> None:
         self._problem, self._latency_s, self._diverged = problem, latency_s, diverged

@@ -53,12 +53,9 @@ class ChannelChange:
         )
 
     def of(self, episode: SampledEpisode, actuated: Sequence[int], *, efforts: bool) -> SampledEpisode:
-        """Return the changed recording; gains and limits stay.
+        """Return the changed recording of a fixed-base robot; gains and limits stay.
 
-        Args:
-            episode: The recording of a robot on a fixed base.
-            actuated: Index of each actuated joint among the joints, (A,). Only these exchange channels.
-            efforts: Commands are efforts, not positions.
+        Only the actuated joints, (A,), exchange commands. ``efforts``: commands are efforts, not positions.
         """
         joints, scale = list(self.source), np.array(self.scale)
         actuators = [list(actuated).index(self.source[joint]) for joint in actuated]

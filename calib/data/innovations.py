@@ -61,13 +61,9 @@ def cut(problem: Problem, ticks: int) -> list[WindowData]:
 def early_setpoints(
     batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray, advance_s: float = 0.008
 ) -> FloatArray:
-    """Return set-points like :func:`setpoints`, also for slightly negative latencies.
+    """Return set-points like :func:`setpoints`, also for latencies, (N,) [s], down to ``-advance_s``.
 
-    Args:
-        batch: The members.
-        episode: The episode.
-        latency_s: Total latency of each member, (N,) [s]; at least ``-advance_s``.
-        advance_s: Set-points are computed with this delay and shifted back [s].
+    They are computed with the delay ``advance_s`` and shifted back.
     """
     ahead = round(advance_s / episode.step_s)
     late = setpoints(batch, episode, latency_s + ahead * episode.step_s)
@@ -115,9 +111,7 @@ class Whitening:
     def innovation(self, measured: FloatArray, predicted: FloatArray) -> FloatArray:
         """Whiten recording minus prediction, the latter shifted to the smoothed start states, (N, W, H M).
 
-        Args:
-            measured: (W, H, M).
-            predicted: From the start states of :meth:`starts`, (N, W, H, M).
+        The prediction, (N, W, H, M), is from the start states of :meth:`starts`.
         """
         moved = np.einsum("wis,ws->wi", self.root, self.offset).reshape(measured.shape)
         return self.apply(measured + moved - predicted)
@@ -131,9 +125,7 @@ class Whitening:
     def next_offset(self, measured: FloatArray, limit: float = 3.0) -> FloatArray:
         """Return the most probable start states under the linearised simulator: the next ``offset``.
 
-        Args:
-            measured: (W, H, M).
-            limit: Largest shift [standard deviations]. Without it, start states would explain a wrong model.
+        Without the limit [standard deviations], start states would explain a wrong model.
         """
         whitened = self.innovation(measured, self.reference[None])[0]
         response = np.einsum("wij,wjs->wis", self.factor, self.root)

@@ -91,18 +91,11 @@ class NoiseModel:
 
 
 def white_noise_std(values: FloatArray, settings: DataSettings = SETTINGS) -> FloatArray:
-    """Estimate the standard deviation of white noise on top of smooth motion.
+    """Estimate the standard deviation of white noise on top of smooth motion, (J,), from samples (T, J).
 
     The sixth difference of a smooth motion nearly vanishes. That of white noise with variance s^2 has
     variance 924 s^2 (the sum of the squared binomial coefficients). The median ignores impacts and
     stick-slip.
-
-    Args:
-        values: Uniformly sampled channels, (T, J).
-        settings: Order of the differences, and the smallest result.
-
-    Returns:
-        Standard deviations, (J,).
     """
     order = settings.noise_order
     if len(values) <= 2 * order:
@@ -120,16 +113,11 @@ def noise_model(
     velocities: list[FloatArray],
     settings: DataSettings = SETTINGS,
 ) -> NoiseModel:
-    """Estimate noise and timing jitter of recordings.
+    """Estimate noise and timing jitter from positions and smoothed velocities of recordings, (T, J) each.
 
     The noise is estimated in bins of equal speed, joint by joint. A straight line is fitted to its square
     over the squared speed. The intercept is the noise at rest; the slope, shared by all joints, is the
     jitter's variance.
-
-    Args:
-        positions: Reported positions of each recording, (T, J) each, uniformly sampled.
-        velocities: Smoothed velocities, likewise.
-        settings: Assumptions about recordings.
     """
     order, bins, floor = settings.noise_order, settings.speed_bins, settings.floor
     whole = np.max([white_noise_std(x, settings) for x in positions], axis=0)
@@ -192,17 +180,12 @@ class StartStates:
 def smooth_states(
     episode: SampledEpisode, noise_std: FloatArray, rotation: slice, settings: DataSettings = SETTINGS
 ) -> StartStates:
-    """Estimate the state at every sample.
+    """Estimate the state at every sample; ``noise_std`` is that of (position, velocity), (2 C,).
 
     Noise-free positions and their reported velocities are kept: smoothing would only round off the impacts.
-    Measured angular velocities of a base are smoothed. Its rotation vector becomes zero, because its
-    reference is the smoothed orientation. Unmeasured coordinates keep the episode's estimate.
-
-    Args:
-        episode: The recording.
-        noise_std: Noise of (position, velocity), (2 C,).
-        rotation: The coordinates of the base's rotation vector.
-        settings: Assumptions about recordings.
+    Measured angular velocities of a base are smoothed. Its rotation vector (coordinates ``rotation``) becomes
+    zero, because its reference is the smoothed orientation. Unmeasured coordinates keep the episode's
+    estimate.
 
     Raises:
         InsufficientDataError: The recording is shorter than the smoother.

@@ -63,13 +63,7 @@ class DiffusionSettings:
 
 
 def alpha_schedule(generations: int, schedule: Schedule, last: float = 1e-3) -> FloatArray:
-    """Return alpha_0 = 1, ..., alpha_T = about 0, (T + 1,).
-
-    Args:
-        generations: Search steps T.
-        schedule: "cosine" spends more steps at both ends; "linear" falls evenly.
-        last: alpha_T.
-    """
+    """Return alpha_0 = 1, ..., alpha_T = ``last``, (T + 1,); "cosine" has smaller steps at both ends."""
     part = np.arange(generations + 1) / generations
     fall = (1 + np.cos(np.pi * part)) / 2 if schedule == "cosine" else 1 - part
     return np.asarray(last + (1 - last) * fall)
@@ -98,10 +92,7 @@ class DiffusionStep:
 class DiffusionEvolution(Kept):
     """A population (N, K) in a box around zero; a uniform start of unit variance fits eq. 12 best.
 
-    Args:
-        population: The start theta^T, (N, K); the paper draws it uniformly from the search range.
-        settings: Schedules and choices.
-        rng: Draws omega.
+    The paper draws the start theta^T uniformly from the search range.
     """
 
     KEPT = ("_theta", "t")
@@ -171,11 +162,9 @@ class DiffusionEvolution(Kept):
 
 
 def probabilities(fitness: FloatArray, temperature: float | None) -> FloatArray:
-    """Map fitness to probabilities, (N,) each (the paper's g, eq. 22).
+    """Map fitness to probabilities, (N,) each (the paper's g, eq. 22); see `DiffusionSettings.temperature`.
 
-    Args:
-        fitness: Higher is better; -inf gets probability 0, unless all are.
-        temperature: None for the softmax of the raw values, a number for standardised ones divided by it.
+    A fitness of -inf gets probability 0, unless all have it.
     """
     finite = np.isfinite(fitness)
     if not finite.any():
@@ -193,13 +182,8 @@ def probabilities(fitness: FloatArray, temperature: float | None) -> FloatArray:
 def neighbour_weights(theta: FloatArray, p: FloatArray, alpha: float, *, divide: bool) -> FloatArray:
     """Return p_i N(theta_j; sqrt(alpha) theta_i, 1 - alpha) / Z, (N, N), row j for member j.
 
-    Computed from logarithms: at high K the density itself underflows to zero for every neighbour.
-
-    Args:
-        theta: Population, (N, K).
-        p: Probabilities, (N,).
-        alpha: alpha_t.
-        divide: Divide the squared distance by K; the constant factor of the density cancels in Z.
+    Computed from logarithms: at high K the density itself underflows to zero for every neighbour. With
+    ``divide`` the squared distance is divided by K; the constant factor of the density cancels in Z.
     """
     centres = np.sqrt(alpha) * theta
     squared = np.sum(theta**2, axis=1)[:, None] - 2 * theta @ centres.T + np.sum(centres**2, axis=1)

@@ -91,16 +91,7 @@ class FitnessSettings:
 
 
 class Fitness(Kept, abc.ABC):
-    """A score of members.
-
-    Args:
-        problem: Data, simulator and policy.
-        settings: How to score.
-        rng: Seeds the critic; the others have no state.
-
-    Attributes:
-        values: Further values of the last call of `score`, for the trace.
-    """
+    """A score of members; ``values`` are further values of the last call of `score`, for the trace."""
 
     def __init__(
         self,
@@ -182,10 +173,6 @@ class TrajectoryFitness(Fitness):
 
 class RolloutView:
     """Transitions (s, a, s') of the recording and of rollouts.
-
-    Args:
-        problem: Data, simulator and policy.
-        settings: Rollout and scaling.
 
     Raises:
         InsufficientDataError: A recording is too short, or its policy is not known.

@@ -58,14 +58,8 @@ def control_ticks(problem: Problem, index: int, most: int | None = None, history
     """Divide an episode into control periods, from its first usable sample to the first gap.
 
     A tick starts at the newest state that the controller can have seen: the last sample before its command
-    acts.
-
-    Args:
-        problem: Gives the episodes and the control rate.
-        index: Index of the episode.
-        most: Most ticks to return.
-        history: Length of the policy's memory [control periods]. If the recording begins after the policy
-            did, this many ticks are left out, so that its past is known.
+    acts. At most ``most`` ticks are returned. If the recording begins after the policy did, ``history`` ticks
+    are left out, so that the policy's past is known.
 
     Raises:
         InsufficientDataError: There are fewer than two ticks.
@@ -122,12 +116,8 @@ def rollout_population(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Roll all members out from the recording's initial state (Algorithm 1, line 3).
 
-    Args:
-        problem: Data, simulator and pi_0; its physics step may be longer than the device's period.
-        members: The N simulators.
-        index: Index of the episode.
-        ticks: Its control periods.
-        replay: Send the recorded targets, pi_0's actions on the robot, instead of pi_0's new ones.
+    With ``replay``, members get the recorded targets, pi_0's actions on the robot, instead of pi_0's new
+    ones. The physics step may be longer than the device's period.
 
     Returns:
         Positions and velocities at the ticks, (N, T + 1, J) each, and the action of each tick, (N, T, A).
@@ -254,13 +244,9 @@ class TransitionScale:
 def transitions(
     position: FloatArray, velocity: FloatArray, action: FloatArray, *, difference: bool = False
 ) -> npt.NDArray[np.float32]:
-    """Return (s, a, s') of rollouts, (N, T, 2 J + A + 2 J), not yet standardised.
+    """Return (s, a, s') of rollouts, (N, T, 2 J + A + 2 J), not yet standardised; or (s, a, s' - s).
 
-    Args:
-        position: (N, T + 1, J).
-        velocity: (N, T + 1, J).
-        action: (N, T, A).
-        difference: Return (s, a, s' - s).
+    Positions and velocities are (N, T + 1, J), actions (N, T, A).
     """
     state = np.concatenate([position, velocity], axis=2)
     after = np.diff(state, axis=1) if difference else state[:, 1:]

@@ -100,13 +100,7 @@ class Advice:
 def menu_designs(
     description: RobotDescription, balances: bool = False, settings: AdviceSettings = SETTINGS
 ) -> dict[str, ExcitationDesign]:
-    """Return the excitations of the menu, by their description.
-
-    Args:
-        description: The robot.
-        balances: Whether they begin with a balancing policy.
-        settings: Which excitations.
-    """
+    """Return the excitations of the menu by their description; ``balances``: a policy balances first."""
     balance_s = min(settings.balance_s, 0.25 * settings.seconds) if balances else 0.0
     top = min(5.0, description.control_rate_hz / 6)
     designs = [
@@ -202,15 +196,7 @@ def predict_menu(
     balance: Callable[[], Behaviour] | None = None,
     threads: int | None = None,
 ) -> dict[str, ExpectedInformation]:
-    """Predict at the estimate the information of each excitation.
-
-    Args:
-        robot: The nominal model.
-        known: The estimate and its uncertainty.
-        menu: Excitations of one length.
-        balance: Makes the balancing policy.
-        threads: Simulation threads.
-    """
+    """Predict the information of each excitation of a menu at the estimate; all have one length."""
     space, one = known.space, np.eye(len(known.space))
     # The range bounds what the recordings leave open.
     flat = np.linalg.inv(np.diag(space.width**2 / 12.0))
@@ -285,18 +271,10 @@ def next_recordings(
     settings: AdviceSettings = SETTINGS,
     threads: int | None = None,
 ) -> tuple[Advice, ...]:
-    """Return advice for each weak or unidentified parameter.
+    """Return advice as :func:`advise` does, for the parameters that the result calls weak or unidentified.
 
     A robot without described limits stays inside what its recordings covered. The noise is the residual that
     the calibration left.
-
-    Args:
-        robot: The nominal model.
-        result: The calibration's result.
-        episodes: The fitted recordings.
-        balance: Makes the balancing policy; None for robots that stand by themselves.
-        settings: Which excitations are tried.
-        threads: Simulation threads.
     """
     open_ = [n for n, v in zip(result.space.names, result.verdicts, strict=False) if v != "identifiable"]
     if not open_:
@@ -371,11 +349,8 @@ def _pairs(low: FloatArray, high: FloatArray) -> tuple[tuple[float, float], ...]
 def next_step(advice: Sequence[Mapping[str, Any]], robot: str = "") -> list[str]:
     """Return the one thing to do next, in words and as commands.
 
-    It is the recording that helps most parameters most; without one, the measurement to make.
-
-    Args:
-        advice: :meth:`Advice.to_json` of each open parameter.
-        robot: The robot's name if `deal-hw` can record it; "" for no commands.
+    It is the recording that helps most parameters most; without one, the measurement to make. ``advice`` is
+    :meth:`Advice.to_json` of each open parameter. Commands need a robot that `deal-hw` can record.
     """
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in advice:

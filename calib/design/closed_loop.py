@@ -108,14 +108,10 @@ class TrialRunner:
         self._batch = ServoBatch(robot, space, len(scenario), threads)
 
     def run(self, behaviours: Sequence[Behaviour], until_trip: bool = False) -> list[Trial]:
-        """Run one behaviour per member, each reset first; all must request equal gains and limits at a time.
-
-        Args:
-            behaviours: One per member.
-            until_trip: End all trials as soon as one trips.
+        """Run one behaviour per member, each reset first; with ``until_trip``, up to the first trip.
 
         Raises:
-            ConfigurationError: They request different gains or limits.
+            ConfigurationError: They request different gains or limits at a time.
         """
         description, scenario = self._robot.description, self._scenario
         for behaviour in behaviours:

@@ -124,17 +124,7 @@ def information(
 ) -> FloatArray:
     """Return the Fisher information of a recording with the nominal sensor's noise, start states eliminated.
 
-    Args:
-        robot: The nominal model.
-        space: The parameters.
-        trial: The recording without noise.
-        theta: Its true parameters, (K,).
-        latency_s: Its true latency [s].
-        window_s: Length of the windows [s].
-        threads: Simulation threads.
-
-    Returns:
-        Of parameters in their own scale and latency [s], (K + 1, K + 1).
+    It is that of parameters in their own scale and latency [s], (K + 1, K + 1), at the trial's true ones.
     """
     J = len(robot.description.joint_names)
     std = np.concatenate([robot.description.sensor.position_std, np.ones(J)])

@@ -49,14 +49,7 @@ CONTACTS = ContactSettings()
 def solve_contacts(
     shooting: Shooting, point: Point, iterations: int, *, fixed_latency: bool
 ) -> tuple[Point, Normal, int]:
-    """Solve for parameters and start states; return the best point seen.
-
-    Args:
-        shooting: The windows.
-        point: Start.
-        iterations: Most derivatives of the solver.
-        fixed_latency: Keep the latency.
-    """
+    """Solve for parameters and start states; return the best point, its normal equations, and derivatives."""
     best, best_cost = settle(shooting, point, CONTACTS.start_iterations)
     bounds, waited, used = value_bounds(shooting.problem), 0, 0
     while used < iterations and waited <= CONTACTS.patience:
@@ -85,14 +78,8 @@ class _Followed:
 class Sticking:
     """The residual as a function of the parameters; start states of sticking and slipping feet follow them.
 
-    Args:
-        shooting: The windows.
-        point: Start.
-        stretch: Factor on the secants' steps; negative for backward ones.
-
-    Attributes:
-        best: The point of the lowest cost so far.
-        best_cost: Its cost.
+    ``stretch`` is a factor on the secants' steps, negative for backward ones. ``best`` is the point of the
+    lowest cost so far.
     """
 
     def __init__(self, shooting: Shooting, point: Point, stretch: float) -> None:
@@ -128,16 +115,7 @@ class Sticking:
 
 
 def settle(shooting: Shooting, point: Point, iterations: int) -> tuple[Point, float]:
-    """Fit start states alone; parameters stay, and no window's cost grows.
-
-    Args:
-        shooting: The windows.
-        point: Start.
-        iterations: Most steps.
-
-    Returns:
-        The point and its cost.
-    """
+    """Fit start states alone; parameters stay, and no window's cost grows. Return the point and its cost."""
     cost = shooting.cost(point)
     for number in range(iterations):
         normal = shooting.normal(point, keep=True, stretch=CONTACTS.stretches[number % 2])

@@ -147,10 +147,7 @@ def prediction_rmse(
 ) -> FloatArray:
     """Return the root mean square errors of predictions from smoothed states, (N, M).
 
-    Args:
-        problem: Recordings to predict.
-        members: Physical parameters, (K,), and latency [s] of each member.
-        seconds: Length of the windows.
+    Windows last ``seconds``. Members are parameters, (K,), and latency [s].
     """
     theta, latency = np.stack([m[0] for m in members]), np.array([m[1] for m in members])
     squares, count = np.zeros((len(members), len(problem.channels))), np.zeros(len(problem.channels))

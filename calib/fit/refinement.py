@@ -190,14 +190,10 @@ def _refined(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_
 
 
 def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
-    """Continue a refinement with less weight on large residuals.
+    """Continue a refinement, in its windows, with less weight on large residuals.
 
     The windows' standard deviations are divided by the roots of the weights. So normal equations, intervals
     and start states use the same weights. ``chi2`` keeps equal weights, or the loss would hide model error.
-
-    Args:
-        refined: Start; its windows are kept.
-        fixed_latency: Keep the latency.
     """
     plain, found, iterations = refined.shooting, refined, refined.iterations
     for _ in range(SETTINGS.robust_rounds):
@@ -217,16 +213,10 @@ def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
 def at_parameters(
     problem: Problem, theta: FloatArray, latency_s: float, length: int, states: States | None = None
 ) -> Refined:
-    """Return given parameters with fitted start states, as if the refinement had ended there.
+    """Return given parameters with start states fitted from ``states``, as if the refinement had ended there.
 
     A prediction from smoothed start states contains the smoother's error, which says nothing about the model.
-
-    Args:
-        problem: The problem.
-        theta: Physical parameters, (K,).
-        latency_s: Total latency [s].
-        length: Samples of a window.
-        states: Initial start states; the smoothed states by default.
+    Windows have ``length`` samples.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -323,12 +313,9 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     """Refine the nominal values; return None where simulations from there diverge.
 
     It costs a small part of a search. Where the sensors' noise explains its residual, no search is needed. It
-    fits a part of the recordings first, and all of them only where that part can be explained.
-
-    Args:
-        problem: The problem.
-        notify: Called with the fit after each window length. On a damped robot the first is often nearly the
-            result, in a third of the time.
+    fits a part of the recordings first, and all of them only where that part can be explained. ``notify``
+    gets the fit after each window length: on a damped robot the first is often nearly the result, in a third
+    of the time.
     """
     fixed = problem.fixed_latency_s is not None
     latency_s = problem.first_latency_s

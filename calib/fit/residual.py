@@ -292,13 +292,9 @@ class Shooting:
     def best_starts(
         self, e: int, value: FloatArray, x: FloatArray, v: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return each window's start state of least cost among several, (W, C) twice.
+        """Return each window's start state of least cost among D candidates, (D, W, C); (W, C) twice.
 
-        Args:
-            e: Number of the episode.
-            value: Parameters and latency, (K + 1,).
-            x: Candidate start positions, (D, W, C).
-            v: Their velocities, likewise.
+        ``e`` is the number of the episode, ``value``, (K + 1,), parameters and latency.
         """
         costs = self._window_costs(e, np.repeat(value[None], len(x), axis=0), x, v)
         best = np.argmin(costs, axis=0)
@@ -367,16 +363,11 @@ class Shooting:
         return found
 
     def shaken(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
-        """Return the point with, window by window, the best of several drawn start states.
+        """Return the point with, window by window, the best of ``count`` drawn start states.
 
         Given the parameters, windows are independent, so one batch searches them all. It frees windows whose
-        feet stick where they should slip, which no derivative shows.
-
-        Args:
-            point: The solver's point.
-            spread: Spread of the draws, in standard deviations of the smoothed states.
-            count: Number of draws; half of them around the smoothed states instead of the point's.
-            rng: Random generator.
+        feet stick where they should slip, which no derivative shows. Half of the draws are around the
+        smoothed states instead of the point's; ``spread`` is in the smoothed states' standard deviations.
         """
         C = self.problem.coordinates
         std = spread * self.state_std

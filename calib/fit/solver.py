@@ -67,17 +67,10 @@ def minimise(
     *,
     fixed_latency: bool,
 ) -> tuple[FloatArray, int]:
-    """Minimise the sum of squared residuals inside bounds.
+    """Minimise the sum of squared residuals inside bounds, (K + 1,) each.
 
-    Args:
-        fit: Residual and derivative.
-        value: Start: parameters in their own scale, then the latency [s], (K + 1,).
-        bounds: Lower and upper bounds, (K + 1,) each.
-        settings: Settings.
-        fixed_latency: Keep the latency.
-
-    Returns:
-        The solution, (K + 1,), and the number of derivatives.
+    Values are parameters in their own scale, then the latency [s], (K + 1,). Return the solution and the
+    number of derivatives.
     """
     low, high = bounds
     free = high > low
@@ -125,14 +118,7 @@ def solve(
 ) -> tuple[Point, Normal, int]:
     """Solve for parameters and start states.
 
-    Args:
-        shooting: The windows.
-        point: Start.
-        settings: Settings.
-        fixed_latency: Keep the latency.
-
-    Returns:
-        The solution, the normal equations there, and the number of derivatives.
+    Return the solution, the normal equations there, and the number of derivatives.
     """
     bounds, used, before = value_bounds(shooting.problem), 0, np.inf
     normal: Normal | None = None
@@ -151,13 +137,9 @@ def solve(
 
 
 def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
-    """Fit start states alone, without contacts; parameters stay, and no window's cost grows.
+    """Fit start states alone, without contacts, from a point and the normal equations there.
 
-    Args:
-        shooting: The windows.
-        point: Start.
-        normal: Normal equations there.
-        iterations: Most steps.
+    Parameters stay, and no window's cost grows.
     """
     for _ in range(0 if shooting.given else iterations):
         moved = shooting.followed(point, normal, np.zeros_like(point.value))
@@ -170,10 +152,7 @@ def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int)
 class _Following:
     """The residual as a function of the parameters alone; start states follow.
 
-    Args:
-        shooting: The windows.
-        point: Start.
-        normal: Normal equations there with their rows, if known.
+    It starts at a point and, if known, the normal equations there with their rows.
     """
 
     def __init__(self, shooting: Shooting, point: Point, normal: Normal | None) -> None:
@@ -242,12 +221,7 @@ def huber_weights(residual: FloatArray) -> FloatArray:
 
 
 def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) -> list[WindowData]:
-    """Return windows with less weight the more their residual exceeds the median's (Cauchy's weights).
-
-    Args:
-        data: The windows of each episode.
-        residuals: Their whitened residuals, (W, H, M) each.
-    """
+    """Return windows with less weight the more their residual, (W, H, M), exceeds the median's (Cauchy)."""
     costs = [np.sum(r**2, axis=(1, 2)) for r in residuals]
     median = max(float(np.median(np.concatenate(costs))), 1e-12)
     return [
@@ -265,10 +239,8 @@ def kurtosis(residuals: Sequence[FloatArray]) -> float:
 def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robust: bool) -> FloatArray:
     """Return the scale of each channel's errors where the sensors' noise does not give it, (M,).
 
-    Args:
-        errors: Prediction minus measurement of each episode, (W, H, M).
-        seen: Whether each was measured, likewise.
-        robust: Limit the scale by the median, so that a local failure does not devalue the channel.
+    Errors, (W, H, M) per episode, count where they were ``seen``. A robust scale is limited by the median, so
+    that a local failure does not devalue the channel.
     """
     squares = np.sum(
         [np.sum(np.where(s, r, 0.0) ** 2, axis=(0, 1)) for r, s in zip(errors, seen, strict=True)], axis=0
@@ -284,9 +256,7 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
 def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
     """Return one plus twice the sum of the residuals' correlations up to their first zero, at least 1.
 
-    Args:
-        residuals: Whitened residuals of each episode, (W, H, M).
-        longest: Longest lag [samples].
+    Residuals are whitened, (W, H, M) per episode; lags end at ``longest`` samples.
     """
     longest = min(longest, max(r.shape[1] for r in residuals) - 1)
     total = sum(float(np.sum(r**2)) for r in residuals)

@@ -182,10 +182,9 @@ def _residual_row(shown: Residuals, m: int, size: float) -> Iterator[Panel]:
 
 
 def autocorrelation(values: FloatArray) -> tuple[FloatArray, float]:
-    """Return the autocorrelation within windows at lags 1, 2, ... and the 95 % band of white noise.
+    """Return the autocorrelation of a channel's residuals, (W, H), at lags 1, 2, ... and white noise's band.
 
-    Args:
-        values: Whitened residuals of one channel, (W, H).
+    The band holds 95 %.
     """
     clean = np.nan_to_num(values)
     power = float(np.mean(clean**2)) or 1.0

@@ -57,11 +57,7 @@ class Row:
 
 
 def write_report(path: Path, inputs: ReportInputs) -> None:
-    """Write the report, whole or not at all.
-
-    Args:
-        path: The file; a folder gets ``report.html``.
-        inputs: What to show.
+    """Write the report to a file, or as ``report.html`` into a folder, whole or not at all.
 
     Raises:
         OSError: The file cannot be written.
@@ -188,10 +184,7 @@ def heldout_rows(rmse: Mapping[str, Any]) -> tuple[list[str], list[tuple[str, st
     """Return the predictors, and for each joint and their mean the unit and each predictor's error.
 
     An error is None where a prediction diverged. The sensor's noise follows where it is known. The mean is
-    left out where joints have different units.
-
-    Args:
-        rmse: ``provenance.heldout_rmse``; empty if nothing was held out.
+    left out where joints have different units. ``rmse`` is ``provenance.heldout_rmse``.
     """
     by_joint, noise = _mapping(rmse.get("by_coordinate")), _mapping(rmse.get("noise"))
     means = _mapping(rmse.get("mean"))
@@ -251,16 +244,9 @@ def _plain(value: Any) -> str:
 def write_result(
     folder: Path, robot: RobotModel, result: CalibrationResult, report: ReportInputs | None = None
 ) -> dict[str, Path]:
-    """Write everything a calibration found; all of it appears, or none.
+    """Write everything a calibration found; all of it appears, or none. A report of None is not written.
 
-    Args:
-        folder: The output folder; made if needed.
-        robot: The nominal model.
-        result: The result.
-        report: Data of the report; None to write none.
-
-    Returns:
-        The files by name; changed included files of the model are among them.
+    Return the files by name; changed included files of the model are among them.
 
     Raises:
         DatasetError: The folder cannot be written.

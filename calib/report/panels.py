@@ -147,14 +147,7 @@ class Panel:
 
 
 def ticks_of(low: float, high: float, most: int, *, whole: bool = False) -> list[tuple[float, str]]:
-    """Return about ``most`` round values between two ends, with labels of equal precision.
-
-    Args:
-        low: One end.
-        high: The other end, above it.
-        most: Number of values, give or take one.
-        whole: Only whole numbers.
-    """
+    """Return about ``most`` round values between two ends, with labels of equal precision."""
     step = nice_step((high - low) / most)
     step = max(round(step), 1) if whole else step
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -178,15 +171,9 @@ def _ends(ends: tuple[float, float]) -> str:
 
 
 def envelope(time: FloatArray, values: FloatArray, buckets: int = 350) -> tuple[FloatArray, FloatArray]:
-    """Reduce a long series without a visible change: lowest and highest of each bucket, in order.
+    """Reduce a long series, (T,), without a visible change: lowest and highest of each bucket, in order.
 
-    Args:
-        time: (T,).
-        values: (T,); NaN leaves a gap.
-        buckets: Number of buckets; series of up to twice as many samples are unchanged.
-
-    Returns:
-        Times and values, up to two per bucket.
+    A value of NaN leaves a gap. Series of up to twice as many samples as buckets are unchanged.
     """
     if len(values) <= 2 * buckets:
         return time, values

@@ -92,16 +92,7 @@ class Coordinates:
 
 
 class SearchLog:
-    """Trace, counts and result of one search.
-
-    Args:
-        method: Name of the method.
-        problem: The problem.
-        budget: Limits of the search.
-        progress: Called after each generation.
-        settings: The method's settings, a dataclass.
-        coordinates: Search coordinates; those of the problem by default.
-    """
+    """Trace, counts and result of one search."""
 
     def __init__(
         self,
@@ -121,13 +112,7 @@ class SearchLog:
         self._earlier_steps, self._earlier_seconds = 0, 0.0
 
     def note(self, message: str, members: Members, values: Mapping[str, float]) -> None:
-        """Append one generation to the trace and call the callback, which may raise to stop the run.
-
-        Args:
-            message: One short line.
-            members: The simulated members.
-            values: For the trace.
-        """
+        """Append one generation to the trace and call the callback, which may raise to stop the run."""
         self.trace.append({"generation": float(len(self.trace)), **values})
         if self._progress is not None:
             total = max(self.budget.generations, len(self.trace))
@@ -173,19 +158,11 @@ class SearchLog:
         extra: Mapping[str, Any] | None = None,
         **better: Any,
     ) -> CalibrationResult:
-        """Return the result.
+        """Return the result; ``better`` are fields for which the method has better values.
 
         The interval is the 5-95 % range of a normal distribution with the population's spread. It is NOT
         calibrated: a population shrinks by the searcher's step rule, too far for small ensembles, and to
         nothing for diffusion evolution. The refinement computes intervals from the data.
-
-        Args:
-            centre: The estimate, one member.
-            population: The last population.
-            chi2: Mean squared whitened residual at the estimate.
-            alarms: Reasons to distrust the result.
-            extra: Further provenance.
-            better: Fields of the result for which the method has better values.
         """
         space = self.problem.space
         scaled = space.to_scale(population.theta)
@@ -218,13 +195,7 @@ class SearchLog:
 
 
 class Stepper(Kept, abc.ABC):
-    """One run of a search, between its generations.
-
-    Args:
-        log: Trace and counts of the run.
-        rng: The only source of randomness.
-        search: The method.
-    """
+    """One run of a search, between its generations."""
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         self.log, self.rng = log, rng

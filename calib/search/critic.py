@@ -61,13 +61,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class Critic(Kept):
-    """A network with two hidden layers, ReLU, and one output (the paper's D).
-
-    Args:
-        inputs: Width of a sample.
-        settings: Size and training.
-        rng: Seeds the network's generator.
-    """
+    """A network with two hidden layers, ReLU, and one output (the paper's D)."""
 
     def __init__(self, inputs: int, settings: CriticSettings, rng: np.random.Generator) -> None:
         self.settings = settings
@@ -99,13 +93,9 @@ class Critic(Kept):
     def train(self, real: Samples, *fake: Samples) -> float:
         """Make the settings' updates on minibatches drawn with replacement (Algorithm 1, lines 4-7).
 
-        Args:
-            real: Samples of the recording, (n, inputs).
-            fake: Samples of the simulators, (m, inputs), in blocks that are never joined: a replay of 50
-                generations of 200 x 200 transitions is 72 MB.
-
-        Returns:
-            Estimate of the Wasserstein distance in the last update: mean output on real minus fake samples.
+        Samples are (n, inputs). Those of the simulators come in blocks that are never joined: a replay of 50
+        generations of 200 x 200 transitions is 72 MB. Return the estimate of the Wasserstein distance in the
+        last update: mean output on real minus fake samples.
         """
         settings = self.settings
         data = torch.from_numpy(real)
@@ -160,14 +150,7 @@ class Critic(Kept):
 
     @torch.no_grad()
     def statistics(self, samples: Samples) -> FloatArray:
-        """Return the mean over samples of all hidden activations and the output.
-
-        Args:
-            samples: N groups of n samples, (N, n, inputs).
-
-        Returns:
-            (N, h1 + h2 + 1).
-        """
+        """Return the mean hidden activations and output, (N, h1 + h2 + 1), of samples, (N, n, inputs)."""
         groups, count, width = samples.shape
         per = max(16384 // count, 1)
         out = []

@@ -170,12 +170,7 @@ class _Deal(KalmanStepper):
 class _View(Kept, abc.ABC):
     """The critic's samples of recording and population, and the statistics of each member.
 
-    Args:
-        problem: Data and simulator.
-        settings: Critic, noise draws.
-        ticks: Window length in control periods.
-        rng: Seeds the critic and draws the noise.
-        move_starts: Linearise around each generation's most probable start states.
+    With ``move_starts`` it linearises around each generation's most probable start states.
     """
 
     KEPT = ("_critic", "_offsets")

@@ -42,10 +42,8 @@ class KalmanStep:
 class EnsembleKalman(Kept):
     """An ensemble (N, C) that moves towards residual zero.
 
-    Args:
-        ensemble: Initial members, (N, C).
-        rng: Draws the perturbations.
-        step_clip: Largest move of a coordinate in one step; a regression is not valid far from its samples.
+    ``step_clip`` is the largest move of a coordinate in one step: a regression is not valid far from its
+    samples.
     """
 
     KEPT = ("_members", "tempering")

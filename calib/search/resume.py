@@ -165,11 +165,6 @@ class Restarts:
 
     It is the running search's store, and puts the last state of each search into the whole run's store. From
     its last state a finished search makes its result again, with the generator as that search left it.
-
-    Args:
-        search: The search.
-        rng: The only source of randomness.
-        store: The whole run's store; None to save nothing.
     """
 
     def __init__(
@@ -213,16 +208,10 @@ class Restarts:
 def run_identity(
     problem: Problem, method: CalibrationMethod[Problem], budget: Budget, rng: np.random.Generator
 ) -> str:
-    """Return the digest of a run, which identifies its checkpoint.
+    """Return the digest of a run, which identifies its checkpoint; ``rng`` has not drawn yet.
 
     It covers the recordings' samples and commands, their given noise and latency, model, space, method with
     its settings, budget, generator and versions. The number of threads changes no result and is left out.
-
-    Args:
-        problem: Data and simulator.
-        method: The method.
-        budget: Its limits.
-        rng: The run's generator before its first draw.
 
     Raises:
         TypeError: The method holds a value without a digest, such as a function.

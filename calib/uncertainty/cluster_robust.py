@@ -156,10 +156,7 @@ def eliminated(rows: WindowRows) -> tuple[FloatArray, FloatArray]:
 def without_starts(start: FloatArray, normal: FloatArray, x: FloatArray) -> FloatArray:
     """Return columns ``x``, (W, R, n), without their projection on the start states.
 
-    Args:
-        start: Derivatives by the start states, (W, R, S).
-        normal: The start states' normal matrices, (W, S, S).
-        x: The columns.
+    ``start`` are derivatives by the start states, (W, R, S), ``normal`` their normal matrices, (W, S, S).
     """
     if start.shape[2] == 0:
         return x

@@ -270,14 +270,7 @@ def _factor(cluster: Clustered | None, uniform: float, inflation: float) -> Floa
 def intervals(
     space: ParameterSpace, theta: FloatArray, covariance: FloatArray, shape: PosteriorShape | None = None
 ) -> FloatArray:
-    """Return 90 % intervals, (K, 2), inside the range.
-
-    Args:
-        space: The parameters.
-        theta: Estimate, (K,).
-        covariance: In each parameter's own scale, (K, K).
-        shape: Which intervals are not symmetric.
-    """
+    """Return 90 % intervals, (K, 2), inside the range; the covariance is in each parameter's own scale."""
     K = len(space)
     std, center = np.sqrt(np.diag(covariance)), space.to_scale(theta)
     low = np.maximum(space.from_scale(center - Z90 * std), space.low)
@@ -362,12 +355,7 @@ def _alarms(
 
 
 def mismatch(chi2: float, window: str = "") -> Alarm:
-    """Return the alarm of residuals above the sensors' noise.
-
-    Args:
-        chi2: Mean squared residual over the noise variance.
-        window: The windows, in words.
-    """
+    """Return the alarm of residuals above the sensors' noise; ``window`` names the windows."""
     return Alarm(
         f"Residuals are {np.sqrt(chi2):.1f} times the sensor's noise{window}.",
         "The model does not explain the recording: it lacks something that the robot has (a friction law, "
@@ -399,13 +387,7 @@ def with_rows(refined: Refined) -> Refined:
 
 
 def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> Uncertainty:
-    """Return the uncertainty of a refinement.
-
-    Args:
-        problem: The problem.
-        refined: The fit; variances are clustered if it holds linearised residuals.
-        fixed_latency: The latency was given or decided.
-    """
+    """Return the uncertainty of a refinement; variances are clustered if it holds linearised residuals."""
     return uncertainty(
         problem.space,
         refined.theta,
@@ -420,13 +402,9 @@ def uncertainty_at(problem: Problem, refined: Refined, fixed_latency: bool) -> U
 
 
 def widened_to(problem: Problem, known: Uncertainty, theta: FloatArray, std: FloatArray) -> Uncertainty:
-    """Return ``known`` with standard deviations of at least ``std``, correlations kept.
+    """Return ``known`` with standard deviations of at least ``std``, (K,), correlations kept.
 
-    Args:
-        problem: The problem.
-        known: Uncertainty of ``theta``.
-        theta: The estimate, (K,).
-        std: Least standard deviations in each parameter's own scale, (K,).
+    They are in each parameter's own scale; ``theta``, (K,), is the estimate.
     """
     own = np.sqrt(np.diag(known.covariance))
     factor = np.maximum(std / np.maximum(own, 1e-300), 1.0)

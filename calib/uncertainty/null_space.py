@@ -62,12 +62,7 @@ class NullSpace:
 
 
 def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
-    """Return the directions in which the data have less information than the range.
-
-    Args:
-        space: The parameters.
-        hessian: Information of the data in each parameter's own scale, (K, K).
-    """
+    """Return the directions in which the data have less information, (K, K), than the range."""
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
     blind = values < max(SETTINGS.seen, SETTINGS.rounding * float(values[-1]))
@@ -172,10 +167,8 @@ class Confounded:
 def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, ...]:
     """Return the confounded pairs of kinds, the worst first.
 
-    Args:
-        problem: Kinds and ranges of the parameters.
-        information: Of the data on parameters, in their own scale, and latency, (K + 1, K + 1); without
-            priors.
+    ``information`` is that of the data on parameters, in their own scale, and latency, (K + 1, K + 1);
+    without priors.
     """
     space = problem.space
     low, high = problem.latency_range_s

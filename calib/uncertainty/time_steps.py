@@ -216,13 +216,7 @@ class StepCheck:
 
 
 def check_step(problem: Problem, refined: Refined, settings: StepSettings | None = None) -> StepCheck:
-    """Compare predictions with the model's step and with half of it.
-
-    Args:
-        problem: Recordings and simulator.
-        refined: The fit, with linearised residuals.
-        settings: Limits of the cost.
-    """
+    """Compare predictions with the model's step and with half of it; the fit has linearised residuals."""
     step_s, K = problem.robot.step_s, len(problem.space)
     nothing = np.zeros(K + 1)
     if problem.robot.base is not None:
@@ -250,14 +244,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
 
 
 def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: StepCheck) -> Uncertainty:
-    """Return ``known`` with intervals widened by the step's shift, unless the recordings contradict it.
-
-    Args:
-        problem: Range of the latency.
-        known: Uncertainty before.
-        theta: The estimate, (K,).
-        found: The comparison.
-    """
+    """Return ``known`` with intervals widened by the step's shift, unless the recordings contradict it."""
     if found.note or found.rejected:
         return known
     std = np.sqrt(np.diag(known.covariance)) + np.abs(found.bias[:-1]) / Z90
@@ -270,13 +257,7 @@ def counted(problem: Problem, known: Uncertainty, theta: FloatArray, found: Step
 
 
 def step_alarm(problem: Problem, known: Uncertainty, found: StepCheck) -> tuple[Alarm, ...]:
-    """Return the alarm of a step that is too coarse, if it is.
-
-    Args:
-        problem: Names of the parameters.
-        known: Uncertainty without the step's shift.
-        found: The comparison.
-    """
+    """Return the alarm of a step that is too coarse, if it is; ``known`` is without the step's shift."""
     if found.note or not found.preferred:
         return ()
     half_width = Z90 * np.sqrt(np.diag(known.covariance))
@@ -311,12 +292,7 @@ def _shifted(rows: WindowRows, change: FloatArray) -> WindowRows:
 def _refitted(
     rows: tuple[WindowRows, ...] | list[WindowRows], belief: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return the cost after a linear refit, and its step, (K + 1,).
-
-    Args:
-        rows: Linearised residuals.
-        belief: Information on parameters and latency without the data, (K + 1,).
-    """
+    """Return the cost after a linear refit, and its step, (K + 1,); ``belief`` is the prior information."""
     P = len(belief)
     cost, gradient, hessian = 0.0, np.zeros(P), np.diag(belief)
     for one in rows:

@@ -86,14 +86,8 @@ def choose(
 ) -> Choice:
     """Fit every candidate without each fold and compare the predictions of that fold.
 
-    Args:
-        problem: The problem, without held-out recordings.
-        search: The search.
-        budget: Its budget in each fold.
-        seed: Seeds the folds' searches.
-        length: Samples of a prediction.
-        search_steps: Cost of the search on all data [physics steps].
-        robust: Try the robust refinement, too.
+    The search on all data cost ``search_steps`` physics steps. Predictions have ``length`` samples.
+    ``robust`` adds the robust refinement.
     """
     window_s = length * problem.episodes[0].period_s
     if (cost := SETTINGS.folds * search_steps) > SETTINGS.most_steps:
@@ -201,10 +195,7 @@ def motion_numbers(episodes: Sequence[SampledEpisode]) -> list[int]:
 def prediction_error(problem: Problem, fits: Sequence[tuple[FloatArray, float]], length: int) -> FloatArray:
     """Return the root mean squared prediction error of each candidate in units of the sensor's noise, (N,).
 
-    Args:
-        problem: Recordings to predict from their smoothed states.
-        fits: Parameters, (K,), and latency [s] of each candidate.
-        length: Samples of a prediction; fewer where no stretch is so long.
+    Predictions start from smoothed states and have ``length`` samples, or fewer where no stretch is so long.
     """
     theta, latency = np.stack([f[0] for f in fits]), np.array([f[1] for f in fits])
     total, count = np.zeros(len(fits)), 0

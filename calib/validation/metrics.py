@@ -120,11 +120,7 @@ class HeldOut:
         self._simulate({None: None})
 
     def errors(self, candidates: Mapping[str, tuple[FloatArray, float]]) -> HeldoutErrors:
-        """Return the errors of candidates and of "null".
-
-        Args:
-            candidates: Name to physical parameters, (K,), and latency [s].
-        """
+        """Return the errors of candidates (parameters, (K,), and latency [s], by name) and of "null"."""
         keys: dict[str, tuple[bytes, float] | None] = {
             name: (np.asarray(theta, dtype=np.float64).tobytes(), latency_s)
             for name, (theta, latency_s) in candidates.items()
@@ -182,14 +178,10 @@ def _still(problem: Problem, data: WindowData) -> FloatArray:
 def signal_range(
     episode: SampledEpisode, values: FloatArray, columns: IntArray, rotation: slice
 ) -> FloatArray:
-    """Return the range of each measured coordinate in a recording, (n,).
+    """Return the range of each measured coordinate in a recording, (n,), from its values, (T, n).
 
-    Args:
-        episode: The recording.
-        values: The coordinates' values, (T, n).
-        columns: Their indices, (n,).
-        rotation: Coordinates of a base's rotation vector. Their reference moves with the base, so their range
-            is that of the turn from the first orientation.
+    The reference of a base's rotation vector moves with the base, so its range is that of the turn from the
+    first orientation.
     """
     span = np.ptp(values, axis=0)
     if episode.reference is not None:

@@ -84,10 +84,7 @@ def random_delay(
 ) -> RandomDelay | None:
     """Compare random delays with other processes; None where there is nothing to compare.
 
-    Args:
-        rows: Linearised residuals, per episode.
-        answers: Responses of the windows to commands, per episode.
-        period_s: Sampling period [s].
+    Residuals and the windows' responses to commands are given per episode.
     """
     every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
     chosen = every[:: max(-(-len(every) // SETTINGS.windows), 1)]

@@ -210,9 +210,7 @@ def _where(names: Sequence[str], group: Sequence[int]) -> tuple[str, str, tuple[
 def find_shared_error(problem: Problem, local: Refined | None) -> FoundError | None:
     """Return the error whose correction makes unpredictable recordings predictable.
 
-    Args:
-        problem: The problem.
-        local: The fit of the original recordings; None where it diverged.
+    ``local`` is the fit of the original recordings; None where it diverged.
     """
     if problem.robot.base is not None or problem.noise_free:
         return None

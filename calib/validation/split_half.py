@@ -120,12 +120,9 @@ class SplitHalf:
 
 
 def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> SplitHalf:
-    """Refine two halves of the windows alone and compare; the latency stays.
+    """Refine two halves of the windows alone and compare with ``refined``; the latency stays.
 
-    Args:
-        problem: The problem.
-        refined: The refinement of all windows.
-        known: Its uncertainty; unidentified parameters are not compared.
+    Parameters that ``known`` calls unidentified are not compared.
     """
     shooting, K = refined.shooting, len(problem.space)
     nothing = np.zeros(K)
@@ -162,16 +159,7 @@ def agreement(
     halves: Sequence[Uncertainty],
     steps: int,
 ) -> SplitHalf:
-    """Return whether two halves agree.
-
-    Args:
-        problem: All data.
-        theta: The estimate on all data, (K,).
-        known: Its uncertainty; unidentified parameters are not compared.
-        estimates: Of each half, (K,).
-        halves: Uncertainty of each half.
-        steps: Physics steps used.
-    """
+    """Return whether two halves agree, given estimates, (K,), and uncertainties of all data and halves."""
     space = problem.space
 
     def three(half: int, k: int) -> tuple[float | None, float, float]:
@@ -202,13 +190,9 @@ def widened_by_split_half(
 
 
 def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
-    """Return every other block of the windows, and the point in them.
+    """Return every other block of the windows, from block ``half``, and the point in them.
 
-    Args:
-        shooting: All windows.
-        point: The point in all of them.
-        half: 0 or 1.
-        block: Windows in a block; the count continues over recordings.
+    The count of windows continues over recordings.
     """
     data, position, velocity, first = [], [], [], 0
     for e, of_episode in enumerate(shooting.data):
