@@ -129,7 +129,7 @@ class OutputErrorFits(Fits):
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
         settings, problem = self.settings, run.problem
         if run.settings.cross_validation:
-            problem = _whole(problem)
+            problem = _joined_stretches(problem)
         if np.isfinite(settings.fitted_s):
             parts = [p for e in problem.episodes for p in stretches(e, settings.stretch_s) if p.usable.any()]
             problem = problem.on(spread(parts, settings.fitted_s), problem.known_std)
@@ -146,13 +146,13 @@ class OutputErrorFits(Fits):
         members = self._members(run, problem, _member(first), searched, choice.chosen)
         theta, latency_s = members[choice.chosen]
         recipe = settings.recipe(choice.chosen)
-        told = dataclasses.replace(recipe, latency=True)
-        fit = fit_output_error(problem, theta, latency_s, told, iterations=0, central=True)
+        with_latency = dataclasses.replace(recipe, latency=True)
+        fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
         known = _known(problem, fit)
         split = self._split_half(problem, fit, recipe, known)
         known = widened_by_split_half(problem, known, theta, split)
         if settings.hold_first:
-            known = _holding(problem, known, theta, first.theta)
+            known = _including(problem, known, theta, first.theta)
         if settings.force_std:
             known = _scaled_together(problem, known, theta, settings.force_std)
         facts: dict[str, Any] = {}
@@ -351,7 +351,7 @@ def _scaled_together(problem: Problem, known: Uncertainty, theta: FloatArray, st
     return dataclasses.replace(known, interval=interval, covariance=covariance)
 
 
-def _holding(problem: Problem, known: Uncertainty, theta: FloatArray, other: FloatArray) -> Uncertainty:
+def _including(problem: Problem, known: Uncertainty, theta: FloatArray, other: FloatArray) -> Uncertainty:
     """Widen intervals and covariance to include another estimate, (K,)."""
     apart = problem.space.to_scale(other) - problem.space.to_scale(theta)
     low, high = known.interval.T
@@ -361,7 +361,7 @@ def _holding(problem: Problem, known: Uncertainty, theta: FloatArray, other: Flo
     return dataclasses.replace(known, interval=interval, covariance=covariance)
 
 
-def _whole(problem: Problem) -> Problem:
+def _joined_stretches(problem: Problem) -> Problem:
     """Return the problem with consecutive stretches joined, so that long windows fit."""
     episodes = joined(problem.episodes)
     return problem.on(episodes, problem.known_std) if len(episodes) < len(problem.episodes) else problem

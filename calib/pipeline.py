@@ -195,11 +195,11 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             run.say(BEFORE_SEARCH, DIVERGED)
         # Another minimum can leave a residual as small as noise, but with a pattern.
         if local is not None and conclusive(problem, local, MISMATCH.white_samples):
-            found = to_the_noise(run, without_search(problem, budget, local), local)
+            found = conclude_fit(run, without_search(problem, budget, local), local)
         else:
             if local is not None and progress is not None:
                 local = with_rows(local)
-                foretell(problem, local, progress)
+                report_unidentifiable(problem, local, progress)
             found = with_shared_error(self.fits, dataclasses.replace(run, local=local))
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
@@ -267,7 +267,7 @@ class Refinement(Fits):
             # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
                 best = (best[0], local)
-        return to_the_noise(run, *best, self._choose(run, *best), attempt)
+        return conclude_fit(run, *best, self._choose(run, *best), attempt)
 
     def _better(self, a: Refined, b: Refined) -> bool:
         """Return whether ``a`` is the better fit; window length counts only where both are explained."""
@@ -294,7 +294,7 @@ class Refinement(Fits):
         return choose(run.problem, run.search, less, seed, refined.shooting.length, searched.steps, robust)
 
 
-def to_the_noise(
+def conclude_fit(
     run: CalibrationRun,
     searched: CalibrationResult,
     refined: Refined,
@@ -368,7 +368,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     return dataclasses.replace(found, known=known, facts={**found.facts, "shared_error": suspect.to_json()})
 
 
-def foretell(problem: Problem, local: Refined, progress: ProgressCallback) -> None:
+def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:
     """Report before the search which parameters the recordings do not show (Fisher information at ``local``).
 
     The local fit has linearised residuals.

@@ -37,7 +37,7 @@ from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.types import FloatArray, IntArray
 
@@ -89,13 +89,13 @@ class BoSettings:
             raise ConfigurationError(f"most_points must be at least 4, got {self.most_points}")
 
 
-class TrustRegion(Kept):
+class TrustRegion(Stateful):
     """The side of the box for the next batch, in widths of the range (TuRBO, algorithm 1).
 
     It is halved after ``failures`` generations without a better point.
     """
 
-    KEPT = ("length", "_good", "_bad")
+    STATE = ("length", "_good", "_bad")
     LONGEST, FIRST, SHORTEST = 1.6, 0.8, 0.5**7
     SUCCESSES = 3
     """Consecutive better points after which the box is doubled."""
@@ -116,14 +116,14 @@ class TrustRegion(Kept):
             self.length = self.FIRST
 
 
-class GaussianProcessSearch(Kept):
+class GaussianProcessSearch(Stateful):
     """Points in the unit cube, proposed from a Gaussian process of the scores of earlier ones.
 
     All draws come from one seed and the generation's number, so points and scores are the whole state. Unless
     the fitness is ``stationary``, each generation has the whole population and scores earlier points again.
     """
 
-    KEPT = ("_points", "_fitness", "_generation", "_seed", "scored", "fallbacks", "region")
+    STATE = ("_points", "_fitness", "_generation", "_seed", "scored", "fallbacks", "region")
 
     def __init__(
         self, count: int, population: int, settings: BoSettings, seed: int, *, stationary: bool

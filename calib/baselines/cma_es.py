@@ -16,7 +16,7 @@ from deal_hw.calib.baselines.scored import ScoredStepper
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import Search, SearchLog
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.errors import ConfigurationError, DatasetError, MissingExtraError
 from deal_hw.types import FloatArray
 
@@ -54,7 +54,7 @@ class CmaSettings:
             )
 
 
-class RestartedCma(Kept):
+class RestartedCma(Stateful):
     """CMA-ES in the unit cube, restarted when a run has ended; all randomness comes from one seed.
 
     pycma's state can only be stored by pickling. So the costs are stored, and replaying them restores the
@@ -151,7 +151,7 @@ class RestartedCma(Kept):
 
 
 class _Cma(ScoredStepper):
-    KEPT = ("_search", "_fitness", "_scored", "_best")
+    STATE = ("_search", "_fitness", "_scored", "_best")
 
     settings: CmaSettings
 
@@ -218,7 +218,7 @@ class Cma(Search):
     settings: CmaSettings = field(default_factory=CmaSettings)
 
 
-class Best(Kept):
+class Best(Stateful):
     """The best member so far; before any score, the midpoint of the range.
 
     Attributes:
@@ -228,7 +228,7 @@ class Best(Kept):
         population: The last population of that run, (n, C).
     """
 
-    KEPT = ("unit", "fitness", "run", "population")
+    STATE = ("unit", "fitness", "run", "population")
 
     def __init__(self, count: int) -> None:
         self.unit, self.fitness, self.run = np.full(count, 0.5), -float("inf"), 0

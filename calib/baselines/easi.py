@@ -19,7 +19,7 @@ from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.deal_paper.fitness import FitnessSettings
 from deal_hw.calib.search.base import RangedSearch, Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -58,13 +58,13 @@ def elite_weights(population: int, elites: int) -> FloatArray:
     return np.asarray(raw / raw.sum())
 
 
-class EliteGaussian(Kept):
+class EliteGaussian(Stateful):
     """A diagonal Gaussian in the unit cube that is fitted to the best members of its own sample.
 
     The first members, (N, C), are drawn uniformly.
     """
 
-    KEPT = ("_population", "mean", "std")
+    STATE = ("_population", "mean", "std")
 
     def __init__(self, population: FloatArray, survive_rate: float, rng: np.random.Generator) -> None:
         if len(population) < 2:

@@ -113,7 +113,7 @@ class _Passes(Stepper):
     """One run: a generation is one pass along all recordings."""
 
     settings: EkfSettings
-    KEPT = ("_value", "_covariance", "_lost", "_misfit")
+    STATE = ("_value", "_covariance", "_lost", "_misfit")
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)

@@ -122,7 +122,7 @@ class _MultiStart(Stepper):
     """One run: draw, refine one start per generation, stage by stage, draw again."""
 
     settings: GaussNewtonSettings
-    KEPT = ("_stage", "_number", "_restarts", "_explained", "_drawn", "_values", "_chi2", "_best")
+    STATE = ("_stage", "_number", "_restarts", "_explained", "_drawn", "_values", "_chi2", "_best")
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:
         super().__init__(log, rng, search)

@@ -23,7 +23,7 @@ class ScoredStepper(Stepper):
     The settings name the fitness and its own settings; its window is also that of the stated residual.
     """
 
-    KEPT: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
+    STATE: ClassVar[tuple[str, ...]] = ("_search", "_fitness")
     INTERVAL = "population spread, uncalibrated"
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:

@@ -26,7 +26,7 @@ class NoSettings:
 class _Draw(Stepper):
     """One generation: the population is a uniform draw, so that the interval is the range's."""
 
-    KEPT = ("_unit",)
+    STATE = ("_unit",)
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Ignorant) -> None:
         super().__init__(log, rng, search)
@@ -108,7 +108,7 @@ class RandomSettings:
 class _Random(Stepper):
     """A run of `random`: each generation draws one population and keeps the best."""
 
-    KEPT = ("_unit", "_score")
+    STATE = ("_unit", "_score")
 
     settings: RandomSettings
 

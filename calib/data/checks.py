@@ -134,7 +134,7 @@ def compute_sensitivity(problem: Problem) -> Sensitivity:
         theta[1 + 2 * k, k], theta[2 + 2 * k, k] = space.low[k], space.high[k]
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     effect = np.zeros(K)
-    for data in _some(longest_windows(problem, SETTINGS.window_s)):
+    for data in _spread_windows(longest_windows(problem, SETTINGS.window_s)):
         predicted = problem.predict(theta, latency, data).observed
         change = np.abs(predicted[1:] - predicted[:1]) / data.std
         # A member that diverges at the end of its range does have an effect.
@@ -163,7 +163,7 @@ def jumps(problem: Problem) -> dict[str, float]:
     theta = space.from_scale(values)
     latency = np.full(len(theta), problem.fixed_latency_s or 0.0)
     changes = []
-    for data in _some(longest_windows(problem, SETTINGS.window_s)):
+    for data in _spread_windows(longest_windows(problem, SETTINGS.window_s)):
         predicted = problem.predict(theta, latency, data).observed
         change = np.where(np.isfinite(data.std), np.abs(predicted[1:] - predicted[:1]), 0.0)
         changes.append(np.nan_to_num(change.max(axis=(2, 3)), nan=0.0, posinf=0.0))
@@ -190,7 +190,7 @@ def require_sensitive(found: Sensitivity) -> None:
         )
 
 
-def _some(windows: list[WindowData]) -> list[WindowData]:
+def _spread_windows(windows: list[WindowData]) -> list[WindowData]:
     """Return about ``most_windows`` of the windows, evenly over all recordings."""
     total = sum(len(data.windows) for data in windows)
     every = max(total // SETTINGS.most_windows, 1)

@@ -88,7 +88,7 @@ class _Box:
 class _DealPaper(Stepper):
     """A run of Algorithm 1: one denoising step a generation."""
 
-    KEPT = ("_search", "_fitness")
+    STATE = ("_search", "_fitness")
 
     settings: PaperSettings
 

@@ -13,7 +13,7 @@ from deal_hw.types import FloatArray
 class CriticFitness(Fitness):
     """Rollouts, replay and critic: lines 3 to 9 of Algorithm 1."""
 
-    KEPT = ("_critic", "_replay")
+    STATE = ("_critic", "_replay")
 
     def _prepare(self, rng: np.random.Generator) -> None:
         settings = self._settings

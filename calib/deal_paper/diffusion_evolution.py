@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import logsumexp, softmax
 
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
@@ -89,13 +89,13 @@ class DiffusionStep:
     clamped: bool
 
 
-class DiffusionEvolution(Kept):
+class DiffusionEvolution(Stateful):
     """A population (N, K) in a box around zero; a uniform start of unit variance fits eq. 12 best.
 
     The paper draws the start theta^T uniformly from the search range.
     """
 
-    KEPT = ("_theta", "t")
+    STATE = ("_theta", "t")
 
     def __init__(self, population: FloatArray, settings: DiffusionSettings, rng: np.random.Generator) -> None:
         self._theta = np.array(population, dtype=float)

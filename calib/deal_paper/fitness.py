@@ -26,7 +26,7 @@ from deal_hw.calib.deal_paper.rollouts import (
     transitions,
 )
 from deal_hw.calib.search.base import Coordinates
-from deal_hw.calib.search.resume import Kept
+from deal_hw.calib.search.resume import Stateful
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
 
@@ -90,7 +90,7 @@ class FitnessSettings:
             raise ConfigurationError(f"the bandwidth must be above 0 or None, got {self.bandwidth:g}")
 
 
-class Fitness(Kept, abc.ABC):
+class Fitness(Stateful, abc.ABC):
     """A score of members; ``values`` are further values of the last call of `score`, for the trace."""
 
     def __init__(

@@ -27,7 +27,7 @@ class ChartSettings:
         lags: Longest lag of autocorrelations [samples].
         bins: Of histograms.
         log_ratio: Ratio of highest to lowest value above which positive series get a log scale.
-        told: Least size of listed correlations.
+        strong: Least size of listed correlations.
         listed: Most listed correlations.
         picture: Width of the robot's drawing [pixels].
     """
@@ -38,7 +38,7 @@ class ChartSettings:
     lags: int = 20
     bins: int = 30
     log_ratio: float = 20.0
-    told: float = 0.8
+    strong: float = 0.8
     listed: int = 12
     picture: int = 480
 
@@ -290,7 +290,7 @@ def strongest(matrix: FloatArray, names: Sequence[str]) -> list[tuple[str, str, 
     """Return the pairs of parameters with the strongest correlations, strongest first."""
     i, j = np.triu_indices(len(matrix), 1)
     size = np.nan_to_num(np.abs(matrix[i, j]))
-    order = [n for n in np.argsort(-size) if size[n] >= SETTINGS.told][: SETTINGS.listed]
+    order = [n for n in np.argsort(-size) if size[n] >= SETTINGS.strong][: SETTINGS.listed]
     return [(names[i[n]], names[j[n]], float(matrix[i[n], j[n]])) for n in order]
 
 

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
-from deal_hw.calib.report.story import tell
+from deal_hw.calib.report.story import make_story
 from deal_hw.calib.validation.verdict import trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult
 from deal_hw.data.files import published_together, write_json
@@ -46,7 +46,7 @@ class Row:
     low: float
     high: float
     verdict: str
-    told: bool
+    has_value: bool
     outside: bool
     at_bound: str
     bar_left: float
@@ -93,7 +93,7 @@ def render(inputs: ReportInputs) -> str:
         style=Markup(_asset("report.css")),
         script=Markup(script),
         script_digest=script_digest(script),
-        story=tell(result),
+        story=make_story(result),
         drawing=None if inputs.drawing is None else charts.robot(inputs.drawing),
         rows=rows,
         trust=trust(result),
@@ -115,7 +115,7 @@ def render(inputs: ReportInputs) -> str:
         scan=charts.latency_scan(_mapping(provenance.get("latency_scan")), inputs.tick_s),
         correlations=None if matrix is None else charts.correlations(matrix),
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
-        told=charts.SETTINGS.told,
+        strong=charts.SETTINGS.strong,
         trace=charts.trace(result.trace),
         population=[]
         if result.population is None
@@ -159,7 +159,7 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
             spread = f"{100 * p.prior_std:.3g} %" if p.scale == "log" else f"{p.prior_std:.3g} {p.unit}"
             prior = f"expected {p.prior_mean:.4g} {p.unit} within {spread}"
         low, high = map(float, result.interval[k])
-        told = bool(with_value(result)[k])
+        has_value = bool(with_value(result)[k])
         rows.append(
             Row(
                 parameter=p,
@@ -167,8 +167,8 @@ def parameter_rows(result: CalibrationResult) -> list[Row]:
                 low=low,
                 high=high,
                 verdict=result.verdicts[k] if result.verdicts else "",
-                told=told,
-                outside=told and not low <= result.estimate[k] <= high,
+                has_value=has_value,
+                outside=has_value and not low <= result.estimate[k] <= high,
                 at_bound=bound,
                 bar_left=float(at[0][k]),
                 bar_width=max(float(at[1][k] - at[0][k]), 0.4),

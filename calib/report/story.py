@@ -47,7 +47,7 @@ class Story:
     in_units: str = ""
 
 
-def tell(result: CalibrationResult) -> Story:
+def make_story(result: CalibrationResult) -> Story:
     """Return the story of a result, in the measure of its verdict: the error over the signal's range."""
     errors = result.heldout_nrmse
     if "nominal" not in errors or "calibrated" not in errors:

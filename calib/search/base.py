@@ -17,7 +17,7 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.search.resume import Kept, restore_generator
+from deal_hw.calib.search.resume import Stateful, restore_generator
 from deal_hw.calibration import (
     Z90,
     Alarm,
@@ -194,7 +194,7 @@ class SearchLog:
         return replace(plain, **better)
 
 
-class Stepper(Kept, abc.ABC):
+class Stepper(Stateful, abc.ABC):
     """One run of a search, between its generations."""
 
     def __init__(self, log: SearchLog, rng: np.random.Generator, search: Search) -> None:

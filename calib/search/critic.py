@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.errors import MissingExtraError
 from deal_hw.types import FloatArray
 
@@ -60,7 +60,7 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class Critic(Kept):
+class Critic(Stateful):
     """A network with two hidden layers, ReLU, and one output (the paper's D)."""
 
     def __init__(self, inputs: int, settings: CriticSettings, rng: np.random.Generator) -> None:

@@ -37,7 +37,7 @@ from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.search.base import Search, SearchLog
 from deal_hw.calib.search.critic import CriticSettings, PenaltyCritic, Samples, torch_threads
 from deal_hw.calib.search.eki import KalmanStepper
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -82,7 +82,7 @@ class DealSettings:
 class _Deal(KalmanStepper):
     """A run of `deal`: stages of windows, one round of critic updates and one Kalman step a generation."""
 
-    KEPT = ("kalman", "_stage", "_spread", "_view")
+    STATE = ("kalman", "_stage", "_spread", "_view")
 
     settings: DealSettings
 
@@ -167,13 +167,13 @@ class _Deal(KalmanStepper):
         self._view = kind(self.problem, self.settings, self._lengths[stage], self.rng, stage > 0)
 
 
-class _View(Kept, abc.ABC):
+class _View(Stateful, abc.ABC):
     """The critic's samples of recording and population, and the statistics of each member.
 
     With ``move_starts`` it linearises around each generation's most probable start states.
     """
 
-    KEPT = ("_critic", "_offsets")
+    STATE = ("_critic", "_offsets")
 
     def __init__(
         self,

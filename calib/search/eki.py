@@ -19,7 +19,7 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, cut, explained, is_noisy, whitened_residual
 from deal_hw.calib.search.base import Search, SearchLog, Stepper
-from deal_hw.calib.search.resume import Kept, State
+from deal_hw.calib.search.resume import State, Stateful
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -39,14 +39,14 @@ class KalmanStep:
     spread: float
 
 
-class EnsembleKalman(Kept):
+class EnsembleKalman(Stateful):
     """An ensemble (N, C) that moves towards residual zero.
 
     ``step_clip`` is the largest move of a coordinate in one step: a regression is not valid far from its
     samples.
     """
 
-    KEPT = ("_members", "tempering")
+    STATE = ("_members", "tempering")
 
     def __init__(self, ensemble: FloatArray, rng: np.random.Generator, step_clip: float = 2.0) -> None:
         self._members = np.array(ensemble, dtype=float)
@@ -198,7 +198,7 @@ class EkiSettings:
 class _Eki(KalmanStepper):
     """A run of `eki`: searches, each of several stages, each of several generations."""
 
-    KEPT = ("kalman", "_restarts", "_best", "_over", "_stage", "_generation", "_offsets")
+    STATE = ("kalman", "_restarts", "_best", "_over", "_stage", "_generation", "_offsets")
 
     settings: EkiSettings
 

@@ -36,22 +36,22 @@ PACKAGES = ("deal-hw", "mujoco", "numpy", "scipy", "torch", "botorch", "cma", "g
 """Packages whose versions may change a run's numbers, where installed."""
 
 
-class Kept:
+class Stateful:
     """An object whose state is some of its attributes: plain values, arrays or objects of this class."""
 
-    KEPT: ClassVar[tuple[str, ...]] = ()
+    STATE: ClassVar[tuple[str, ...]] = ()
     """Names of these attributes; they decide all that follows."""
 
     def save(self) -> State:
         """Return a copy of the state."""
-        held = {name: getattr(self, name) for name in self.KEPT}
-        return {k: v.save() if isinstance(v, Kept) else copy.deepcopy(v) for k, v in held.items()}
+        held = {name: getattr(self, name) for name in self.STATE}
+        return {k: v.save() if isinstance(v, Stateful) else copy.deepcopy(v) for k, v in held.items()}
 
     def load(self, state: State) -> None:
         """Continue from what :meth:`save` returned."""
-        for name in self.KEPT:
+        for name in self.STATE:
             held = getattr(self, name)
-            if isinstance(held, Kept):
+            if isinstance(held, Stateful):
                 held.load(state[name])
             else:
                 setattr(self, name, copy.deepcopy(state[name]))
@@ -241,10 +241,10 @@ def digest(value: Any) -> str:
     Raises:
         TypeError: A value has another type.
     """
-    return hashlib.sha256(json.dumps(value, default=_told_apart).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(value, default=_to_plain).encode()).hexdigest()
 
 
-def _told_apart(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {"array": [value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()]}
     if isinstance(value, CalibrationMethod):

@@ -115,10 +115,10 @@ def sparse_basis(vectors: FloatArray) -> FloatArray:
 
 def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]:
     """Describe the combinations of parameters without effect on the recordings."""
-    return tuple(_words(space, direction) for direction in unseen.directions)
+    return tuple(_describe(space, direction) for direction in unseen.directions)
 
 
-def _words(space: ParameterSpace, direction: FloatArray) -> str:
+def _describe(space: ParameterSpace, direction: FloatArray) -> str:
     parts = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) > SETTINGS.part]
     lead = np.sign(direction[parts[0]])
     up = [space.names[k] for k in parts if np.sign(direction[k]) == lead]

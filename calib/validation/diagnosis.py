@@ -251,7 +251,7 @@ def name_causes(known: Evidence) -> list[Diagnosis]:
         share = 1 - float(np.exp(-max(gains) / left.count))
         if max(gains) <= SETTINGS.evidence or share <= SETTINGS.noticed:
             break
-        found.append(_told(left, taken, group, share, max(gains)))
+        found.append(_cause_diagnosis(left, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
     varying = _varying_delay(known)
@@ -282,19 +282,19 @@ def _finding(
     return Diagnosis(cause, float(share), float(deviance), tuple(joints), alarm)
 
 
-def _told(
+def _cause_diagnosis(
     left: _Left, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
 ) -> Diagnosis:
     cause = group[0].cause
     if cause == "mass":
-        return _told_mass(left, taken, share, deviance)
+        return _mass_diagnosis(left, taken, share, deviance)
     gains = np.array([left.gain(taken, [signature]) for signature in group])
     order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
     joints = [group[k].where for k in order[:4]]
     return _finding(cause, share, deviance, joints, listed(joints))
 
 
-def _told_mass(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
+def _mass_diagnosis(left: _Left, taken: Sequence[Signature], share: float, deviance: float) -> Diagnosis:
     """Name each body that explains about as much: without a known torque, motion shows mass ratios only."""
     bodies = [s for s in left.known.found if s.cause == "mass"]
     gains = {k: left.gain(taken, [body]) for k, body in enumerate(bodies)}

@@ -143,11 +143,11 @@ def check_split_half(problem: Problem, refined: Refined, known: Uncertainty) -> 
         found = refine_windows(
             *half_of(shooting, refined.point, half, block), SETTINGS.iterations, fixed_latency=True
         )
-        told = uncertainty_at(problem, with_rows(found), fixed_latency=True)
+        own = uncertainty_at(problem, with_rows(found), fixed_latency=True)
         # A half holds few blocks: the clustering of all blocks holds for it, too.
-        std = np.sqrt(np.diag(told.covariance)) * np.maximum(known.widened / told.widened, 1.0)
+        std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
         estimates.append(found.theta)
-        halves.append(widened_to(problem, told, found.theta, std))
+        halves.append(widened_to(problem, own, found.theta, std))
     return agreement(problem, refined.theta, known, estimates, halves, problem.steps - before)
 
 
@@ -164,17 +164,17 @@ def agreement(
 
     def three(half: int, k: int) -> tuple[float | None, float, float]:
         estimate, (low, high) = float(estimates[half][k]), map(float, halves[half].interval[k])
-        told = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
-        return estimate if told else None, low, high
+        identified = halves[half].verdicts[k] != "not identifiable" and low <= estimate <= high
+        return estimate if identified else None, low, high
 
     rows = tuple(
         SplitHalfRow(name=n, first=three(0, k), second=three(1, k)) for k, n in enumerate(space.names)
     )
-    told = ~known.shape.blind
-    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(told.sum()), 1)))
+    identified = ~known.shape.blind
+    least = norm.ppf(1 - SETTINGS.false_alarms / (2 * max(int(identified.sum()), 1)))
     scaled = space.to_scale(np.stack(estimates))
     far = np.abs(scaled[0] - scaled[1]) > least * np.hypot(*(np.sqrt(np.diag(h.covariance)) for h in halves))
-    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and told[k] and r.agree is False)
+    flagged = tuple(r.name for k, r in enumerate(rows) if far[k] and identified[k] and r.agree is False)
     return SplitHalf(rows, flagged, np.max(np.abs(scaled - space.to_scale(theta)), axis=0), steps)
 
 

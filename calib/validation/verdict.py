@@ -216,12 +216,12 @@ def trust(result: CalibrationResult) -> Trust:
             "The method does not test whether the model explains the recordings.",
             f"Compare the held-out error with the error that your task allows. {record}".strip(),
         )
-    untold = result.verdicts.count("not identifiable")
-    if result.null_directions or untold:
+    unidentified = result.verdicts.count("not identifiable")
+    if result.null_directions or unidentified:
         return Trust(
             "amber",
             f"{gain} {noise}"
-            + (f" {untold} of {len(result.space)} parameters have no value." if untold else ""),
+            + (f" {unidentified} of {len(result.space)} parameters have no value." if unidentified else ""),
             "The model explains the recordings, but they do not identify all parameters.",
             "Use it: training draws these parameters from their whole range. Or record the motion advised "
             "below.",

@@ -115,8 +115,8 @@ def draw(path: Path, rows: Sequence[Row], settings: FigureSettings = SETTINGS) -
         _policies(places[-1], trained)
     # One legend for all panels: a colour has the same meaning in each.
     named = [pair for axes in places for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    told = {label: handle for handle, label in sorted(named, key=lambda pair: "no data" in pair[1])}
-    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=columns + 1, fontsize=9)
+    legend = {label: handle for handle, label in sorted(named, key=lambda pair: "no data" in pair[1])}
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=columns + 1, fontsize=9)
     figure.savefig(path, dpi=settings.dpi)
 
 

@@ -96,7 +96,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
     for joint in isaac["damping"]:
         isaac["damping"][joint] += rows[joint]["joint_damping"]
     blind = [result.space[name] for name in result.without_value]
-    untold = {
+    unidentified = {
         joint: [
             _ACTUATOR_KINDS[p.kind] for p in blind if p.kind in _ACTUATOR_KINDS and _drives(robot, p, number)
         ]
@@ -106,7 +106,7 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
         "format": "deal_hw.actuators/1",
         "physics_step_s": robot.step_s,
         "delay_s": {joint: row["delay_s"] for joint, row in rows.items()},
-        "without_value": {joint: names for joint, names in untold.items() if names},
+        "without_value": {joint: names for joint, names in unidentified.items() if names},
         "isaac_lab": {
             "class": "DelayedPDActuatorCfg",
             "joint_names_expr": list(rows),
