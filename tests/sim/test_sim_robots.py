@@ -208,7 +208,7 @@ def test_joints_and_actuators_that_are_left_out(model: Path) -> None:
     path = written(model)
     text = path.read_text(encoding="utf-8")
     path.write_text(text[: text.index("  - name: elbow")], encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="the MJCF's elbow are not among `joints`; add them"):
+    with pytest.raises(ConfigurationError, match="the MJCF's joints elbow are not among `joints`; add them"):
         read_robot(path)
     cut = text[: text.rindex("    actuator:")] + "    actuator: null\n"
     path.write_text(cut, encoding="utf-8")

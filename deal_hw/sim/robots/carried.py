@@ -74,7 +74,7 @@ def carried_description(dataset: Path, values: Mapping[str, Any]) -> RobotDescri
     for name, digest in digests.items():
         file = folder / name
         if not file.is_file():
-            raise DatasetError(f"{file}, a file of the dataset's robot, is missing; {AGAIN}")
+            raise DatasetError(f"{file} is missing; the dataset's robot needs it: {AGAIN}")
         if _digest(file) != digest:
             raise DatasetError(
                 f"{file} was changed after the recordings were imported; {AGAIN}. For a changed model make "
