@@ -141,7 +141,7 @@ def test_the_papers_protocol_is_won_by_the_empty_predictor(tmp_path: Path) -> No
     assert rows["nominal"]["error_percent"] == 0.0
     # The centre of a linear range [p / 5, 5 p] is 2.6 p.
     assert rows["midpoint"]["error_percent"] == pytest.approx(160.0)
-    assert "scores 0" in rows["midpoint"]["note"]
+    assert "error of 0" in rows["midpoint"]["note"]
 
 
 @pytest.mark.parametrize(
