@@ -183,7 +183,7 @@ class OutputErrorFits(Fits):
                 problem.space.names[k] for k in np.flatnonzero(ended_at_bound(problem.space, theta))
             ],
             "split_half": split.to_json(),
-            "confounded": [pair.to_json() for pair in found],
+            "confounded": [dataclasses.asdict(pair) for pair in found],
         }
         known = dataclasses.replace(
             known,
@@ -369,8 +369,7 @@ def _joined_stretches(problem: Problem) -> Problem:
 
 def _error(problem: Problem, rmse: FloatArray) -> float:
     """Return the mean error of the channels, (M,); the geometric mean where units differ."""
-    C, units = problem.coordinates, problem.robot.coordinate_units
-    if len({units[c % C] + "/s" * int(c >= C) for c in problem.channels}) == 1:
+    if len(set(problem.channel_units)) == 1:
         return float(np.mean(rmse))
     return float(np.exp(np.mean(np.log(rmse))))
 

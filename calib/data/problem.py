@@ -265,6 +265,13 @@ class Problem:
         every = (*names, *(f"{name}.velocity" for name in names))
         return tuple(every[c] for c in self.channels)
 
+    @property
+    def channel_units(self) -> tuple[str, ...]:
+        """Units of the measured channels, (M,)."""
+        units = self.robot.coordinate_units
+        every = (*units, *(f"{unit}/s" for unit in units))
+        return tuple(every[c] for c in self.channels)
+
     def batch(self, count: int) -> ServoBatch:
         """Return the simulator of ``count`` members; the last used sizes are kept."""
         return self._batches.get(count)

@@ -184,9 +184,13 @@ def _solved(
 
 
 def _refined(shooting: Shooting, point: Point, normal: Normal, used: int, fixed_latency: bool) -> Refined:
-    free = len(shooting.problem.space) + (0 if fixed_latency else 1)
-    chi2 = normal.cost / max(normal.count - free, 1)
+    chi2 = normal.cost / _degrees(shooting, normal, fixed_latency)
     return Refined(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
+
+
+def _degrees(shooting: Shooting, normal: Normal, fixed_latency: bool) -> int:
+    """Return the residuals' degrees of freedom; at least 1."""
+    return max(normal.count - len(shooting.problem.space) - (not fixed_latency), 1)
 
 
 def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
@@ -205,8 +209,7 @@ def refine_robust(refined: Refined, fixed_latency: bool) -> Refined:
             plain.on(data), found.point, SETTINGS.robust_iterations, fixed_latency=fixed_latency
         )
         iterations += found.iterations
-    free = len(plain.problem.space) + (0 if fixed_latency else 1)
-    chi2 = plain.cost(found.point) / max(found.normal.count - free, 1)
+    chi2 = plain.cost(found.point) / _degrees(plain, found.normal, fixed_latency)
     return dataclasses.replace(found, chi2=chi2, iterations=iterations)
 
 
@@ -295,10 +298,9 @@ def _with_contacts(
 ) -> tuple[Point, Normal, int]:
     """Solve; while the residual is unexplained, draw other start states and solve again."""
     settings = SETTINGS
-    free = len(shooting.problem.space) + (0 if fixed_latency else 1)
     point, normal, used = _solved(shooting, point, iterations, fixed_latency)
     for spread in settings.shakes if shake else ():
-        if normal.cost / max(normal.count - free, 1) < settings.explained:
+        if normal.cost / _degrees(shooting, normal, fixed_latency) < settings.explained:
             break
         before = normal.cost
         point = shooting.shaken(point, spread, settings.shake_count, rng)

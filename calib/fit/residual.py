@@ -149,6 +149,11 @@ class Shooting:
             self._state_step = np.maximum(DIFFERENCES.contact_state * self.state_std, self._state_step)
 
     @property
+    def device_periods(self) -> int:
+        """Device periods in all windows."""
+        return sum(len(d.windows) * d.windows.length * d.windows.stride for d in self.data)
+
+    @property
     def contacts(self) -> bool:
         """Whether sticking and slipping feet make kinks in the effect of start states."""
         return self.problem.robot.base is not None and not self.given

@@ -200,7 +200,7 @@ def _overlay(
         title=title,
         heldout=heldout,
         names=problem.channel_names,
-        units=_units(problem),
+        units=problem.channel_units,
         time_s=episode.time_s,
         real=real,
         nominal=both[0],
@@ -240,12 +240,6 @@ def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
         alone = [np.full(len(e.sample), i == index) for i, e in enumerate(problem.episodes)]
         with contextlib.suppress(InsufficientDataError):
             yield from longest_windows(problem.part(alone), window_s)
-
-
-def _units(problem: Problem) -> tuple[str, ...]:
-    units = problem.robot.coordinate_units
-    every = (*units, *(f"{unit}/s" for unit in units))
-    return tuple(every[c] for c in problem.channels)
 
 
 def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str]) -> list[Residuals]:

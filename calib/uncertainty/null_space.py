@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
@@ -158,10 +157,6 @@ class Confounded:
             f"{self.first} and {self.second} are {degree}confounded: with {self.second} known the interval "
             f"of {self.first} would be {self.factor:.1f} times narrower"
         )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values."""
-        return {"first": self.first, "second": self.second, "factor": self.factor}
 
 
 def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, ...]:

@@ -223,8 +223,7 @@ def check_step(problem: Problem, refined: Refined, settings: StepSettings | None
         # A contact at another moment changes a prediction more than the step's error does.
         return StepCheck(step_s, nothing, note="not compared for robots in contact")
     shooting, rows = refined.shooting, refined.normal.rows
-    samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
-    steps = 3.0 * samples * problem.episodes[0].step_s / step_s
+    steps = 3.0 * shooting.device_periods * problem.episodes[0].step_s / step_s
     if steps > (settings or STEP).most_steps:
         return StepCheck(step_s, nothing, note=f"not compared: it would take {steps:.1g} physics steps")
     finer = Shooting(halved(problem), shooting.length, data=shooting.data)

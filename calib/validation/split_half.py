@@ -209,7 +209,6 @@ def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Sh
 def _steps(problem: Problem, shooting: Shooting) -> float:
     """Return the most physics steps that the comparison takes."""
     substeps = problem.episodes[0].step_s / problem.robot.step_s
-    samples = sum(len(d.windows) * d.windows.length * d.windows.stride for d in shooting.data)
     # One normal matrix and one line of damped steps per iteration.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
-    return float(SETTINGS.iterations * members * samples * substeps)
+    return float(SETTINGS.iterations * members * shooting.device_periods * substeps)
