@@ -180,7 +180,6 @@ class _Following:
     def __init__(self, shooting: Shooting, point: Point, normal: Normal | None) -> None:
         self._shooting, self._here, self._normal = shooting, point, normal
         self._last = point
-        self._vector: tuple[Point, FloatArray] | None = None
 
     def at(self, value: FloatArray) -> Point:
         """Return the point at parameters and latency, (K + 1,)."""
@@ -193,11 +192,7 @@ class _Following:
 
     def residual(self, value: FloatArray) -> FloatArray:
         """See :class:`LeastSquares`."""
-        point = self.at(value)
-        # The start is asked for twice, here and by the library.
-        if self._vector is None or self._vector[0] is not point:
-            self._vector = point, self._shooting.vector(point)
-        return self._vector[1]
+        return self._shooting.vector(self.at(value))
 
     def jacobian(self, value: FloatArray) -> FloatArray:
         """See :class:`LeastSquares`."""
