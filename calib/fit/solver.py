@@ -135,7 +135,7 @@ def solve(
     Returns:
         Where it ended, the normal equations there, and the derivatives that were computed.
     """
-    bounds, used, before = value_bounds(shooting.problem), 0, np.inf
+    bounds, used, before = value_bounds(shooting.problem), 0, shooting.cost(point)
     normal: Normal | None = None
     # Next to a kink steps shrink to nothing. A new trust region around start states that have settled since
     # leads on, or shows that this is the end.
