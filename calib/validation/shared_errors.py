@@ -3,7 +3,7 @@
 No comparison of the two channels shows them. What can is the model: gravity, what joints do to each other,
 and how fast masses move. So each error is undone in turn, and the model is fitted to recordings without it.
 The one that then predicts motion that no fit has seen, where the recordings as they are cannot be predicted,
-is named. Many cannot be told: parameters or a symmetry take them up (docs/explanation/calibration.md).
+is named. Many cannot be told: parameters or a symmetry take them up.
 """
 
 from __future__ import annotations
