@@ -187,9 +187,10 @@ CASES = (
 )
 TITLE = "Cart-pole: from a fault to a motor without torque"
 WORDS = (
-    "By `tools/measure_cartpole_faults.py` on the emulated cart-pole, profile `sensor`, over a",
-    "pseudo-terminal. Each repetition draws a phase (connecting, homing, arming, running, ending) and a",
-    "moment of it. The device's own watchdog stops the motor 200 ms after the last command.",
+    "This page has the time from each fault to a motor without torque. `tools/measure_cartpole_faults.py`",
+    "measured it on the emulated cart-pole, profile `sensor`, over a pseudo-terminal. Each repetition draws",
+    "a random moment of a random phase (connecting, homing, arming, running, ending). The device's own",
+    "watchdog stops the motor 200 ms after the last command.",
     "",
 )
 

@@ -36,7 +36,7 @@ def lacks(document: Any) -> set[str]:
 
 def told() -> dict[str, set[str]]:
     """Return what the page says that files lack."""
-    table = PAGE.partition("| older file | does not say |")[2].partition("\n\n")[0]
+    table = PAGE.partition("| older file | lacks |")[2].partition("\n\n")[0]
     rows = [line.split("|") for line in table.splitlines()[2:]]
     return {row[1].strip(" `"): {word.strip() for word in row[2].split(",")} for row in rows}
 
