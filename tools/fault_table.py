@@ -48,14 +48,16 @@ def repetition(
 ) -> dict[str, Any]:
     """Run one repetition of a case and return its row.
 
-        Args:
-            rig_type: The robot.
-            case: The case.
-            wire: The transport.
-            entropy: Decides the moment.
-            slot: Number of the job.
-            typical_s: Duration of connecting and taking over [s]; updated.  Raises: SpoiledError: In all attempts
-    the run ended before the fault.
+    Args:
+        rig_type: The robot.
+        case: The case.
+        wire: The transport.
+        entropy: Decides the moment.
+        slot: Number of the job.
+        typical_s: Duration of connecting and taking over [s]; updated.
+
+    Raises:
+        SpoiledError: In all attempts the run ended before the fault.
     """
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([*entropy, attempt, *case.name.encode()])

@@ -219,8 +219,8 @@ TITLE = "Go2: from a fault to damping"
 WORDS = (
     "This page has the time from each fault to a damped robot. `tools/measure_go2_faults.py` measured it on",
     "the emulated robot, profile `sensor`, over real wires. Each repetition draws a random moment of a",
-    "random phase (connecting, taking over, arming, standing up, running, lying down, ending). *Cut*: the emulator",
-    "neither sends nor receives. *Freezes* and *reset*: a proxy freezes or resets the TCP connection.",
+    "random phase (connecting, taking over, arming, standing up, running, lying down, ending). *Cut*: the",
+    "emulator neither sends nor receives. *Freezes* and *reset*: a proxy freezes or resets the TCP connection.",
     "",
     "In the row that expects *stiff*, both processes are dead and the Go2 holds its last command. Only a",
     "program on the robot's side could help. The same holds while a link is away. Keep the remote in your",
