@@ -1,4 +1,4 @@
-"""Who imports whom, read from the sources: what the layer test and `tools/structure.py` share.
+"""Imports between modules, read from the sources, for the layer test and `tools/structure.py`.
 
 Nothing is imported or run, so the sources may be those of another checkout.
 """

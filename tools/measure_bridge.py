@@ -1,14 +1,14 @@
-"""Measure the Go2's bridge: what latency it adds, and how soon it damps when something breaks.
+"""Measure the Go2's bridge: its added latency, and its time to damping after a fault.
 
 Run it as ``python tools/measure_bridge.py --out FILE.json``. All processes run on this machine, so that their
 monotonic clock is the same.
 
-``latency``: a controller and a robot that only measure, 500 commands and states a second, over TLS; through
-the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge stand in a
-network namespace, and its interface goes down in a command stream; time from there to the first damping at
-the robot, beside a stall monitor of the bridge's priority. ``restart``: the bridge is killed with SIGKILL in
-a command stream and started again. ``refuse``: replayed commands and a second controller beside one that
-commands.
+``latency``: a controller and a robot only measure, with 500 commands and states a second over TLS, through
+the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge run in a
+network namespace, and its interface goes down in a command stream. The time from there to the first damping
+at the robot counts, beside a stall monitor of the bridge's priority. ``restart``: the bridge is killed with
+SIGKILL in a command stream and started again. ``refuse``: replayed commands and a second controller beside
+the first.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fault table of the cart-pole: what happens when something goes wrong, and how soon its motor is off.
+"""Fault table of the cart-pole: results of faults, and the time until its motor is off.
 
 python tools/measure_cartpole_faults.py --jobs 2 --out cartpole.json
 python tools/measure_cartpole_faults.py --transport can --jobs 2 --out cartpole_can.json

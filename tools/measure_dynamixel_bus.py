@@ -4,10 +4,10 @@
     python tools/measure_dynamixel_bus.py --seconds 120
     python tools/measure_dynamixel_bus.py --port /dev/ttyUSB0 --rates 50 200
 
-A round trip is from the question's write to the last byte of both servos' answers, as the driver asks with
-each sample (Fast Sync Read of 72 bytes each); beside it stands the time of these bytes on the wire. Without
---port two emulated servos answer, which take the wire's time, too. --absent asks a servo that is not there:
-what a dead servo costs.
+A round trip is from the request's write to the last byte of both servos' answers, as for each sample of the
+driver (Fast Sync Read of 72 bytes each). The time of these bytes on the wire is shown beside it. Without
+--port two emulated servos answer, which take the wire's time, too. --absent asks an absent servo, to measure
+the cost of a dead one.
 """
 
 from __future__ import annotations

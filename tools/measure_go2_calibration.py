@@ -7,10 +7,10 @@ ends; it is read after the calibration has written its result.
 
     python tools/measure_go2_calibration.py --transport zenoh --seeds 1000-1004 --out FILE.json
 
-What each parameter is compared with: stiffness with what the drive makes of the kp that is sent; damping with
-what it makes of the kd that is sent plus the joint's viscous friction; the others with themselves. The
-latency that a recording shows is the emulator's own plus the way over the wire there and back, rounded up to
-the drives' next millisecond.
+The true stiffness is the drive's factor times the kp that is sent. The true damping is the drive's factor
+times the kd that is sent, plus the joint's viscous friction. The others have their own value. The latency of
+a recording is the emulator's own plus the transit over the wire and back, rounded up to the drives' next
+millisecond.
 """
 
 from __future__ import annotations

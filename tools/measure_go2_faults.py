@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fault table of the Go2: what happens when something goes wrong, and how soon the robot is damped for good.
+"""Fault table of the Go2: results of faults, and the time until the robot stays damped.
 
 python tools/measure_go2_faults.py --transport zenoh --jobs 2 --out zenoh.json
 python tools/measure_go2_faults.py --table faults.md zenoh.json dds.json
@@ -220,7 +220,7 @@ WORDS = (
     "This page has the time from each fault to a damped robot. `tools/measure_go2_faults.py` measured it on",
     "the emulated robot, profile `sensor`, over real wires. Each repetition draws a random moment of a",
     "random phase (connecting, taking over, arming, standing up, running, lying down, ending). *Cut*: the",
-    "emulator neither sends nor receives. *Freezes* and *reset*: a proxy freezes or resets the TCP connection.",
+    "emulator neither sends nor receives. *Freezes*, *reset*: a proxy freezes or resets the TCP connection.",
     "",
     "In the row that expects *stiff*, both processes are dead and the Go2 holds its last command. Only a",
     "program on the robot's side could help. The same holds while a link is away. Keep the remote in your",

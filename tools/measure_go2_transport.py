@@ -1,10 +1,10 @@
-"""How regular 500 commands and states a second are over the Go2's wire: a controller, a robot, nothing else.
+"""Measure the timing of 500 commands and states a second over the Go2's wire.
 
     python tools/measure_go2_transport.py --transport zenoh --seconds 600 --freeze-at 300 --freeze-s 5
 
-Two processes of this machine send messages of the robot's size on its topics. With --freeze-at the robot's
-process is stopped for a while: no control cycle may wait for it. Exit code 1: one was late by more than 2 ms
-while the machine ran.
+Two processes of this machine, controller and robot, send messages of the robot's size on its topics. With
+--freeze-at the robot's process is stopped for a time, and no control cycle may wait for it. Exit code 1: a
+cycle was late by more than 2 ms while the machine did not pause.
 """
 
 from __future__ import annotations

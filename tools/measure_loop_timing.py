@@ -1,12 +1,12 @@
-"""Measure the control loop_timing: one run of N minutes against an emulated cart-pole, the report as JSON.
+"""Measure the timing of the control loop in one run against an emulated cart-pole; the report as JSON.
 
     python tools/measure_loop_timing.py --minutes 10 > loop_timing.json
 
 The whole path is measured: supervisor, control process, recorder, serial line (a pty). With --port the robot
 or emulator on that port is used instead of one of our own.
 
-Beside it runs the stall monitor (stall_monitor.py): each overrun beyond a period is listed with the
-longest pause of the machine at that time.
+The stall monitor (stall_monitor.py) runs beside it: each overrun beyond a period is listed with the longest
+pause of the machine at that time.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Does memory stay flat over generations? Memory of each method, generation by generation or run by run.
+"""Measure the growth of each method's memory over its generations, or over repeated runs.
 
-Each method runs in a process of its own on a short cart-pole recording. A search is looked at after every
-generation; one that ends before the wanted number is run again on the same problem with another seed, so that
-what a run leaves behind shows. A method that is one optimiser's call, or decides itself what follows its
-search, is run again and again and looked at after every run.
+Each method runs in a process of its own on a short cart-pole recording. Memory of a search is measured after
+every generation. A search that ends early is run again on the same problem with another seed, so that memory
+left by a run shows. A method without generations, or with its own choice of steps, is run repeatedly and
+measured after every run.
 
-Two figures are taken. The resident memory is what the system lends to the process. What malloc has handed out
-(glibc only) is what somebody still holds, in Python, NumPy, torch and MuJoCo: without memory that was freed
-and waits to be used again, with addresses that were never written to. No garbage is collected and no memory
-is trimmed for the measurement's sake. The first half of the values is warm-up: by its end libraries are
-loaded and buffers have their size. A straight line through the second half is the growth.
+There are two figures. Resident memory is the process's memory as the system counts it. Held memory is the
+memory that malloc has handed out (glibc only), in Python, NumPy, torch and MuJoCo. It excludes freed memory
+and includes addresses that were never written to. The measurement neither collects garbage nor trims memory.
+The first half of the values is warm-up: by its end libraries are loaded and buffers have their size. The
+slope of a line through the second half is the growth.
 
     python tools/measure_memory.py --out docs/measured/memory.json
 """

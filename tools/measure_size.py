@@ -1,16 +1,16 @@
-"""What a calibration costs against the size of the robot: arms of 7 and 14 servo joints.
+"""Measure time and memory of a calibration against the size of the robot: arms of 7 and 14 servo joints.
 
     python tools/measure_size.py --joints 7 --limit 600 --out size.json
     python tools/measure_size.py --joints 7 --profile size.prof      # where the time goes, by cProfile
 
-An arm is made with a hidden truth: stiffness, damping, dry friction, armature and encoder bias of every
-joint, masses of all links but the second, which was weighed, or the common scale of all would show in no
-motion. Its base is tilted, so that the first joint carries weight, too. 14 joints are two arms.
+An arm has hidden true values: stiffness, damping, dry friction, armature and encoder bias of every joint, and
+masses of all links but the second. The second is known, because no motion shows the common scale of all
+masses and forces. The base is tilted, so that the first joint carries weight, too. 14 joints are two arms.
 
-It is recorded in plain MuJoCo, with late commands and noise, and calibrated as a user would, by `deal-hw
-calibrate --model` in a process of its own with default settings. A row has seconds, peak memory, held-out
-error, what was shown on the way, and how the estimates lie to the truth. After --limit seconds the
-calibration is stopped as by Ctrl-C; the row says what was best until then.
+The arm is recorded in plain MuJoCo, with late commands and noise. `deal-hw calibrate --model` calibrates it
+in a process of its own with default settings. A row has seconds, peak memory, held-out error, the printed
+fits, and the errors of the estimates. After --limit seconds the calibration is stopped as by Ctrl-C, and the
+row has the best fit until then.
 """
 
 from __future__ import annotations

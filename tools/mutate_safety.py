@@ -1,10 +1,10 @@
 """Mutation run over the safety module and the exit path: `make mutation`.
 
-mutmut changes them in one place after another and runs their tests against each change. A change
-that no test notices survives. Survivors must stand in docs/results/safety-mutation.md with the reason why
-they may; any other fails the run.
+mutmut changes the sources in one place after another and runs their tests against each change. A change
+that no test notices survives. docs/results/safety-mutation.md must list each survivor with a reason; any
+other survivor fails the run.
 
-mutmut wants to own the directory it runs in, so the sources and the tests are copied into build/mutation; the
+mutmut needs a directory of its own, so the sources and the tests are copied into build/mutation; the
 rest of deal_hw (drivers) comes from the installed package.
 """
 

@@ -1,4 +1,4 @@
-"""Runs the two processes of ``tools/measure_go2_transport.py``: orders in, one line after the other out."""
+"""Run the two processes of ``tools/measure_go2_transport.py``: they read orders and print lines."""
 
 from __future__ import annotations
 

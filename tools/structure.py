@@ -1,4 +1,4 @@
-"""Count how a checkout is built: lines, rooms, arrows, circles, constants. For before and after a rebuild.
+"""Count lines, rooms, imports, circles and constants of a checkout, before and after a rebuild.
 
     python tools/structure.py                                  # this checkout, folder calib
     python tools/structure.py --root ../old --json old.json    # another checkout, counted by this tool

@@ -1,4 +1,4 @@
-"""Makes the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
+"""Make the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
 
     python tools/train_demo_policy.py allegro
     python tools/train_demo_policy.py ant
