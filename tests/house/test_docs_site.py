@@ -161,3 +161,12 @@ def test_names_in_docstrings_are_names() -> None:
         "of :class:<code>~deal_hw.robot.Robot</code> and :meth:<code>x</code>", None, None, None
     )
     assert shown == "of <code>deal_hw.robot.Robot</code> and <code>x</code>"
+
+
+def test_options_stay_whole_in_wrapped_commands() -> None:
+    """A command's options are marked, and text outside of code is not."""
+    shown = docs_pages.on_page_content(
+        "<p>a --b</p><pre><code>c --out-dir d\n--e</code></pre>", None, None, None
+    )
+    whole = '<span class="option">{}</span>'.format
+    assert shown == f"<p>a --b</p><pre><code>c {whole('--out-dir')} d\n{whole('--e')}</code></pre>"
