@@ -1,7 +1,7 @@
 """The two processes of ``tools/measure_bridge.py``: a controller and a robot that only note times.
 
-A state carries its number as the robot's tick, a command as the first joint's target, which means nothing
-while all gains but damping are 0. Both are valid messages, because the bridge passes no others.
+A state carries its number as the robot's tick. A command carries it as the first joint's target, which has no
+effect while all gains but damping are 0. Both are valid messages, because the bridge passes no others.
 """
 
 from __future__ import annotations

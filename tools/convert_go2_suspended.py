@@ -1,10 +1,10 @@
 r"""Convert the public recording of a suspended Unitree Go2 into an NPZ file and its column map.
 
 The recording is datasets/go2/traj_0.pt of iit-DLSLab/sim2real-robot-identification (BSD-3-Clause) at commit
-06739ea. The base is held in the air. All twelve joints are under PD control by the robot's own drivers (kp 20
-and kd 1.5 in that project's configuration), with position set-points and 200 samples a second. Its keys are
-time (T) [s], dof_pos and des_dof_pos (T, 12) [rad]. Columns are leg by leg FL, FR, RL, RR, in each leg hip,
-thigh, calf (that project's collecting script).
+06739ea. The base is held in the air. All twelve joints are under PD control by the robot's own drivers: kp 20
+and kd 1.5 in that project's configuration. There are position set-points and 200 samples a second. Its keys
+are time (T) [s], dof_pos and des_dof_pos (T, 12) [rad]. Columns are leg by leg FL, FR, RL, RR, in each leg
+hip, thigh, calf (that project's collecting script).
 
 Fetch it and convert it:
 

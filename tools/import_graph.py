@@ -16,7 +16,7 @@ import tomllib
 
 When = Literal["load", "call", "types", "text"]
 """When an import happens: as its module loads, as a function runs, never (under ``TYPE_CHECKING``, for type
-checkers alone), or where somebody uses a module's name that is written as text."""
+checkers alone), or where a module's name is written as text."""
 
 MODULE_TEXT = re.compile(r"[A-Za-z_]\w*(?:\.\w+)+(?::\w+)?")
 IMPORT_CALLS = frozenset({"import_module", "importlib.import_module", "__import__"})

@@ -5,11 +5,10 @@
     python tools/train_demo_policy.py humanoid
     python tools/train_demo_policy.py go2
 
-writes policies/assets/allegro_udr.onnx, ant_udr.onnx, humanoid_udr.onnx or go2_walk.onnx and, beside it,
-the record of its training and of what it can do with robots that it has not seen. Task, trainer and settings
-are those of `deal-hw train ROBOT --udr`. All but the Go2's are early checkpoints, made in minutes on one
-core: good enough to excite a robot for calibration (the paper's Table 5 studies such ones), not good at
-their task.
+writes policies/assets/allegro_udr.onnx, ant_udr.onnx, humanoid_udr.onnx or go2_walk.onnx and, beside it, the
+record of its training and of its results on other robots. Task, trainer and settings are those of `deal-hw
+train ROBOT --udr`. All but the Go2's are early checkpoints, made in minutes on one core: good enough to
+excite a robot for calibration (the paper's Table 5 studies such ones), not good at their task.
 """
 
 from __future__ import annotations
