@@ -34,7 +34,7 @@ BY_ITSELF = (
 CAN = ("can", "odrive")
 DYNAMIXEL = ("dynamixel",)
 STOPPED = "stopped"
-"""A servo that its own watchdog stopped stands still, with torque."""
+"""State of a servo that its own watchdog stopped: it holds its position with torque."""
 DEPLOY = """
 import sys
 from pathlib import Path
@@ -100,7 +100,7 @@ class CartpoleRig(Rig):
         return self.case.seconds or SECONDS
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
-        """Phases by the device's modes; the run's own times follow the moment of arming."""
+        """Phases by the device's modes; the later ones by their time after arming."""
         return {
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (HOMING, 0.0, self.typical_s[TAKING_OVER]),
@@ -118,7 +118,7 @@ class CartpoleRig(Rig):
         return f"{report['received_bytes']} bytes" if report["received_bytes"] else ""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
-        """The port vanished, the wire was cut, the firmware hung, or the bus had a fault."""
+        """The port vanished, the wire was cut, the firmware stopped, or the bus had a fault."""
         return next((ns for ns, what in self.changes(report) if what in BY_ITSELF), -1)
 
 

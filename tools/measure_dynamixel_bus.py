@@ -46,16 +46,16 @@ class MeasureBus:
     """The port, with settings as for `deal-hw`; by default two servos are emulated."""
 
     rates: tuple[float, ...] = (50.0, 200.0)
-    """Questions a second."""
+    """Requests a second."""
 
     seconds: float = 120.0
     """Length of each row [s]."""
 
     baud_rate: int = 1_000_000
-    """Of the emulated servos."""
+    """Baud rate of the emulated servos."""
 
     absent: bool = False
-    """Ask a servo that is not there."""
+    """Ask an absent servo."""
 
     out: Path | None = field(default=None)
     """Write the rows to this JSON file."""
@@ -95,7 +95,7 @@ def measure(
 
 @contextlib.contextmanager
 def some_port(config: MeasureBus) -> Iterator[str]:
-    """Yield the port given, or that of emulated servos."""
+    """Yield the given port, or that of emulated servos."""
     if config.port is not None:
         yield config.port
         return

@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
-    """Return the row of one seed; what failed is kept in it."""
+    """Return the row of one seed, with its failures."""
     row: dict[str, Any] = {"seed": seed, "profile": options.profile, "transport": options.transport}
     with tempfile.TemporaryDirectory(dir=options.keep) as folder:
         try:
@@ -169,7 +169,7 @@ def verb(*words: str) -> str:
 
 
 def judge(result: dict[str, Any], truth: Go2Truth) -> dict[str, Any]:
-    """Return how far a calibration's result is from the truth."""
+    """Return the errors of a calibration's result."""
     true = truth.parameters(DESCRIPTION.stiffness[0], DESCRIPTION.damping[0])
     rows: dict[str, dict[str, Any]] = {}
     for name, found in result["parameters"].items():
@@ -213,7 +213,7 @@ def error(rows: dict[str, dict[str, Any]], kind: str, which: str) -> float:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what all seeds say together."""
+    """Return statistics over all seeds."""
     good = [row for row in rows if "error" not in row]
     if not good:
         return {"seeds": len(rows), "failed": len(rows)}

@@ -97,7 +97,7 @@ class Go2Rig(Rig):
         return self.case.seconds or SECONDS
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
-        """Phases by what the robot is told; the run's own times follow its first stiff command."""
+        """Phases by the robot's commands; the later ones by their time after the first stiff command."""
         before_s, total_s = POSTURE.before_s, POSTURE.added_s + self._seconds
         return {
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
@@ -110,7 +110,7 @@ class Go2Rig(Rig):
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
-        """Kinds of commands that the robot heard."""
+        """Kinds of commands that the robot received."""
         return [(ns, kind) for _, ns, kind in report["commands"]["changes"]]
 
     def untouched(self, report: Mapping[str, Any]) -> str:

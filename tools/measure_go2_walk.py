@@ -33,10 +33,10 @@ NAMES = ("stand", "ahead", "left", "turn")
 
 
 class Rounds:
-    """The profile again and again."""
+    """The profile, repeated."""
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return the velocity of the part that it is time for."""
+        """Return the velocity of the present part."""
         part = np.searchsorted([begin for begin, _ in PROFILE], time_s % PROFILE_S, side="right") - 1
         return np.array(PROFILE[int(part)][1])
 

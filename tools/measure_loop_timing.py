@@ -42,10 +42,10 @@ class MeasureLoopTiming:
     """Length of the run [min]."""
 
     port: str | None = None
-    """Where the robot is; by default an emulator is started."""
+    """Port of the robot; by default an emulator is started."""
 
     profile: Literal["hold", "chirp", "balance"] = "hold"
-    """What the robot does meanwhile; balance includes the policy's network."""
+    """Motion of the robot; balance includes the policy's network."""
 
 
 _PAUSE_NS = 3_000_000
@@ -118,7 +118,7 @@ def _port(given: str | None) -> Iterator[str]:
     command = [sys.executable, "-m", "deal_hw", "emulate", "--nominal", "--profile", "sensor"]
     process = subprocess.Popen([*command, "--parent", str(os.getpid())], stdout=subprocess.PIPE, text=True)
     try:
-        # A device does not stand still because the machine is busy; an emulator should not either.
+        # A real device does not pause on a busy machine, so the emulator has a high priority.
         with contextlib.suppress(PermissionError):
             os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(60))
         if process.stdout is None:

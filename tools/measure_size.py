@@ -58,7 +58,7 @@ SHOWN_FUNCTIONS = 25
 
 
 def make_arm(joints: int, seed: int) -> tuple[PlainRobot, str]:
-    """Return arms of seven joints each with a hidden truth, and what is searched (YAML).
+    """Return arms of seven joints each with a hidden truth, and the searched parameters (YAML).
 
     Args:
         joints: Joints altogether, a multiple of seven; fewer than seven are the first of an arm.
@@ -226,7 +226,7 @@ def measure(
 
 
 def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]:
-    """Run a calibration; return seconds, memory and what it said with its time."""
+    """Run a calibration; return seconds, memory, and its output with times."""
     began, said = time.monotonic(), []
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with subprocess.Popen(
@@ -258,7 +258,7 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
 
 
 def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
-    """Return held-out errors, and how estimates and intervals lie to the truth."""
+    """Return held-out errors, and errors of estimates and intervals."""
     rows = {name: result["parameters"][name] for name in robot.truth}
     told = {name: row for name, row in rows.items() if row["verdict"] != "not identifiable"}
     ratios = [
@@ -285,7 +285,7 @@ def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
 
 
 def words(row: dict[str, Any]) -> str:
-    """Return a row in words."""
+    """Return a row as text."""
     text = (
         f"{row['joints']} joints, {row['parameters']} parameters, {row['fitted_s']:g} s fitted, seed "
         f"{row['seed']}: {row['seconds']:.0f} s ({row['cpu_s']:.0f} s of processor time), peak memory "

@@ -35,7 +35,7 @@ NOT_THERE = {"odrive": ("servo.speed_limit",)}
 
 
 def measure(transport: str, profile: str, seed: int) -> dict[str, Any]:
-    """Run one row; what goes wrong is kept in it."""
+    """Run one row and keep its errors."""
     row: dict[str, Any] = {"transport": transport, "profile": profile, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as place:
         try:
@@ -129,7 +129,7 @@ def main() -> int:
         print(table(json.loads(given.table.read_text(encoding="utf-8"))["rows"]))
         return 0
     rows: list[dict[str, Any]] = []
-    # Wires take turns, so that what else the machine does falls on all of them.
+    # Wires take turns, so that other work on the machine affects all of them.
     for seed in tuple(given.seeds) * given.repeats:
         for transport in given.transports:
             rows.append(measure(transport, given.profile, seed))

@@ -59,7 +59,7 @@ filterwarnings = ["error"]
 
 
 def prepare(mutated: tuple[str, ...], tests: tuple[str, ...], arguments: tuple[str, ...]) -> None:
-    """Copy what mutmut needs."""
+    """Copy the files that mutmut needs."""
     shutil.rmtree(WORK, ignore_errors=True)
     (WORK / "tests").mkdir(parents=True)
     shutil.copytree(ROOT / "deal_hw", WORK / "deal_hw", ignore=shutil.ignore_patterns("__pycache__"))
@@ -72,7 +72,7 @@ def prepare(mutated: tuple[str, ...], tests: tuple[str, ...], arguments: tuple[s
 
 
 def mutmut(*arguments: str) -> str:
-    """Run mutmut and return what it says."""
+    """Run mutmut and return its output."""
     program = Path(sys.executable).parent / "mutmut"
     done = subprocess.run([program, *arguments], cwd=WORK, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -107,7 +107,7 @@ def main() -> int:
 
 
 def run(mutated: tuple[str, ...], tests: tuple[str, ...], arguments: tuple[str, ...] = ()) -> int:
-    """Run one set; return 1 where a survivor is not argued."""
+    """Run one set; return 1 if a survivor has no reason in the page."""
     prepare(mutated, tests, arguments)
     children = str(max((os.cpu_count() or 2) - 1, 1))
     mutmut("run", "--max-children", children)

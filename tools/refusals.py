@@ -152,7 +152,7 @@ def unreached(found: list[Refusal], coverage: Path) -> list[Refusal]:
 def _ends_the_command(kind: str, known: frozenset[str]) -> bool:
     outside = getattr(builtins, kind, None)
     if isinstance(outside, type):
-        # What the system refuses is told in one line, too.
+        # Refusals of the system end in one line, too.
         return issubclass(outside, OSError)
     # Helpers behind `raise`, and classes in variables, make errors of the tree.
     return kind in known or not kind[:1].isupper()

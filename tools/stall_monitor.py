@@ -42,7 +42,7 @@ class Pause:
 
 @dataclass(slots=True)
 class Account:
-    """What the monitor saw; filled when the block that it watches ends.
+    """The monitor's findings; filled when the watched block ends.
 
     Attributes:
         pauses: All pauses, by processor and time.

@@ -73,7 +73,7 @@ def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:
 
 
 def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged: int) -> None:
-    """Judge a policy under the distribution that it was trained under, and write its record."""
+    """Judge a policy under its training distribution, and write its record."""
     env = training_task(robot).make(recorded_description(robot), udr_distribution(robot), judged)
     record["evaluation"] = judge(policy, env, JUDGE_SEED)
     record["at_rest"] = judge(_Rest(policy), env, JUDGE_SEED)
@@ -83,7 +83,7 @@ def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged
 
 
 class _Rest:
-    """Does nothing: what the policy's figures are to be compared with."""
+    """A policy that does nothing, to compare with."""
 
     def __init__(self, policy: OnnxPolicy) -> None:
         self.spec = policy.spec
