@@ -344,14 +344,14 @@ def on_env(env: Any, config: Any, files: Any) -> Any:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    """Show names in docstrings as names, and keep options whole where a command wraps.
+    """Show names in docstrings as names, and keep options whole where code wraps.
 
     mkdocstrings does not know Sphinx's roles. A browser breaks a line after the first hyphen of ``--out``.
     """
     html = re.sub(r":(?:class|func|meth|mod|attr|data|exc):(<code>)~?", r"\1", html)
     whole = r'<span class="option">\g<0></span>'
     return re.sub(
-        r"<pre>.*?</pre>", lambda code: re.sub(r"(?<=[\s>])--[a-z][\w-]*", whole, code[0]), html, flags=re.S
+        r"<code>.*?</code>", lambda code: re.sub(r"(?<=[\s>])--[a-z][\w-]*", whole, code[0]), html, flags=re.S
     )
 
 
