@@ -1,7 +1,7 @@
 # One command for people and for CI. `make` alone lists the targets.
 #
-# PIP_ARGS goes to every `pip install`, so that you choose where wheels come from. On a machine without an NVIDIA GPU,
-# name PyTorch's CPU index (its install page shows the address) to spare 2 GB of CUDA libraries:
+# PIP_ARGS goes to every `pip install`: it chooses the source of wheels. Without an NVIDIA GPU, name PyTorch's CPU
+# index (its install page shows the address) to avoid 2 GB of CUDA libraries:
 #     make demo PIP_ARGS="--extra-index-url <PyTorch's CPU index>"
 
 PYTHON ?= python3
@@ -23,13 +23,13 @@ SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-setup: $(STAMP) ## make .venv with everything in it (done by the other targets when needed)
+setup: $(STAMP) ## make .venv with everything (other targets do this when needed)
 
-# torch comes first and alone: its version is pinned and its builds (CPU, CUDA) differ by gigabytes, so a wrong index
-# shows at once. The stamp is touched last: an interrupted set-up is taken up again by the next call.
+# torch is installed first and alone: its builds (CPU, CUDA) differ by gigabytes, so a wrong index shows at once. The
+# stamp is touched last, so that the next call continues an interrupted set-up.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-	  || { echo "everything needs Python 3.11 or newer (3.10: base and sim only, by pip); say which: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
+	  || { echo "make setup needs Python 3.11 or newer (3.10: base and sim only, by pip); name one: make setup PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
 	  || { echo "this Python cannot make a venv; on Debian: apt-get install -y python3-venv" >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
@@ -40,7 +40,7 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
-# Without the DDS peer or the AVR's tools, the tests that need them are skipped and say what to install.
+# Tests that need the DDS peer or the AVR's tools are skipped without them, and say what to install.
 test: $(STAMP) ## all tests that need no robot
 	@tools/build_dds_peer.sh || true
 	@tools/install_avr_tools.sh || true
@@ -52,7 +52,7 @@ dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
 avr-tools: ## install gcc-avr and simavr
 	@tools/install_avr_tools.sh
 
-firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and the memory that it takes
+firmware: $(STAMP) avr-tools ## build/firmware/cartpole.hex for the ATmega328P, and its memory use
 	@$(BIN)/python -m deal_hw.drivers.cartpole.native build/firmware
 
 check: $(STAMP) typing coverage-safety docs ## format, lint, types, declared imports, layers, safety coverage, docs, distributions
@@ -64,17 +64,17 @@ check: $(STAMP) typing coverage-safety docs ## format, lint, types, declared imp
 	$(BIN)/python -m pytest -q tests/house/test_layers.py
 	@$(MAKE) -s dist
 
-dist: $(STAMP) ## build/dist: the wheel, built from the source distribution, and that; both are checked
+dist: $(STAMP) ## build/dist: source distribution, and the wheel built from it; both are checked
 	@rm -rf build/dist
 	$(BIN)/python -m build --no-isolation --outdir build/dist >build/dist.log 2>&1 || { cat build/dist.log; exit 1; }
 	$(BIN)/twine check --strict build/dist/*
 
-# mkdocs runs without a network; the built pages load nothing from other hosts.
+# mkdocs needs no network, and the built pages load nothing from other hosts.
 docs: $(STAMP) typing ## build the documentation into build/site and check its links
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/python tools/check_site.py build/site
 
-# The repository's own coverage settings measure everything; here every line and branch of a few files counts.
+# The repository's coverage settings measure all files; here every line and branch of a few files counts.
 coverage-safety: $(STAMP) ## each line and branch of the safety module and of the exit path is tested
 	@mkdir -p build
 	$(BIN)/coverage run $(SAFETY_COVERAGE) --branch \
@@ -92,7 +92,7 @@ format: $(STAMP) ## rewrite the sources in the one format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Type checkers cannot follow package-dir through an editable install, so they read this tree of links instead.
+# Type checkers cannot follow package-dir through an editable install, so they read this tree of links.
 typing:
 	@mkdir -p build/typing/deal_hw
 	@find build/typing/deal_hw -xtype l -delete
@@ -100,6 +100,6 @@ typing:
 	  case $$entry in */__pycache__) ;; *) ln -sfn ../../../$$entry build/typing/deal_hw/ ;; esac; done
 	@for leaf in calib drivers policies; do ln -sfn ../../../$$leaf build/typing/deal_hw/$$leaf; done
 
-clean: ## remove what was generated, but neither .venv nor runs/
+clean: ## remove generated files, but not .venv or runs/
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage htmlcov
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print | xargs rm -rf

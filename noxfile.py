@@ -1,8 +1,8 @@
 """Tests on each Python that this machine has.
 
-`nox` runs all, `nox -s base-3.10` one of them (`nox -l` lists them). 3.11 to 3.13 get everything, 3.10 what
-a robot's own computer needs (Ubuntu 22.04, Jetson): links, recording, safety, deployment and the simulator.
-pip's own settings (PIP_EXTRA_INDEX_URL for PyTorch's CPU builds) apply.
+`nox` runs all, `nox -s base-3.10` one of them (`nox -l` lists them). Python 3.11 to 3.13 run all tests.
+Python 3.10 runs those for a robot's own computer (Ubuntu 22.04, Jetson): links, recording, safety, deployment
+and the simulator. pip's own settings (PIP_EXTRA_INDEX_URL for PyTorch's CPU builds) apply.
 """
 
 import nox
@@ -13,7 +13,7 @@ nox.options.reuse_existing_virtualenvs = True
 
 @nox.session(python=["3.10"])
 def base(session: nox.Session) -> None:
-    """Test what needs no torch."""
+    """Test all parts that need no torch."""
     session.install("--constraint", "constraints-3.10.txt", "--editable", ".[sim,keys,lerobot,dds,testing]")
     others = ("gymnasium", "hypothesis", "onnx", "pillow", "psutil", "pycdr2", "pytest-xdist")
     session.install("--constraint", "constraints-3.10.txt", *others)

@@ -11,7 +11,7 @@ import numpy as np
 import deal_hw
 from deal_hw.testing.plain_robots import make_robot, write
 
-# A robot in plain MuJoCo whose true parameters the calibration does not know, recorded for 10 s.
+# A robot in plain MuJoCo, recorded for 10 s. The calibration does not know its parameters.
 folder = Path(tempfile.mkdtemp())
 model, (recording, *_), other = write(make_robot("double-pendulum", seed=0), folder, seconds=10.0)
 columns = np.genfromtxt(recording, delimiter=",", names=True, deletechars="")

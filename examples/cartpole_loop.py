@@ -1,6 +1,6 @@
 """The whole loop on an emulated cart-pole: record, calibrate, train, deploy.
 
-python examples/cartpole_loop.py            # a policy that balances takes --steps 400000, some minutes
+python examples/cartpole_loop.py            # a policy that balances needs --steps 400000, some minutes
 """
 
 import argparse
@@ -14,9 +14,9 @@ parser.add_argument("--steps", type=int, default=20_000, help="training steps")
 steps = parser.parse_args().steps
 folder = Path(tempfile.mkdtemp())
 
-# A robot on a port, with hidden physics; with a real one, leave the block out and name its port.
+# An emulated robot with hidden parameters. For a real one, leave the block out and name its port.
 with deal_hw.emulate("cartpole", profile="sensor", seed=1) as robot:
-    for motion in ("rich", "chirp"):  # 4 s to fit, and 4 s of other motion to judge by
+    for motion in ("rich", "chirp"):  # 4 s to fit, and 4 s of another motion to judge
         deal_hw.collect("cartpole", port=robot.port, motion=motion, out=folder, say=print)
 
     found = deal_hw.calibrate(dataset=folder / "dataset", say=print)

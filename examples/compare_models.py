@@ -1,4 +1,4 @@
-"""Compare the model you have and the calibrated one with a recording that neither has seen.
+"""Compare your model and the calibrated one on a held-out recording.
 
 python examples/compare_models.py
 """

@@ -29,12 +29,12 @@ ZERO: Final = np.zeros(12)
 
 
 class BridgeClient:
-    """Sends a command every 2 ms in a thread, and hears what the bridge says; a context manager.
+    """Sends a command every 2 ms in a thread, and receives the bridge's messages; a context manager.
 
     Attributes:
         frame: Newest state; None before the first.
-        states: States heard so far.
-        status: What the bridge said last; empty before.
+        states: States received so far.
+        status: The bridge's last status; empty before.
 
     Args:
         port: End point of the bridge.
@@ -115,7 +115,7 @@ class BridgeClient:
         return self._encoder.encode(LowCommand(target, ZERO, *self._gains, ZERO))
 
     def hear(self, until: Callable[[], bool], patience_s: float = PATIENCE_S) -> None:
-        """Only listen until something is so.
+        """Only listen until a condition holds.
 
         Raises:
             TransportTimeoutError: It is not so in time.
@@ -127,11 +127,11 @@ class BridgeClient:
             self.listen(0.02)
 
     def take_over(self) -> None:
-        """Take the robot over by damping, and go on holding the pose that it is in."""
+        """Take the robot over by damping, then hold the present pose."""
         self.hear(lambda: self.frame is not None and bool(self.status))
         self._begin()
         while not self.in_charge:
-            # A busy machine may hold this process up for longer than the bridge waits: then it begins again.
+            # On a busy machine this process may pause for longer than the bridge waits: then it starts again.
             self._begin()
 
     def _begin(self) -> None:
@@ -159,6 +159,6 @@ class BridgeClient:
 
 
 def decode_status(payload: bytes) -> dict[str, Any]:
-    """Return all that the bridge says of itself."""
+    """Return the bridge's status messages."""
     found: dict[str, Any] = json.loads(decode_request(payload).parameter)
     return found

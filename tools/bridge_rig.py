@@ -29,7 +29,7 @@ def make_keys(folder: Path, *addresses: str) -> None:
 
 
 def wire(folder: Path, name: str) -> WireOptions:
-    """Return the options of who holds a certificate; of nobody in particular for ""."""
+    """Return the options of a certificate's holder; "" for none."""
     own: dict[str, Any] = (
         {"certificate": folder / f"{name}.pem", "key": folder / f"{name}.key"} if name else {}
     )
@@ -104,7 +104,7 @@ class BridgeRig:
         self.port = self.bridge.start()
 
     def kill_bridge(self) -> None:
-        """Kill it as the kernel does that is out of memory: it cannot do anything any more."""
+        """Kill it with SIGKILL, as a kernel without memory does."""
         os.kill(self.bridge.pid, signal.SIGKILL)
         self.bridge.stop()
 
@@ -113,7 +113,7 @@ class BridgeRig:
         return wire(self.keys, name)
 
     def told(self) -> list[tuple[int, str]]:
-        """Return what the robot was told so far: host time [ns], kind of command."""
+        """Return the robot's commands so far: host time [ns], kind of command."""
         lines = self._events.read_text(encoding="utf-8").splitlines()
         return [(stamp_ns, what) for _, stamp_ns, what in map(json.loads, lines)]
 
@@ -131,7 +131,7 @@ class BridgeRig:
         end_ns = clock.now_ns() + round(PATIENCE_S * 1e9)
         while (found := self.commands()) != list(kinds):
             if clock.now_ns() > end_ns:
-                raise TransportTimeoutError(f"the robot was told {found}, expected {list(kinds)}")
+                raise TransportTimeoutError(f"the robot got {found}, expected {list(kinds)}")
             clock.sleep_until_ns(clock.now_ns() + 10_000_000)
 
     def _make_bridge(self) -> VerbProcess:

@@ -1,7 +1,7 @@
 """The two processes of ``tools/measure_bridge.py``: a controller and a robot that only note times.
 
-A state carries its number as the robot's tick, a command as the first joint's target, which means nothing
-while all gains but damping are 0. Both are sound messages, as the bridge passes no others.
+A state carries its number as the robot's tick. A command carries it as the first joint's target, which has no
+effect while all gains but damping are 0. Both are valid messages, because the bridge passes no others.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from deal_hw.transport import Message, WireOptions
 
 PERIOD_NS: Final = 2_000_000
 WARM_NS: Final = 3_000_000_000
-"""Messages of this first time are sent and not noted: both sides and the bridge are to have met."""
+"""Time at the start in which messages are not noted, while both sides and the bridge connect."""
 
 
 def run(side: str, orders: dict[str, Any]) -> dict[str, Any]:
-    """Send every 2 ms, note when each message went out and when each of the other side came."""
+    """Send every 2 ms, and note the times of all messages sent and received."""
     clock = MonotonicClock()
     own, other = (LOW_STATE, LOW_COMMAND) if side == "robot" else (LOW_COMMAND, LOW_STATE)
     make, read = (_state(), _command_number) if side == "robot" else (_command(), _state_number)

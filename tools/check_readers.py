@@ -1,11 +1,11 @@
-"""Reads what deal-hw writes with other people's programs, and prints a table.
+"""Read files of deal-hw with other people's programs, and print a table.
 
     python tools/check_readers.py --environments build/readers
     python tools/check_readers.py --environments build/readers --only rerun lerobot --out readers.json
 
 Each program gets an environment of its own, which the first call makes (some gigabytes: lerobot and mjlab
-bring torch). LeRobot 0.4.4 wants an older torch and rerun than deal-hw, so no CI runs this. `--pip-args` is
-passed on to pip. The exit code is 1 where a reader fails.
+bring torch). LeRobot 0.4.4 needs an older torch and rerun than deal-hw, so no CI runs this. `--pip-args` is
+passed on to pip. The exit code is 1 if a reader fails.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ SCRIPTS = Path(__file__).resolve().parent / "readers"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reader:
-    """A program that reads what deal-hw writes.
+    """A program that reads files of deal-hw.
 
     Attributes:
-        name: What the table calls it.
+        name: Its name in the table.
         packages: What pip installs; none: the environment of deal-hw itself.
         script: A file of tools/readers.
         inputs: Which samples it reads, one run each.
@@ -87,7 +87,7 @@ READERS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What a reader made of an input."""
+    """Result of a reader for an input."""
 
     reader: str
     versions: str
@@ -169,7 +169,7 @@ def python_of(reader: Reader, folder: Path, pip_args: list[str]) -> Path:
 
 
 def check(reader: Reader, samples: Path, folder: Path, pip_args: list[str]) -> list[Finding]:
-    """Return what a reader makes of its inputs."""
+    """Return a reader's results for its inputs."""
     try:
         python = python_of(reader, folder, pip_args)
     except subprocess.CalledProcessError as error:
@@ -198,7 +198,7 @@ def check(reader: Reader, samples: Path, folder: Path, pip_args: list[str]) -> l
 
 
 def main() -> int:
-    """Print a row a reader and input; return 1 where one fails."""
+    """Print a row for each reader and input; return 1 if one fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -2,7 +2,7 @@
 
     python tools/check_site.py build/site
 
-No network is used: of a link to another host only the form is checked. Exit status 1: something is wrong.
+No network is used: for a link to another host only the form is checked. Exit status 1: there is a fault.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ STYLE_LOADS = re.compile(r"@import\s+(?:url\()?['\"]?(\S+?)['\")\s;]|url\(\s*['\
 
 @dataclass(slots=True, kw_only=True)
 class Page:
-    """What a page of the site refers to.
+    """References of a page of the site.
 
     Attributes:
         anchors: Its ids and names.
-        links: Where its links lead.
-        loads: What a browser fetches to show it.
+        links: Targets of its links.
+        loads: Addresses that a browser fetches to show it.
     """
 
     anchors: set[str] = field(default_factory=set)
@@ -71,12 +71,12 @@ class _Reader(HTMLParser):
 
 
 def style_loads(text: str) -> list[str]:
-    """Return what a style sheet makes a browser fetch."""
+    """Return the addresses that a browser fetches for a style sheet."""
     return [first or second for first, second in STYLE_LOADS.findall(text)]
 
 
 def read(text: str) -> Page:
-    """Return what a page refers to."""
+    """Return the references of a page."""
     reader = _Reader()
     reader.feed(text)
     return reader.page
@@ -89,7 +89,7 @@ def is_foreign(address: str) -> bool:
 
 
 def malformed(address: str) -> str:
-    """Return what is wrong with the form of a link to another host; "" if nothing."""
+    """Return the fault in the form of a link to another host; "" if there is none."""
     parts = urlsplit(address)
     host = parts.hostname or ""
     if host in LOCAL_HOSTS:
@@ -102,7 +102,7 @@ def malformed(address: str) -> str:
 
 
 def complaints(root: Path) -> list[str]:
-    """Return what is wrong with a site, a line each.
+    """Return the faults of a site, a line each.
 
     Args:
         root: The folder that holds its index.html.
@@ -137,7 +137,7 @@ def complaints(root: Path) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print what is wrong with the site in the folder given."""
+    """Print the faults of the site in the given folder."""
     found = complaints(Path(arguments[0]))
     print("\n".join(found) if found else f"{arguments[0]}: links and loads are in order")
     return int(bool(found))

@@ -1,17 +1,16 @@
-"""Compare two files of `deal-hw bench ... --out FILE.json`, cell by cell; exit 1 where the new one is worse.
+"""Compare two files of `deal-hw bench ... --out FILE.json`, cell by cell; exit 1 if the new one is worse.
 
     python tools/compare_rows.py docs/measured/base_cartpole_sensor.json new.json
     python tools/compare_rows.py old.json new.json --map open-loop=default
 
-A cell is a bench, task, parameter set (space), profile, way of demonstrating, split, ratio of the range,
-method, and whether the refinement followed; over its seeds. Old and new words are mapped by the tables in
-this file (`weki` is `eki`, `near` is `local`, `open-loop` is `output-error`, field `xi` is `range_ratio`,
-...), so each file may have either; ``--map OLD=NEW`` compares a method of OLD with another one of NEW. For
-methods that decide themselves what follows their search (default, local, output-error, and those that ignore
-the data) it does not matter what a row says of the refinement. Cells that only NEW has are named and not
-judged.
+A cell has one bench, task, parameter set (space), profile, demonstration, split, range ratio, method and
+choice of refinement, with all its seeds. Tables in this file map old words to new ones (`weki` is `eki`,
+`near` is `local`, `open-loop` is `output-error`, field `xi` is `range_ratio`, ...), so each file may have
+either. ``--map OLD=NEW`` compares a method of OLD with another one of NEW. Some methods choose the refinement
+themselves (default, local, output-error, and those that ignore the data). For these the row's refinement is
+not compared. Cells that only NEW has are named and not judged.
 
-A cell is a loss where one of these holds. Figures are of the seeds that both files have without an error.
+A cell is a loss if one of these holds. Figures are of the seeds that both files have without an error.
 
     missing     NEW lacks the cell, or a seed of it that OLD has without an error, or has an error there, or
                 lacks a figure that OLD has.
@@ -22,17 +21,16 @@ A cell is a loss where one of these holds. Figures are of the seeds that both fi
                 range. Real recordings: also `heldout_rmse_calibrated` and `heldout_pooled_calibrated`, in rad
                 or m.
     coverage    The mean over seeds of `coverage90`, the share of parameters whose 90 % interval holds the
-                truth, is below the old one (though never where it reaches --coverage-enough, by default 1),
-                or below 0.85 (--coverage-least) where the model is right and the method claims intervals. The
-                model is right but for profiles `realistic` and `real` and bench `mismatch`. Methods that
-                claim intervals are `default`, `local`, `output-error` and those that the refinement followed:
-                searches alone, baselines and no-data rows are compared with OLD only. Without a truth there
-                is no coverage.
+                truth, is below the old one and below --coverage-enough (by default 1). Or it is below 0.85
+                (--coverage-least), if the model is right and the method claims intervals. The model is right
+                except in profiles `realistic` and `real` and bench `mismatch`. Methods that claim intervals
+                are `default`, `local`, `output-error` and those with refinement. Searches alone, baselines
+                and no-data rows are compared with OLD only. Without a truth there is no coverage.
 
-Alarms (seeds with one) and seconds (median) are shown. Seconds are judged with ``--seconds-limit`` alone, as
-only runs that were timed in turn on one machine can be compared. Where a seed is much worse than it was
-(twice, above the floor) it is named: a median hides one bad seed. Exit codes: 0 no loss, 1 a loss, 2 a file
-cannot be compared.
+Alarms (seeds with one) and seconds (median) are shown. Seconds are judged with ``--seconds-limit`` only,
+because only runs that were timed in turn on one machine can be compared. A seed that is much worse than it
+was (twice, above the floor) is named, because a median hides one bad seed. Exit codes: 0 no loss, 1 a loss,
+2 a file cannot be compared.
 """
 
 from __future__ import annotations
@@ -79,7 +77,7 @@ KEY = (
     "refined",
 )
 MISSPECIFIED = frozenset({"realistic", "real"})
-"""Profiles of robots that do what no model here does."""
+"""Profiles of robots with effects that the model lacks."""
 
 ERRORS = ("error_percent", "log_error_x100")
 HELDOUT = ("heldout_nrmse_calibrated", "heldout_rmse_calibrated", "heldout_pooled_calibrated")
@@ -92,7 +90,7 @@ Cells = dict[Key, dict[int, Row]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What counts as a loss; ratios are new over old."""
+    """Limits of a loss; ratios are new over old."""
 
     error: float = 1.1
     error_floor: float = 1e-3
@@ -108,11 +106,11 @@ class Comparison:
     """One cell of both files.
 
     Attributes:
-        key: What names it, by new names.
+        key: Its name, by new names.
         seeds: How many seeds were compared.
         figures: Name of a figure -> (old, new), each None where there is none.
-        losses: Why it is worse; empty where it is not.
-        notes: What a reader should know besides.
+        losses: Why it is worse; empty if it is not.
+        notes: Other remarks.
     """
 
     key: Key
@@ -338,7 +336,7 @@ def _flagged(rows: Sequence[Row]) -> float | None:
 
 
 def print_table(compared: Sequence[Comparison]) -> None:
-    """Print one line a cell, then what is worse and what should be known of it."""
+    """Print one line for each cell, then losses and notes."""
     width = max((len(cell_name(cell.key)) for cell in compared), default=4)
     print(
         f"{'':5s} {'cell':{width}s} seeds  {'error [%]: old, new, ratio':26s}  "

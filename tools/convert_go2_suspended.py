@@ -1,10 +1,10 @@
-r"""Turns the public recording of a suspended Unitree Go2 into an NPZ file and its column map.
+r"""Convert the public recording of a suspended Unitree Go2 into an NPZ file and its column map.
 
-The recording: iit-DLSLab/sim2real-robot-identification (BSD-3-Clause), datasets/go2/traj_0.pt at commit
-06739ea: the base held in the air, all twelve joints under PD control by the robot's own drivers (kp 20 and
-kd 1.5 in that project's configuration), position set-points, 200 samples a second. Its keys: time (T) [s],
-dof_pos and des_dof_pos (T, 12) [rad]; columns leg by leg FL, FR, RL, RR, in each leg hip, thigh, calf (that
-project's collecting script).
+The recording is datasets/go2/traj_0.pt of iit-DLSLab/sim2real-robot-identification (BSD-3-Clause) at commit
+06739ea. The base is held in the air. All twelve joints are under PD control by the robot's own drivers: kp 20
+and kd 1.5 in that project's configuration. There are position set-points and 200 samples a second. Its keys
+are time (T) [s], dof_pos and des_dof_pos (T, 12) [rad]. Columns are leg by leg FL, FR, RL, RR, in each leg
+hip, thigh, calf (that project's collecting script).
 
 Fetch it and convert it:
 
@@ -52,7 +52,7 @@ def convert(source: Path, out: Path, parts: int = 1) -> list[Path]:
         parts: Write the recording in so many parts of equal length, so that any of them can be held out.
 
     Raises:
-        SystemExit: The file is not what its source says it is.
+        SystemExit: The file has other contents than its source describes.
     """
     # weights_only: a torch file is a pickle and could otherwise run anything.
     data = torch.load(source, map_location="cpu", weights_only=True)
@@ -81,7 +81,9 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("source", type=Path, help="datasets/go2/traj_0.pt of the source project")
     parser.add_argument("--out", type=Path, required=True, help="folder for traj_0.npz and columns.yaml")
-    parser.add_argument("--parts", type=int, default=1, help="write so many parts, to hold one of them out")
+    parser.add_argument(
+        "--parts", type=int, default=1, help="number of equal parts to write, to hold one of them out"
+    )
     options = parser.parse_args(arguments)
     if options.parts < 1:
         parser.error(f"--parts must be at least 1, got {options.parts}")

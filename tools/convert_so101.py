@@ -1,6 +1,6 @@
-r"""Turns public recordings of an SO-101 arm into NPZ files and their column map.
+r"""Convert public recordings of an SO-101 arm into NPZ files and their column map.
 
-The recordings: isaac-sim2real/sage (Apache-2.0), output/real/so101/custom/<motion>/ at commit 4ffd262: a
+The recordings are output/real/so101/custom/<motion>/ of isaac-sim2real/sage (Apache-2.0) at commit 4ffd262: a
 real arm of six Feetech STS3215 servos in position mode, about fifty motions at 49.85 samples a second. In
 each folder:
 
@@ -17,8 +17,8 @@ Fetch and convert:
     git clone https://github.com/isaac-sim2real/sage
     python tools/convert_so101.py sage/output/real/so101/custom --out so101 --motions multisine
 
-then import for a model with the joint names of mujoco_menagerie (shoulder_pan, ...). Signs and zeros against
-your model are for you to find: under P control gravity makes a joint sag, and must in the model as well.
+then import for a model with the joint names of mujoco_menagerie (shoulder_pan, ...). Check signs and zeros
+against your model: under P control gravity makes a joint sag, and the model's joint must sag, too.
 
     deal-hw data import so101/multisine.npz --columns so101/columns.yaml --model so101.xml \
         --out runs/so101/dataset

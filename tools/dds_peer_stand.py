@@ -4,8 +4,8 @@
     python tools/dds_peer_stand.py --out docs/measured/dds_peer_stand.json
 
 The program does what the vendor's low-level example does: it releases sport mode by RPC, then sends targets
-at 500 Hz with kp 60 and kd 5. It runs twice: once until the robot stands, once to the end. What the program
-saw stands beside what only the emulator knows.
+at 500 Hz with kp 60 and kd 5. It runs twice: once until the robot stands, once to the end. The result has the
+program's observations and the emulator's own state.
 """
 
 from __future__ import annotations

@@ -224,10 +224,9 @@ def errors_page(table: str) -> str:
     lines = [
         "# Error messages",
         "",
-        "Every message with which a command of deal-hw ends (exit status 2), by the file that raises it. "
-        "`…` stands for what was given. A message says what was given, what is allowed and what to do. "
-        "[Troubleshooting](../troubleshooting.md) has the frequent ones with more words. Search this page "
-        "for a part of the message that does not change.",
+        "This page lists every message with which a command of deal-hw ends (exit status 2), by the file "
+        "that raises it. Search it for a part of your message without values: `…` stands for a value. "
+        "[Troubleshooting](../troubleshooting.md) explains the frequent messages.",
         "",
     ]
     path = ""
@@ -280,8 +279,8 @@ def alarms_page() -> str:
     lines = [
         "# Alarms",
         "",
-        "An alarm is a reason to distrust a calibration. The terminal, the report and `result.json` show "
-        "it in three parts: what was seen, what it means, what to do. This page is made from the code. `…` "
+        "This page lists all alarms. An alarm is a reason to distrust a calibration. The terminal, the "
+        "report and `result.json` show it in three parts: what was seen, what it means, what to do. `…` "
         "stands for a name or a number. [Calibration](../explanation/calibration.md#alarms) has the limits.",
         "",
         "| what was seen | what it means | what to do |",
@@ -290,8 +289,8 @@ def alarms_page() -> str:
         "",
         "## Causes of a residual above the noise",
         "",
-        "Where the model does not explain the recording, deal-hw looks for a cause. Its alarm names one "
-        "of these, the share of the residual that it explains, and the joints.",
+        "If the model does not explain the recording, deal-hw looks for a cause. The alarm names one of "
+        "these causes, the joints, and the share of the residual that it explains.",
         "",
         "| cause | the residual looks like | what it means | what to do |",
         "|---|---|---|---|",
@@ -345,8 +344,15 @@ def on_env(env: Any, config: Any, files: Any) -> Any:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    """Show names in docstrings as names: mkdocstrings does not know Sphinx's roles."""
-    return re.sub(r":(?:class|func|meth|mod|attr|data|exc):(<code>)~?", r"\1", html)
+    """Show names in docstrings as names, and keep options whole where code wraps.
+
+    mkdocstrings does not know Sphinx's roles. A browser breaks a line after the first hyphen of ``--out``.
+    """
+    html = re.sub(r":(?:class|func|meth|mod|attr|data|exc):(<code>)~?", r"\1", html)
+    whole = r'<span class="option">\g<0></span>'
+    return re.sub(
+        r"<code>.*?</code>", lambda code: re.sub(r"(?<=[\s>])--[a-z][\w-]*", whole, code[0]), html, flags=re.S
+    )
 
 
 def on_files(files: Any, config: Any) -> Any:

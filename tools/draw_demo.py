@@ -3,8 +3,8 @@
     deal-hw demo --out runs/demo
     python tools/draw_demo.py runs/demo --out docs/images/demo.gif
 
-Left: the first recording, and what the nominal and the calibrated model predict of it; predictions restart
-from the measured state. Right: the policy on the robot before and after it was trained again, first episodes.
+Left: the first recording and the predictions of the nominal and the calibrated model, which restart from the
+measured state. Right: the policy on the robot, before and after it was trained again, first episodes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What can go wrong with any robot's run: signals, a link that is away, a second run; and rows of that."""
+"""Faults of any robot's run, and their rows: signals, a lost link, a second run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def signal_control(number: signal.Signals) -> Callable[[Rig], None]:
 
 
 def kill_control_sometime(rig: Rig) -> None:
-    """The control process dies, sooner or later: of a dry run the robot tells no phases."""
+    """The control process dies at a random time: a dry run has no phases in the emulator's log."""
     pid = rig.control_pid()
     time.sleep(float(rig.rng.uniform(0.0, 3.0)))
     rig.signal(pid, signal.SIGKILL)
@@ -53,7 +53,7 @@ def kill_both(rig: Rig) -> None:
 
 
 def stop_supervisor(rig: Rig) -> None:
-    """The operator's process stands still, until its control process has ended; then it goes on."""
+    """The operator's process is stopped until its control process has ended; then it goes on."""
     control = rig.control_pid()
     rig.signal(rig.run.pid, signal.SIGSTOP)
     with contextlib.suppress(TimeoutError):
@@ -152,7 +152,7 @@ LINK_S = (0.1, 0.5, 1.5, 3.0, 8.0)
 
 
 def process_cases() -> tuple[Case, ...]:
-    """Return the rows in which something happens to a process; the same for every robot."""
+    """Return the rows with a fault of a process; the same for every robot."""
     stop, kill = signal_control(signal.SIGSTOP), signal_control(signal.SIGKILL)
     connected = ANY[1:]
     return (
@@ -207,7 +207,7 @@ def process_cases() -> tuple[Case, ...]:
 def link_cases(
     kinds: Mapping[str, Callable[[float], Callable[[Rig], None]]], cut: bool, wires: tuple[str, ...] = ()
 ) -> Iterator[Case]:
-    """Yield the rows in which the link is away for a time, while the run ends and at any other moment.
+    """Yield the rows with a link that is lost for a time, while the run ends and at any other moment.
 
     Args:
         kinds: What happens to the link, in words with "{}" for the time, and what makes an act of a time [s].

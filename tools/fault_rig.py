@@ -1,4 +1,4 @@
-"""What the fault tables share: an emulator and a run of deal-hw, processes of their own over a real wire."""
+"""Common part of the fault tables: an emulator and a run of deal-hw, as processes over a real wire."""
 
 from __future__ import annotations
 
@@ -86,11 +86,11 @@ class Case:
 
 
 class SpoiledError(Exception):
-    """A repetition shows nothing: the run ended by itself before anything went wrong, on a busy machine."""
+    """A repetition is of no use: on a busy machine the run ended by itself before the fault."""
 
 
 class Rig(ABC):
-    """An emulator, a run, and what can happen to them. One repetition of one case.
+    """An emulator, a run, and their faults. One repetition of one case.
 
     Args:
         case: The case.
@@ -148,14 +148,14 @@ class Rig(ABC):
 
     @abstractmethod
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
-        """Return what the robot was told or did, from the emulator's report: host time [ns] and what."""
+        """Return the robot's commands and actions, from the emulator's report: host time [ns] and name."""
 
     @abstractmethod
     def untouched(self, report: Mapping[str, Any]) -> str:
         """Return what the robot was told, in words; "" where it was told nothing at all."""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
-        """Return when the emulator let something go wrong by itself [host ns]; -1: it did not."""
+        """Return the time of the emulator's own fault [host ns]; -1: there was none."""
         return -1
 
     @contextlib.contextmanager
@@ -228,7 +228,7 @@ class Rig(ABC):
     # What can be waited for.
 
     def pump(self) -> None:
-        """Take in what the emulator told since."""
+        """Read the emulator's new events."""
         if (self.folder / "events").stat().st_size == self._events_at:
             return
         with (self.folder / "events").open() as file:
@@ -255,7 +255,7 @@ class Rig(ABC):
         raise TimeoutError(f"waited {seconds:g} s in vain: {getattr(ready, '__doc__', '')}")
 
     def event_ns(self, what: str) -> int:
-        """Return when something was first told [host ns]; 0: not yet. "start": when the run was started."""
+        """Return the first time of an event [host ns]; 0: not yet. "start": the start of the run."""
         if what == "start":
             return self.start_ns
         return next((ns for ns, told in self.events if told == what), 0)
@@ -291,7 +291,7 @@ class Rig(ABC):
 
     @property
     def is_active(self) -> bool:
-        """Whether the motors obey, as far as the emulator has told."""
+        """Whether the motors follow commands, by the emulator's events so far."""
         self.pump()
         told = [what for _, what in self.events if what in self.active | self.inactive]
         return bool(told) and told[-1] in self.active
@@ -345,7 +345,7 @@ def headline(said: str) -> str:
 
 
 def write_faulty(path: Path, description: RobotDescription, fault: str) -> None:
-    """Write a policy that goes wrong as soon as the wanted velocity is not zero.
+    """Write a policy whose fault begins when the commanded velocity is not zero.
 
     Args:
         path: The file.

@@ -1,8 +1,8 @@
 """Fault tables: repetitions at random moments beside a stall monitor, and pages of them.
 
-A repetition waits for a random moment of a phase of the run, lets one thing go wrong, and asks who knows: the
-emulator (what the robot was told, by its own log, on the machine's monotonic clock that all processes share),
-the operator's terminal and exit code, and the recording. deal-hw's own word on the robot counts for nothing.
+A repetition waits for a random moment of a phase of the run and causes one fault. It is judged by the
+emulator's log of commands (on the machine's monotonic clock, which all processes share), by the operator's
+terminal and exit code, and by the recording. deal-hw's own report on the robot is not used.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _LONG_PAUSE_NS = 20_000_000
 PAUSE_NS = 3_000_000
 """Shorter pauses of the machine are not noted [ns]."""
 _ATTEMPTS = 4
-"""So often a repetition is begun anew where the run ended before anything went wrong."""
+"""Attempts at a repetition if its run ends before the fault."""
 _RIG_PRIORITY = 45
-"""Of the thread that lets things go wrong: a moment that was drawn must not slip."""
+"""Real-time priority of the thread that causes the fault: it must act at the drawn moment."""
 
 
 def repetition(
     rig_type: type[Rig], case: Case, wire: str, entropy: Sequence[int], slot: int, typical_s: dict[str, float]
 ) -> dict[str, Any]:
-    """Run one repetition of a case and return what came of it.
+    """Run one repetition of a case and return its row.
 
     Args:
         rig_type: The robot.
@@ -54,10 +54,10 @@ def repetition(
         wire: The transport.
         entropy: Decides the moment.
         slot: Number of the job.
-        typical_s: How long connecting and taking over take; followed.
+        typical_s: Duration of connecting and taking over [s]; updated.
 
     Raises:
-        SpoiledError: Again and again the run ended before anything went wrong.
+        SpoiledError: In all attempts the run ended before the fault.
     """
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([*entropy, attempt, *case.name.encode()])
@@ -83,12 +83,12 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
             rig.notes.append(str(error))
         finally:
             rig.finish()
-        # What is still under way shall arrive.
+        # Messages in transit must arrive.
         time.sleep(0.3)
         rig.pump()
     learn(typical_s, rig)
     if not (rig.folder / "emulator.json").exists():
-        raise SpoiledError("the emulator died and told nothing")
+        raise SpoiledError("the emulator died without a report")
     report = json.loads((rig.folder / "emulator.json").read_text())
     row = recording(rig.folder / "run" / "dataset")
     last_cycle_ns = row.pop("last_cycle_ns")
@@ -111,7 +111,7 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
 
 
 def recording(folder: Path) -> dict[str, Any]:
-    """Return whether the recording is whole, after the repair that the next opening does by itself."""
+    """Return whether the recording is whole after the automatic repair of the next opening."""
     if not folder.exists():
         return {"dataset": "none", "states": 0, "last_cycle_ns": -1}
     try:
@@ -124,8 +124,7 @@ def recording(folder: Path) -> dict[str, Any]:
     states = sum(len(episode.trajectory.device_s) for episode in episodes)
     last_ns = -1
     if episodes and len(starts := episodes[-1].cycles.start_s):
-        # The cycle that went wrong is the one that was judged, or, where it never ended, the one that had to
-        # follow the last record.
+        # The faulty cycle is the first passive one, or, if it never ended, the one after the last record.
         said = episodes[-1].cycles.safety_state
         good = [i for i in range(len(starts)) if said[i] != "passive"]
         passive = [i for i in range(len(starts)) if said[i] == "passive"]
@@ -135,17 +134,19 @@ def recording(folder: Path) -> dict[str, Any]:
 
 
 def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by the emulator's log how the robot ends, and how long after the fault it became so for good.
+    """Return by the emulator's log the robot's final state, and the time from the fault to that state.
 
-    Where somebody else goes on commanding, the first time that it was made passive counts.
+    If another program goes on commanding, the first time that the robot was made passive counts.
     """
-    told = [(ns, what in rig.active) for ns, what in rig.changes(report) if what in rig.active | rig.inactive]
+    states = [
+        (ns, what in rig.active) for ns, what in rig.changes(report) if what in rig.active | rig.inactive
+    ]
     ends = "never commanded"
-    if any(active for _, active in told):
-        ends = "active" if told[-1][1] else "passive"
+    if any(active for _, active in states):
+        ends = "active" if states[-1][1] else "passive"
     from_ns = rig.fault_ns + round(rig.case.from_ms * 1e6)
-    obeys = any(active for _, active in [pair for pair in told if pair[0] < from_ns][-1:])
-    after = [(ns, active) for ns, active in told if ns >= from_ns]
+    obeys = any(active for _, active in [pair for pair in states if pair[0] < from_ns][-1:])
+    after = [(ns, active) for ns, active in states if ns >= from_ns]
     if rig.case.expect == "contested":
         times = [ns for ns, active in after if not active][:1]
     elif obeys or any(active for _, active in after):
@@ -156,13 +157,13 @@ def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
     known = rig.fault_ns > 0 and bool(times)
     return {
         "ends": ends,
-        "obeyed": any(active for _, active in [pair for pair in told if pair[0] < rig.fault_ns][-1:]),
+        "obeyed": any(active for _, active in [pair for pair in states if pair[0] < rig.fault_ns][-1:]),
         "passive_ms": round(max(times[0] - from_ns, 0) * 1e-6, 1) if known else None,
     }
 
 
 def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
-    """Return what was not as the case expects."""
+    """Return the differences from the case's expectation."""
     case, found = rig.case, list(rig.notes)
     end = judge(rig, report)
     late = rig.fault_ns > 0 and (end["passive_ms"] is None or end["passive_ms"] > case.within_ms)
@@ -178,10 +179,10 @@ def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> l
         case "contested":
             found += [] if end["ends"] != "never commanded" else ["it was never commanded"]
         case "untouched":
-            found += [told] if (told := rig.untouched(report)) else []
+            found += [touched] if (touched := rig.untouched(report)) else []
         case "unhomed":
             commanded = [what for _, what in rig.changes(report) if what in rig.active | rig.inactive]
-            found += [f"the motors were told {commanded}"] if commanded else []
+            found += [f"the motors got {commanded}"] if commanded else []
         case "stiff":
             found += [f"it ends {end['ends']}"] if end["ends"] != "active" else []
     if rig.run.returncode not in case.codes:
@@ -194,7 +195,7 @@ def complaints(rig: Rig, report: Mapping[str, Any], row: Mapping[str, Any]) -> l
 
 
 def learn(typical_s: dict[str, float], rig: Rig) -> None:
-    """Follow how long connecting and taking over take on this machine [s], so that moments fall into them."""
+    """Update the durations of connecting and taking over on this machine [s]; random moments need them."""
     begun_ns = rig.start_ns
     for phase, event in ((CONNECTING, rig.phase_at(TAKING_OVER)[0]), (TAKING_OVER, rig.phase_at(ARMING)[0])):
         if not (end_ns := rig.event_ns(event)):
@@ -206,14 +207,14 @@ def learn(typical_s: dict[str, float], rig: Rig) -> None:
 def run_cases(
     rig_type: type[Rig], cases: Sequence[Case], wire: str, given: argparse.Namespace, have: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """Run every case its repetitions, some at a time, and yield its row.
+    """Run all repetitions of every case, some at a time, and yield its row.
 
     Args:
         rig_type: The robot.
         cases: The rows.
         wire: The transport.
         given: Repetitions, jobs and seed.
-        have: Rows of earlier calls by their fault: their repetitions count.
+        have: Rows of earlier calls by fault; their repetitions count.
     """
     typical_s = {CONNECTING: 3.0, TAKING_OVER: 0.5}
     slots = threading.local()
@@ -260,9 +261,9 @@ def run_cases(
 
 
 def summary(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row with what its repetitions say together."""
+    """Return a row with the statistics of its repetitions."""
     done = row["repetitions"]
-    # A robot that did not obey when the fault came, and a run that was not ended by it, have no time to tell.
+    # There is no time if the robot followed no commands at the fault, or if the fault did not end the run.
     went_on = [r for r in done if r["exit_code"] == 0 and r["phase"] != ENDING]
     counted = [r for r in done if r["obeyed"] and r["passive_ms"] is not None and r not in went_on]
     times = [r["passive_ms"] for r in counted] if row["expected"] in ("passive", "contested") else []
@@ -296,10 +297,10 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         f"Machine: {first['platform']}, {first['processors']} processors, shared with other work, load "
         f"{min(loads):.1f} to {max(loads):.1f}.",
         "",
-        "*20/20*: all twenty repetitions were as expected. Times: median / worst of those in which the robot",
-        "obeyed when the fault came (*of 13*, where that were not all), from the fault (where a link was",
-        "away: from its return) until the robot was passive for good, by the emulator's own log.",
-        "In brackets: the longest pause of the whole machine beside the worst one, by a stall monitor.",
+        "*20/20*: all twenty repetitions were as expected. Times are median / worst, from the fault (after a",
+        "lost link: from its return) until the robot stayed passive, by the emulator's own log. *of 13*:",
+        "only 13 repetitions count, in which the robot followed commands when the fault came.",
+        "In brackets: the longest pause of the whole machine near the worst time, by a stall monitor.",
         "",
         f"| fault | expected | {' | '.join(f'{wire} [ms]' for wire in wires)} | exit codes | recordings | "
         "the operator reads |",
@@ -324,13 +325,13 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
 
 
 def shortened(said: str) -> str:
-    """Return what the operator reads without addresses of this machine."""
+    """Return the operator's message without addresses of this machine."""
     said = re.sub(r"/tmp/\S+|tcp/\S+", "PORT:", said)
     return said if len(said) <= 110 else said[:107] + "..."
 
 
 def cell(row: Mapping[str, Any] | None) -> str:
-    """Return a row's times as a page shows them."""
+    """Return a row's times for a cell of the page."""
     if row is None:
         return ""
     text = ""
@@ -345,16 +346,16 @@ def cell(row: Mapping[str, Any] | None) -> str:
 def main(
     rig_type: type[Rig], cases: Sequence[Case], title: str, words: Sequence[str], doc: str | None
 ) -> int:
-    """Run a table, or write a page; return 1 where something was not as expected."""
+    """Run a table, or write a page; return 1 if a repetition was not as expected."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawTextHelpFormatter)
     if len(rig_type.wires) > 1:
         parser.add_argument("--transport", choices=rig_type.wires, default=rig_type.wires[0])
     parser.add_argument("--repetitions", type=int, default=20)
-    parser.add_argument("--only", default="", help="rows whose name this regular expression finds")
-    parser.add_argument("--skip", default="^$", help="rows whose name this one finds are left out")
+    parser.add_argument("--only", default="", help="only rows whose name matches this regular expression")
+    parser.add_argument("--skip", default="^$", help="leave out rows whose name matches this one")
     parser.add_argument("--seed", type=int, default=0, help="draws phases and moments")
     parser.add_argument(
-        "--jobs", type=int, default=1, help="repetitions at a time, each on a wire of its own"
+        "--jobs", type=int, default=1, help="repetitions at the same time, each on a wire of its own"
     )
     parser.add_argument("--list", action="store_true", help="list the rows")
     parser.add_argument("--out", type=Path, default=None, help="results; repetitions in it count")
@@ -382,7 +383,7 @@ def main(
     if given.list:
         print("\n".join(f"{case.expect:10} {case.name}" for case in chosen))
         return 0
-    # A shell that starts a program in the background has it ignore Ctrl-C, and so would all that it starts.
+    # A shell makes a background program ignore Ctrl-C, and all its children would inherit this.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     calls, rows = earlier(given.out)
     calls.append(describe_call(f"tools/{Path(sys.argv[0]).name}"))
@@ -400,7 +401,7 @@ def main(
 
 
 def earlier(path: Path | None) -> tuple[list[Any], dict[str, Any]]:
-    """Return the calls that are in a results file, and its rows by their fault."""
+    """Return the calls of a results file, and its rows by fault."""
     if path is None or not path.exists():
         return [], {}
     known = json.loads(path.read_text(encoding="utf-8"))

@@ -1,7 +1,8 @@
-"""Feeds damaged and hostile inputs to every reader and counts what they do with them.
+"""Feed damaged and hostile inputs to every reader, and count the results.
 
-Each input must be read or refused with one of our errors, in one line, in bounded time and memory. All else
-is a failure: it is printed with its number, and the exit code is 1. Input n of a seed is always the same:
+Each input must be read or refused with one of our errors, in one line, in bounded time and memory. Any other
+result is a failure: it is printed with its number, and the exit code is 1. Input n of a seed is always the
+same:
 
     python tools/fuzz_files.py --kind mcap --count 100000 --seed 0
     python tools/fuzz_files.py --kind mcap --seed 0 --only 4711     # one input again, its traceback in full

@@ -1,9 +1,9 @@
-"""Feeds damaged policies to the checks that stand before a robot, and counts what becomes of them.
+"""Feed damaged policies to the checks before a robot, and count the results.
 
-Specs are damaged as JSON; what is accepted runs the behaviour that would drive the robot, in this process.
-Networks are damaged as bytes: quickly in a worker that may crash or hang and is then started again; one in so
-many, and all that the worker could not finish, by the check that `deal-hw deploy` makes. A failure is any
-error that is not a refusal in one line, a check that outlasts its limit, or a gigabyte of memory here.
+Specs are damaged as JSON. An accepted spec runs the robot's behaviour in this process. Networks are damaged
+as bytes. Most run in a fast worker, which is restarted after a crash or a hang. Some, and all that the worker
+could not finish, run through the check of `deal-hw deploy`. A failure is any error that is not a refusal in
+one line, a check beyond its time limit, or a gigabyte of memory here.
 
     .venv/bin/python tools/fuzz_policies.py --specs 100000 --networks 20000 --seed 1
 """

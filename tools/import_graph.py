@@ -1,4 +1,4 @@
-"""Who imports whom, read from the sources: what the layer test and `tools/structure.py` share.
+"""Imports between modules, read from the sources, for the layer test and `tools/structure.py`.
 
 Nothing is imported or run, so the sources may be those of another checkout.
 """
@@ -16,7 +16,7 @@ import tomllib
 
 When = Literal["load", "call", "types", "text"]
 """When an import happens: as its module loads, as a function runs, never (under ``TYPE_CHECKING``, for type
-checkers alone), or where somebody uses a module's name that is written as text."""
+checkers alone), or where a module's name is written as text."""
 
 MODULE_TEXT = re.compile(r"[A-Za-z_]\w*(?:\.\w+)+(?::\w+)?")
 IMPORT_CALLS = frozenset({"import_module", "importlib.import_module", "__import__"})

@@ -1,14 +1,14 @@
-"""Measure the Go2's bridge: what latency it adds, and how soon it damps when something breaks.
+"""Measure the Go2's bridge: its added latency, and its time to damping after a fault.
 
 Run it as ``python tools/measure_bridge.py --out FILE.json``. All processes run on this machine, so that their
 monotonic clock is the same.
 
-``latency``: a controller and a robot that only measure, 500 commands and states a second, over TLS; through
-the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge stand in a
-network namespace, and its interface goes down in a command stream; time from there to the first damping at
-the robot, beside a stall monitor of the bridge's priority. ``restart``: the bridge is killed with SIGKILL in
-a command stream and started again. ``refuse``: replayed commands and a second controller beside one that
-commands.
+``latency``: a controller and a robot only measure, with 500 commands and states a second over TLS, through
+the bridge (DDS behind it), and without it on each of the two wires. ``cut``: robot and bridge run in a
+network namespace, and its interface goes down in a command stream. The time from there to the first damping
+at the robot counts, beside a stall monitor of the bridge's priority. ``restart``: the bridge is killed with
+SIGKILL in a command stream and started again. ``refuse``: replayed commands and a second controller beside
+the first.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ class MeasureBridge(Checked):
     """Measure the Go2's bridge on this machine."""
 
     acts: tuple[str, ...] = ACTS
-    """What to measure: latency, cut (needs root), restart, refuse."""
+    """Measurements: latency, cut (needs root), restart, refuse."""
 
     seconds: Annotated[float, Range(1, 3600, "s")] = 30.0
-    """How long each wire's latency is measured [s]."""
+    """Length of each latency measurement [s]."""
 
     cuts: Annotated[int, Range(1, 1000)] = 20
-    """How often the link is cut."""
+    """Number of cuts of the link."""
 
     restarts: Annotated[int, Range(1, 100)] = 5
-    """How often the bridge is killed."""
+    """Number of kills of the bridge."""
 
     domain: Annotated[int, Range(0, 232)] = 77
     """DDS domain."""
@@ -176,7 +176,7 @@ def _side(
 
 
 def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any]:
-    """Return the spread of the times from sending to arrival, and how many messages did not arrive."""
+    """Return statistics of the times from sending to arrival, and the number of lost messages."""
     ages_ms = np.array([heard[number] - sent[number] for number in heard if number in sent]) * 1e-6
     first, last = min(map(int, heard)), max(map(int, heard))
     lost = sum(1 for number in sent if first <= int(number) <= last and number not in heard)
@@ -194,7 +194,7 @@ def _one_way(sent: Mapping[str, int], heard: Mapping[str, int]) -> dict[str, Any
 
 
 def cut(config: MeasureBridge, folder: Path) -> dict[str, Any]:
-    """Return how soon the robot is damped when the interface of the bridge's computer goes down."""
+    """Return the times to damping after the interface of the bridge's computer goes down."""
     name = f"go2-{os.getpid()}"
     times: list[tuple[int, int]] = []
     with (
@@ -273,7 +273,7 @@ def _set_up(inside: socket.socket, interface: str, up: bool) -> None:
 
 
 def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
-    """Return how soon a bridge that was killed damps once it is started again, and what it let through."""
+    """Return the times to damping after a killed bridge is restarted, and the commands that it admitted."""
     delays: list[float] = []
     refused = admitted = 0
     with BridgeRig(folder, config.domain) as rig:
@@ -300,7 +300,7 @@ def restart(config: MeasureBridge, folder: Path) -> dict[str, Any]:
 
 
 def refuse(config: MeasureBridge, folder: Path) -> dict[str, Any]:
-    """Return what was refused beside a controller that went on undisturbed."""
+    """Return the refusals beside a controller that is not disturbed."""
     with BridgeRig(folder, config.domain) as rig:
         options = rig.options("controller")
         # Opened before the first one commands: a handshake would hold up the threads of this process.

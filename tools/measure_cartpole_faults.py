@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fault table of the cart-pole: what happens when something goes wrong, and how soon its motor is off.
+"""Fault table of the cart-pole: results of faults, and the time until its motor is off.
 
 python tools/measure_cartpole_faults.py --jobs 2 --out cartpole.json
 python tools/measure_cartpole_faults.py --transport can --jobs 2 --out cartpole_can.json
@@ -34,7 +34,7 @@ BY_ITSELF = (
 CAN = ("can", "odrive")
 DYNAMIXEL = ("dynamixel",)
 STOPPED = "stopped"
-"""A servo that its own watchdog stopped stands still, with torque."""
+"""State of a servo that its own watchdog stopped: it holds its position with torque."""
 DEPLOY = """
 import sys
 from pathlib import Path
@@ -100,7 +100,7 @@ class CartpoleRig(Rig):
         return self.case.seconds or SECONDS
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
-        """Phases by the device's modes; the run's own times follow the moment of arming."""
+        """Phases by the device's modes; the later ones by their time after arming."""
         return {
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (HOMING, 0.0, self.typical_s[TAKING_OVER]),
@@ -118,7 +118,7 @@ class CartpoleRig(Rig):
         return f"{report['received_bytes']} bytes" if report["received_bytes"] else ""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
-        """The port vanished, the wire was cut, the firmware hung, or the bus had a fault."""
+        """The port vanished, the wire was cut, the firmware stopped, or the bus had a fault."""
         return next((ns for ns, what in self.changes(report) if what in BY_ITSELF), -1)
 
 
@@ -187,9 +187,10 @@ CASES = (
 )
 TITLE = "Cart-pole: from a fault to a motor without torque"
 WORDS = (
-    "By `tools/measure_cartpole_faults.py` on the emulated cart-pole, profile `sensor`, over a",
-    "pseudo-terminal. Each repetition draws a phase (connecting, homing, arming, running, ending) and a",
-    "moment of it. The device's own watchdog stops the motor 200 ms after the last command.",
+    "This page has the time from each fault to a motor without torque. `tools/measure_cartpole_faults.py`",
+    "measured it on the emulated cart-pole, profile `sensor`, over a pseudo-terminal. Each repetition draws",
+    "a random moment of a random phase (connecting, homing, arming, running, ending). The device's own",
+    "watchdog stops the motor 200 ms after the last command.",
     "",
 )
 

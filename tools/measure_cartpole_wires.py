@@ -4,11 +4,11 @@
 python tools/measure_cartpole_wires.py --transports serial can odrive --seconds 120 --out wires.json
 python tools/measure_cartpole_wires.py --table wires.json
 
-Each row is an emulator in a process of its own and a control loop here: a command a cycle, all states
-read. Round trip: from sending a command until the first state that names it has been read [ms]; the device
-ticks once a millisecond and sends a state every 5 ms, so 1 to 6 ms are the device's own. Cycle: how late it
-begins [ms]. Wire: how long a command and a state are under way at the bit rate, worst case [ms]; the
-emulators' wires take no time, so this is to be added, but for dynamixel, whose servos take it.
+Each row is an emulator in a process of its own and a control loop here, with one command for each cycle and
+all states read. Round trip: from sending a command until the first state that names it has been read [ms].
+The device ticks once a millisecond and sends a state every 5 ms, so 1 to 6 ms are the device's own. Cycle:
+lateness of its start [ms]. Wire: worst transit of a command and a state at the bit rate [ms]. Add it, because
+the emulators' wires take no time. Only the emulated Dynamixel servos include it.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@
     python tools/measure_dynamixel_bus.py --seconds 120
     python tools/measure_dynamixel_bus.py --port /dev/ttyUSB0 --rates 50 200
 
-A round trip is from the question's write to the last byte of both servos' answers, as the driver asks with
-each sample (Fast Sync Read of 72 bytes each); beside it stands the time of these bytes on the wire. Without
---port two emulated servos answer, which take the wire's time, too. --absent asks a servo that is not there:
-what a dead servo costs.
+A round trip is from the request's write to the last byte of both servos' answers, as for each sample of the
+driver (Fast Sync Read of 72 bytes each). The time of these bytes on the wire is shown beside it. Without
+--port two emulated servos answer, which take the wire's time, too. --absent asks an absent servo, to measure
+the cost of a dead one.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class MeasureBus:
     """The port, with settings as for `deal-hw`; by default two servos are emulated."""
 
     rates: tuple[float, ...] = (50.0, 200.0)
-    """Questions a second."""
+    """Requests a second."""
 
     seconds: float = 120.0
     """Length of each row [s]."""
 
     baud_rate: int = 1_000_000
-    """Of the emulated servos."""
+    """Baud rate of the emulated servos."""
 
     absent: bool = False
-    """Ask a servo that is not there."""
+    """Ask an absent servo."""
 
     out: Path | None = field(default=None)
     """Write the rows to this JSON file."""
@@ -95,7 +95,7 @@ def measure(
 
 @contextlib.contextmanager
 def some_port(config: MeasureBus) -> Iterator[str]:
-    """Yield the port given, or that of emulated servos."""
+    """Yield the given port, or that of emulated servos."""
     if config.port is not None:
         yield config.port
         return

@@ -7,10 +7,10 @@ ends; it is read after the calibration has written its result.
 
     python tools/measure_go2_calibration.py --transport zenoh --seeds 1000-1004 --out FILE.json
 
-What each parameter is compared with: stiffness with what the drive makes of the kp that is sent; damping with
-what it makes of the kd that is sent plus the joint's viscous friction; the others with themselves. The
-latency that a recording shows is the emulator's own plus the way over the wire there and back, rounded up to
-the drives' next millisecond.
+The true stiffness is the drive's factor times the kp that is sent. The true damping is the drive's factor
+times the kd that is sent, plus the joint's viscous friction. The others have their own value. The latency of
+a recording is the emulator's own plus the transit over the wire and back, rounded up to the drives' next
+millisecond.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace, seed: int) -> dict[str, Any]:
-    """Return the row of one seed; what failed is kept in it."""
+    """Return the row of one seed, with its failures."""
     row: dict[str, Any] = {"seed": seed, "profile": options.profile, "transport": options.transport}
     with tempfile.TemporaryDirectory(dir=options.keep) as folder:
         try:
@@ -169,7 +169,7 @@ def verb(*words: str) -> str:
 
 
 def judge(result: dict[str, Any], truth: Go2Truth) -> dict[str, Any]:
-    """Return how far a calibration's result is from the truth."""
+    """Return the errors of a calibration's result."""
     true = truth.parameters(DESCRIPTION.stiffness[0], DESCRIPTION.damping[0])
     rows: dict[str, dict[str, Any]] = {}
     for name, found in result["parameters"].items():
@@ -213,7 +213,7 @@ def error(rows: dict[str, dict[str, Any]], kind: str, which: str) -> float:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what all seeds say together."""
+    """Return statistics over all seeds."""
     good = [row for row in rows if "error" not in row]
     if not good:
         return {"seeds": len(rows), "failed": len(rows)}

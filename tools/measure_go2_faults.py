@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fault table of the Go2: what happens when something goes wrong, and how soon the robot is damped for good.
+"""Fault table of the Go2: results of faults, and the time until the robot stays damped.
 
 python tools/measure_go2_faults.py --transport zenoh --jobs 2 --out zenoh.json
 python tools/measure_go2_faults.py --table faults.md zenoh.json dds.json
@@ -97,7 +97,7 @@ class Go2Rig(Rig):
         return self.case.seconds or SECONDS
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
-        """Phases by what the robot is told; the run's own times follow its first stiff command."""
+        """Phases by the robot's commands; the later ones by their time after the first stiff command."""
         before_s, total_s = POSTURE.before_s, POSTURE.added_s + self._seconds
         return {
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
@@ -110,7 +110,7 @@ class Go2Rig(Rig):
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
-        """Kinds of commands that the robot heard."""
+        """Kinds of commands that the robot received."""
         return [(ns, kind) for _, ns, kind in report["commands"]["changes"]]
 
     def untouched(self, report: Mapping[str, Any]) -> str:
@@ -217,13 +217,14 @@ CASES = (
 )
 TITLE = "Go2: from a fault to damping"
 WORDS = (
-    "By `tools/measure_go2_faults.py` on the emulated robot, profile `sensor`, over real wires.",
-    "Each repetition draws a phase (connecting, taking over, arming, standing up, running, lying down,",
-    "ending) and a moment of it. *Cut* is the emulator's: nothing goes out or is heard. *Freezes* and",
-    "*reset* are done to the TCP connection by a proxy.",
+    "This page has the time from each fault to a damped robot. `tools/measure_go2_faults.py` measured it on",
+    "the emulated robot, profile `sensor`, over real wires. Each repetition draws a random moment of a",
+    "random phase (connecting, taking over, arming, standing up, running, lying down, ending). *Cut*: the",
+    "emulator neither sends nor receives. *Freezes*, *reset*: a proxy freezes or resets the TCP connection.",
     "",
-    "In the row that expects *stiff* only the robot's own side could help: both processes are dead, the Go2",
-    "holds its last command. So it does for as long as a link stays away. Keep the remote in your hand.",
+    "In the row that expects *stiff*, both processes are dead and the Go2 holds its last command. Only a",
+    "program on the robot's side could help. The same holds while a link is away. Keep the remote in your",
+    "hand.",
     "",
 )
 

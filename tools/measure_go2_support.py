@@ -1,8 +1,8 @@
-"""How clearly the emulated Go2 shows what carries it: the figures behind ``deal_hw.drivers.go2.support``.
+"""Measure the signals that tell floor from stand on the emulated Go2, for ``deal_hw.drivers.go2.support``.
 
     python tools/measure_go2_support.py --out docs/measured/go2_support.json
 
-prints a table with the range over seeds and profiles of what decides, for each situation.
+prints a table with their range over seeds and profiles, for each situation.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How regular 500 commands and states a second are over the Go2's wire: a controller, a robot, nothing else.
+"""Measure the timing of 500 commands and states a second over the Go2's wire.
 
     python tools/measure_go2_transport.py --transport zenoh --seconds 600 --freeze-at 300 --freeze-s 5
 
-Two processes of this machine send messages of the robot's size on its topics. With --freeze-at the robot's
-process is stopped for a while: no control cycle may wait for it. Exit code 1: one was late by more than 2 ms
-while the machine ran.
+Two processes of this machine, controller and robot, send messages of the robot's size on its topics. With
+--freeze-at the robot's process is stopped for a time, and no control cycle may wait for it. Exit code 1: a
+cycle was late by more than 2 ms while the machine did not pause.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ FREEZE_LIMIT_S: Final = 2e-3
 
 @dataclass(frozen=True, kw_only=True)
 class TransportBench:
-    """Measure how regular 500 commands and states a second are over the Go2's wire."""
+    """Measure the timing of 500 commands and states a second over the Go2's wire."""
 
     transport: Literal["dds", "zenoh"] = "dds"
-    """The wire."""
+    """The transport."""
 
     port: str = ""
     """Network interface (dds) or end point (zenoh); by default on this machine's loopback."""
@@ -58,16 +58,16 @@ class TransportBench:
     """Stop the robot's process (SIGSTOP) this long after the start [s]."""
 
     freeze_s: Annotated[float, Range(1e-3, 3600, "s")] = 1.0
-    """For how long [s]."""
+    """Length of the stop [s]."""
 
     wire: tyro.conf.OmitArgPrefixes[WireOptions] = field(default_factory=WireOptions)
-    """More about the network."""
+    """Options of the network."""
 
     out: Path | None = None
     """File of the row (JSON)."""
 
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -100,7 +100,7 @@ def bench_transport(settings: TransportBench) -> int:
 
 
 def _longest_s(frozen: Mapping[str, Any]) -> float:
-    """Return the delay that counts: without the machine's pauses, where the stall monitor ran [s]."""
+    """Return the longest delay, without pauses of the machine if the stall monitor ran [s]."""
     awake_s = frozen.get("awake_delay_s")
     return float(frozen["cycle_delay"]["max_s"] if awake_s is None else awake_s)
 
@@ -135,7 +135,7 @@ def measure(settings: TransportBench) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @contextlib.contextmanager
 def _monitored() -> Iterator[Account | None]:
-    """Watch the machine itself, where that is permitted."""
+    """Run the stall monitor, if permitted."""
     with contextlib.ExitStack() as stack:
         try:
             seen: Account | None = stack.enter_context(watch_stalls(_PAUSE_NS))
@@ -158,7 +158,7 @@ def summary(
 ) -> dict[str, Any]:
     """Return the row of the result from what both sides measured.
 
-    Losses that fall into the freeze and the 2 s after it are counted apart: nobody could have delivered them.
+    Losses in the freeze and the 2 s after it are counted apart, because no transport could avoid them.
     """
     freeze = _freeze_cycles(settings)
     commands, states = robot["commands"], controller["states"]
@@ -236,7 +236,7 @@ def _stream(sent: int, arrived: Mapping[str, Any], touched: tuple[int, int]) -> 
 
 
 def lines(row: Mapping[str, Any]) -> list[str]:
-    """Return the result for a person."""
+    """Return the result as text."""
     text = [
         f"{row['transport']}, {row['rate_hz']:g} Hz both ways, {row['seconds']:g} s; p50 / p99 / max",
         f"period error     {_ms(row['period_error'])}",

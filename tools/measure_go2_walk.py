@@ -1,11 +1,11 @@
-"""Lets a policy walk the emulated Go2 behind the safety filter, in virtual time: how well does it follow?
+"""Measure how well a policy walks the emulated Go2 behind the safety filter, in virtual time.
 
     python tools/measure_go2_walk.py --profile realistic --seeds 0 1 2
     python tools/measure_go2_walk.py --policy runs/train/policies/policy.onnx --rounds 35
 
 Driver, wire format, filter, safety checks and control loop are those of `deal-hw deploy go2`; only time is
-virtual, so that a busy machine changes nothing. A round asks for 1 m/s ahead, 0.5 m/s to the left and a turn
-of 1 rad/s, 5 s each, and stands for 2 s before. Errors are those of the emulator's own truth: of the velocity
+virtual, so a busy machine does not change the result. A round stands for 2 s, then commands 1 m/s ahead, 0.5
+m/s to the left and a turn of 1 rad/s, 5 s each. Errors are against the emulator's true motion: mean velocity
 in the base's heading over one step of the gait, from 1 s after each change of the command on.
 """
 
@@ -33,10 +33,10 @@ NAMES = ("stand", "ahead", "left", "turn")
 
 
 class Rounds:
-    """The profile again and again."""
+    """The profile, repeated."""
 
     def velocity(self, state: RobotState, time_s: float) -> FloatArray:
-        """Return the velocity of the part that it is time for."""
+        """Return the velocity of the present part."""
         part = np.searchsorted([begin for begin, _ in PROFILE], time_s % PROFILE_S, side="right") - 1
         return np.array(PROFILE[int(part)][1])
 

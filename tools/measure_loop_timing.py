@@ -1,12 +1,12 @@
-"""Measure the control loop_timing: one run of N minutes against an emulated cart-pole, the report as JSON.
+"""Measure the timing of the control loop in one run against an emulated cart-pole; the report as JSON.
 
     python tools/measure_loop_timing.py --minutes 10 > loop_timing.json
 
 The whole path is measured: supervisor, control process, recorder, serial line (a pty). With --port the robot
 or emulator on that port is used instead of one of our own.
 
-Beside it runs the stall monitor (stall_monitor.py): each overrun beyond a period is listed with the
-longest pause of the machine at that time.
+The stall monitor (stall_monitor.py) runs beside it: each overrun beyond a period is listed with the longest
+pause of the machine at that time.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class MeasureLoopTiming:
     """Length of the run [min]."""
 
     port: str | None = None
-    """Where the robot is; by default an emulator is started."""
+    """Port of the robot; by default an emulator is started."""
 
     profile: Literal["hold", "chirp", "balance"] = "hold"
-    """What the robot does meanwhile; balance includes the policy's network."""
+    """Motion of the robot; balance includes the policy's network."""
 
 
 _PAUSE_NS = 3_000_000
@@ -118,7 +118,7 @@ def _port(given: str | None) -> Iterator[str]:
     command = [sys.executable, "-m", "deal_hw", "emulate", "--nominal", "--profile", "sensor"]
     process = subprocess.Popen([*command, "--parent", str(os.getpid())], stdout=subprocess.PIPE, text=True)
     try:
-        # A device does not stand still because the machine is busy; an emulator should not either.
+        # A real device does not pause on a busy machine, so the emulator has a high priority.
         with contextlib.suppress(PermissionError):
             os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(60))
         if process.stdout is None:

@@ -1,15 +1,15 @@
-"""Does memory stay flat over generations? Memory of each method, generation by generation or run by run.
+"""Measure the growth of each method's memory over its generations, or over repeated runs.
 
-Each method runs in a process of its own on a short cart-pole recording. A search is looked at after every
-generation; one that ends before the wanted number is run again on the same problem with another seed, so that
-what a run leaves behind shows. A method that is one optimiser's call, or decides itself what follows its
-search, is run again and again and looked at after every run.
+Each method runs in a process of its own on a short cart-pole recording. Memory of a search is measured after
+every generation. A search that ends early is run again on the same problem with another seed, so that memory
+left by a run shows. A method without generations, or with its own choice of steps, is run repeatedly and
+measured after every run.
 
-Two figures are taken. The resident memory is what the system lends to the process. What malloc has handed out
-(glibc only) is what somebody still holds, in Python, NumPy, torch and MuJoCo: without memory that was freed
-and waits to be used again, with addresses that were never written to. No garbage is collected and no memory
-is trimmed for the measurement's sake. The first half of the values is warm-up: by its end libraries are
-loaded and buffers have their size. A straight line through the second half is the growth.
+There are two figures. Resident memory is the process's memory as the system counts it. Held memory is the
+memory that malloc has handed out (glibc only), in Python, NumPy, torch and MuJoCo. It excludes freed memory
+and includes addresses that were never written to. The measurement neither collects garbage nor trims memory.
+The first half of the values is warm-up: by its end libraries are loaded and buffers have their size. The
+slope of a line through the second half is the growth.
 
     python tools/measure_memory.py --out docs/measured/memory.json
 """
@@ -41,7 +41,7 @@ from deal_hw.testing.simulated_episode import simulated_episode
 Unit = Literal["generation", "run"]
 
 REFINED = "default, refined"
-"""What `deal-hw calibrate` does without options."""
+"""Settings of `deal-hw calibrate` without options."""
 
 SEARCHES = (
     "eki",
@@ -77,13 +77,13 @@ RUN_GENERATIONS = 5
 """So many generations are given to one run of a method without; a run is wanted for as many."""
 
 FLAT_KIB: Mapping[Unit, float] = {"generation": 10.0, "run": 10.0 * RUN_GENERATIONS}
-"""Growth below this is chance: 1 MiB in a hundred generations [KiB]."""
+"""Growth below this counts as chance: 1 MiB in a hundred generations [KiB]."""
 
 KIB, MIB = 1024.0, 1024.0**2
 
 
 class Enough(Exception):  # noqa: N818
-    """The wanted number of values is there."""
+    """The requested number of values is complete."""
 
 
 class MallocInfo(ctypes.Structure):
@@ -107,7 +107,7 @@ class MallocInfo(ctypes.Structure):
 
 
 def heap_reader() -> Callable[[], float] | None:
-    """Return a function that gives what malloc has handed out [MiB]; None where the C library cannot tell."""
+    """Return a function for the memory that malloc has handed out [MiB]; None if the C library has none."""
     ask = getattr(ctypes.CDLL(None), "mallinfo2", None) if sys.platform == "linux" else None
     if ask is None:
         return None
@@ -199,7 +199,7 @@ def slope_kib(values: Sequence[float]) -> float:
 
 
 def verdict(rss: float, held: float | None, most: float) -> str:
-    """Say what slopes mean, of which so much is chance [KiB a value]."""
+    """Return a text on slopes; those below the given limit are chance [KiB a value]."""
     if rss < most and (held is None or held < most):
         return "flat"
     if held is not None and held < most:
@@ -208,7 +208,7 @@ def verdict(rss: float, held: float | None, most: float) -> str:
 
 
 def summary(rss: Sequence[float], held: Sequence[float], most_kib: float) -> dict[str, Any]:
-    """Return what two series of memory say [MiB]."""
+    """Return statistics of two series of memory [MiB]."""
     grown = slope_kib(held) if held else None
     return {
         "count": len(rss),
@@ -224,7 +224,7 @@ def summary(rss: Sequence[float], held: Sequence[float], most_kib: float) -> dic
 
 
 def measured(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Measure a method in a process of its own: what another method left would hide growth."""
+    """Measure a method in a process of its own, because memory of another method would hide growth."""
     words = [sys.executable, __file__, "--one", "--methods", method]
     words += [f"--{key}={value}" for key, value in settings.items()]
     done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)
@@ -244,7 +244,7 @@ def write(path: Path, settings: Mapping[str, Any], rows: Sequence[Mapping[str, A
 
 
 def main() -> int:
-    """Measure and write one JSON file; return 1 where a method grows."""
+    """Measure and write one JSON file; return 1 if a method's memory grows."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

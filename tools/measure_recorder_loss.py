@@ -1,7 +1,7 @@
-"""Kills real recorder processes with SIGKILL at random moments and prints how much each lost.
+"""Kill real recorder processes with SIGKILL at random moments, and print the loss of each.
 
-The loss is the time between the last state sample handed over and the last one that the repaired file holds,
-both by the samples' own stamps, so that it does not matter when the kill was noticed.
+The loss is the time between the last state sample handed over and the last one in the repaired file. Both
+times are the samples' own stamps, so the time at which the kill is noticed has no effect.
 """
 
 from __future__ import annotations

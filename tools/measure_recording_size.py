@@ -1,9 +1,9 @@
-"""Measures what the standard messages of an episode cost: bytes a second, the recorder's time for a cycle.
+"""Measure the cost of an episode's standard messages: bytes a second, the recorder's time for a cycle.
 
     python tools/measure_recording_size.py --out FILE.json
 
-The cart-pole has 4 state samples in a cycle of 20 ms, the Go2 has 10 and what its body senses. Numbers are
-noisy, as those of a robot are: repeated ones would compress to nothing.
+The cart-pole has 4 state samples in a cycle of 20 ms. The Go2 has 10, and its body's sensors. Numbers are
+noisy, as on a robot: repeated ones would compress to nothing.
 """
 
 from __future__ import annotations

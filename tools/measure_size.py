@@ -1,16 +1,16 @@
-"""What a calibration costs against the size of the robot: arms of 7 and 14 servo joints.
+"""Measure time and memory of a calibration against the size of the robot: arms of 7 and 14 servo joints.
 
     python tools/measure_size.py --joints 7 --limit 600 --out size.json
     python tools/measure_size.py --joints 7 --profile size.prof      # where the time goes, by cProfile
 
-An arm is made with a hidden truth: stiffness, damping, dry friction, armature and encoder bias of every
-joint, masses of all links but the second, which was weighed, or the common scale of all would show in no
-motion. Its base is tilted, so that the first joint carries weight, too. 14 joints are two arms.
+An arm has hidden true values: stiffness, damping, dry friction, armature and encoder bias of every joint, and
+masses of all links but the second. The second is known, because no motion shows the common scale of all
+masses and forces. The base is tilted, so that the first joint carries weight, too. 14 joints are two arms.
 
-It is recorded in plain MuJoCo, with late commands and noise, and calibrated as a user would, by `deal-hw
-calibrate --model` in a process of its own with default settings. A row has seconds, peak memory, held-out
-error, what was shown on the way, and how the estimates lie to the truth. After --limit seconds the
-calibration is stopped as by Ctrl-C; the row says what was best until then.
+The arm is recorded in plain MuJoCo, with late commands and noise. `deal-hw calibrate --model` calibrates it
+in a process of its own with default settings. A row has seconds, peak memory, held-out error, the printed
+fits, and the errors of the estimates. After --limit seconds the calibration is stopped as by Ctrl-C, and the
+row has the best fit until then.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ SHOWN_FUNCTIONS = 25
 
 
 def make_arm(joints: int, seed: int) -> tuple[PlainRobot, str]:
-    """Return arms of seven joints each with a hidden truth, and what is searched (YAML).
+    """Return arms of seven joints each with a hidden truth, and the searched parameters (YAML).
 
     Args:
         joints: Joints altogether, a multiple of seven; fewer than seven are the first of an arm.
@@ -226,7 +226,7 @@ def measure(
 
 
 def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]:
-    """Run a calibration; return seconds, memory and what it said with its time."""
+    """Run a calibration; return seconds, memory, and its output with times."""
     began, said = time.monotonic(), []
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with subprocess.Popen(
@@ -258,7 +258,7 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
 
 
 def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
-    """Return held-out errors, and how estimates and intervals lie to the truth."""
+    """Return held-out errors, and errors of estimates and intervals."""
     rows = {name: result["parameters"][name] for name in robot.truth}
     told = {name: row for name, row in rows.items() if row["verdict"] != "not identifiable"}
     ratios = [
@@ -285,7 +285,7 @@ def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
 
 
 def words(row: dict[str, Any]) -> str:
-    """Return a row in words."""
+    """Return a row as text."""
     text = (
         f"{row['joints']} joints, {row['parameters']} parameters, {row['fitted_s']:g} s fitted, seed "
         f"{row['seed']}: {row['seconds']:.0f} s ({row['cpu_s']:.0f} s of processor time), peak memory "

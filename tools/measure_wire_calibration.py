@@ -4,11 +4,11 @@
 python tools/measure_wire_calibration.py --transports serial can odrive dynamixel --seeds 1,2,3 --out r.json
 python tools/measure_wire_calibration.py --table r.json
 
-Each row is an emulator with hidden physics in a process of its own, 4 s of the `rich` profile and 4 s of
-`chirp` to judge by, and a calibration with default settings. Two runs over one wire differ, too: they are in
-real time, a pole that balances is chaotic, and each demonstration tells something else. So a seed is run
-several times (--repeats), and the interval beside each error says what its recording could tell.
-Parameters that a wire's device does not have are left out: an ODrive's set-point is moved by the host.
+Each row is an emulator with hidden physics in a process of its own. 4 s of motion `rich` are fitted by
+default settings, and 4 s of `chirp` judge. Two runs over one wire differ, too: they are in real time, and a
+balancing pole is chaotic, so each demonstration shows different parameters. So a seed is run several times
+(--repeats), and the interval beside each error shows what its recording determines. Parameters that a wire's
+device does not have are left out: an ODrive's set-point is moved by the host.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NOT_THERE = {"odrive": ("servo.speed_limit",)}
 
 
 def measure(transport: str, profile: str, seed: int) -> dict[str, Any]:
-    """Run one row; what goes wrong is kept in it."""
+    """Run one row and keep its errors."""
     row: dict[str, Any] = {"transport": transport, "profile": profile, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as place:
         try:
@@ -129,7 +129,7 @@ def main() -> int:
         print(table(json.loads(given.table.read_text(encoding="utf-8"))["rows"]))
         return 0
     rows: list[dict[str, Any]] = []
-    # Wires take turns, so that what else the machine does falls on all of them.
+    # Wires take turns, so that other work on the machine affects all of them.
     for seed in tuple(given.seeds) * given.repeats:
         for transport in given.transports:
             rows.append(measure(transport, given.profile, seed))

@@ -1,10 +1,10 @@
 """Mutation run over the safety module and the exit path: `make mutation`.
 
-mutmut changes them in one place after another and runs their tests against each change. A change
-that no test notices survives. Survivors must stand in docs/results/safety-mutation.md with the reason why
-they may; any other fails the run.
+mutmut changes the sources in one place after another and runs their tests against each change. A change
+that no test notices survives. docs/results/safety-mutation.md must list each survivor with a reason; any
+other survivor fails the run.
 
-mutmut wants to own the directory it runs in, so the sources and the tests are copied into build/mutation; the
+mutmut needs a directory of its own, so the sources and the tests are copied into build/mutation; the
 rest of deal_hw (drivers) comes from the installed package.
 """
 
@@ -59,7 +59,7 @@ filterwarnings = ["error"]
 
 
 def prepare(mutated: tuple[str, ...], tests: tuple[str, ...], arguments: tuple[str, ...]) -> None:
-    """Copy what mutmut needs."""
+    """Copy the files that mutmut needs."""
     shutil.rmtree(WORK, ignore_errors=True)
     (WORK / "tests").mkdir(parents=True)
     shutil.copytree(ROOT / "deal_hw", WORK / "deal_hw", ignore=shutil.ignore_patterns("__pycache__"))
@@ -72,7 +72,7 @@ def prepare(mutated: tuple[str, ...], tests: tuple[str, ...], arguments: tuple[s
 
 
 def mutmut(*arguments: str) -> str:
-    """Run mutmut and return what it says."""
+    """Run mutmut and return its output."""
     program = Path(sys.executable).parent / "mutmut"
     done = subprocess.run([program, *arguments], cwd=WORK, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -107,7 +107,7 @@ def main() -> int:
 
 
 def run(mutated: tuple[str, ...], tests: tuple[str, ...], arguments: tuple[str, ...] = ()) -> int:
-    """Run one set; return 1 where a survivor is not argued."""
+    """Run one set; return 1 if a survivor has no reason in the page."""
     prepare(mutated, tests, arguments)
     children = str(max((os.cpu_count() or 2) - 1, 1))
     mutmut("run", "--max-children", children)

@@ -1,17 +1,17 @@
-"""List every refusal of the product: where an error is made, of which type, with which words.
+"""List every refusal of the product: its place, type and words.
 
     python tools/refusals.py                        # print the table
     python tools/refusals.py --write                # rewrite tests/house/refusals.txt
     python tools/refusals.py --unreached COV.json   # those that no test ran, by a report of `coverage json`
 
-A refusal is a call that makes an error: of a class of deal_hw/errors.py or of a class below one of these; of
-`deal_hw.schema.refusal`; or any call that stands directly behind `raise`, helpers that make the error among
-them. `raise error` and a bare `raise` hand on what was made elsewhere. The sources are read by their syntax
-tree; nothing of the product is imported.
+A refusal is a call that makes an error: of a class of deal_hw/errors.py or of its subclasses; of
+`deal_hw.schema.refusal`; or any call directly after `raise`, including helpers that make the error.
+`raise error` and a bare `raise` do not count, because the error was made elsewhere. The sources are read by
+their syntax tree; nothing of the product is imported.
 
-A line of the table is function, type, exit code of `deal-hw` and the words, with `{...}` where a value comes
-in and ` | ` between several arguments. Exit code "-": no error of deal-hw. A reader puts the words into its
-own message, or a programmer made the mistake and gets a traceback.
+A line of the table has function, type, exit code of `deal-hw` and the words, with `{...}` for a value and
+` | ` between several arguments. Exit code "-": no error of deal-hw. Either a reader puts the words into its
+own message, or it is a programmer's mistake and gives a traceback.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def unreached(found: list[Refusal], coverage: Path) -> list[Refusal]:
 def _ends_the_command(kind: str, known: frozenset[str]) -> bool:
     outside = getattr(builtins, kind, None)
     if isinstance(outside, type):
-        # What the system refuses is told in one line, too.
+        # Refusals of the system end in one line, too.
         return issubclass(outside, OSError)
     # Helpers behind `raise`, and classes in variables, make errors of the tree.
     return kind in known or not kind[:1].isupper()

@@ -1,4 +1,4 @@
-"""Runs the two processes of ``tools/measure_go2_transport.py``: orders in, one line after the other out."""
+"""Run the two processes of ``tools/measure_go2_transport.py``: they read orders and print lines."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SideProcess:
         return self._process.pid
 
     def stop(self) -> None:
-        """Ask it to end and tell its result."""
+        """Ask it to end and to print its result."""
         self._process.terminate()
 
     def expect(self, word: str, timeout_s: float) -> None:
@@ -104,7 +104,7 @@ class SideProcess:
 
 
 def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
-    """Return the pipe that was asked for."""
+    """Return the requested pipe."""
     if pipe is None:
         raise TransportError("a process was started without its pipes")
     return pipe

@@ -1,10 +1,10 @@
-"""Stall monitor beside a measurement: was a program late, or did the machine stand still?
+"""Stall monitor beside a measurement: was a program late, or did the whole machine pause?
 
     python tools/stall_monitor.py --seconds 60 --least-ms 1
 
-The monitor is a process of the highest real-time priority on each processor, which sleeps for a millisecond
-and looks at the clock. Where it wakes late, too, no program there could have been on time: a virtual machine
-was taken off its processor, or the kernel was busy with itself. Other tools use :func:`watch_stalls`.
+The monitor is a process of the highest real-time priority on each processor. It sleeps for a millisecond and
+reads the clock. If it wakes late, no program there could have been on time: a virtual machine was taken off
+its processor, or the kernel was busy. Other tools use :func:`watch_stalls`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Pause:
 
 @dataclass(slots=True)
 class Account:
-    """What the monitor saw; filled when the block that it watches ends.
+    """The monitor's findings; filled when the watched block ends.
 
     Attributes:
         pauses: All pauses, by processor and time.

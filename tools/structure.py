@@ -1,4 +1,4 @@
-"""Count how a checkout is built: lines, rooms, arrows, circles, constants. For before and after a rebuild.
+"""Count lines, rooms, imports, circles and constants of a checkout, before and after a rebuild.
 
     python tools/structure.py                                  # this checkout, folder calib
     python tools/structure.py --root ../old --json old.json    # another checkout, counted by this tool
@@ -377,7 +377,7 @@ def _accepts(loop: ast.AST) -> bool:
 
 
 def print_counts(counted: Mapping[str, Any]) -> None:
-    """Print all that a person reads."""
+    """Print the summary."""
     for name, value in counted["summary"].items():
         print(f"{value:8d}  {name}")
     print("\nlines of packages")
@@ -397,7 +397,7 @@ def print_counts(counted: Mapping[str, Any]) -> None:
 
 
 def print_comparison(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Print two summaries side by side; what only one of them has shows a dash."""
+    """Print two summaries side by side; a missing value shows a dash."""
     names = list(dict.fromkeys([*before["summary"], *now["summary"]]))
     width = max(map(len, names))
     print(f"{'':{width}s} {'before':>8s} {'now':>8s}  ratio")

@@ -1,15 +1,14 @@
-"""Makes the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
+"""Make the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
 
     python tools/train_demo_policy.py allegro
     python tools/train_demo_policy.py ant
     python tools/train_demo_policy.py humanoid
     python tools/train_demo_policy.py go2
 
-writes policies/assets/allegro_udr.onnx, ant_udr.onnx, humanoid_udr.onnx or go2_walk.onnx and, beside it,
-the record of its training and of what it can do with robots that it has not seen. Task, trainer and settings
-are those of `deal-hw train ROBOT --udr`. All but the Go2's are early checkpoints, made in minutes on one
-core: good enough to excite a robot for calibration (the paper's Table 5 studies such ones), not good at
-their task.
+writes policies/assets/allegro_udr.onnx, ant_udr.onnx, humanoid_udr.onnx or go2_walk.onnx and, beside it, the
+record of its training and of its results on other robots. Task, trainer and settings are those of `deal-hw
+train ROBOT --udr`. All but the Go2's are early checkpoints, made in minutes on one core: good enough to
+excite a robot for calibration (the paper's Table 5 studies such ones), not good at their task.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:
 
 
 def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged: int) -> None:
-    """Judge a policy under the distribution that it was trained under, and write its record."""
+    """Judge a policy under its training distribution, and write its record."""
     env = training_task(robot).make(recorded_description(robot), udr_distribution(robot), judged)
     record["evaluation"] = judge(policy, env, JUDGE_SEED)
     record["at_rest"] = judge(_Rest(policy), env, JUDGE_SEED)
@@ -84,7 +83,7 @@ def add_judgement(robot: str, policy: OnnxPolicy, record: dict[str, Any], judged
 
 
 class _Rest:
-    """Does nothing: what the policy's figures are to be compared with."""
+    """A policy that does nothing, to compare with."""
 
     def __init__(self, policy: OnnxPolicy) -> None:
         self.spec = policy.spec

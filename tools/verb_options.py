@@ -57,7 +57,7 @@ def options(config: Any, values: Mapping[str, tuple[str, ...]]) -> Iterator[Opti
 
     Args:
         config: The settings.
-        values: What options are given that are no flags, numbers or choices.
+        values: Values of options that are no flags, numbers or choices.
 
     Raises:
         KeyError: Such an option has no value.

@@ -94,7 +94,7 @@ class Sticking:
             ways = [
                 np.stack([-share * (gain @ step) for share in CONTACTS.follow]) for gain in self._here.gains
             ]
-            self._last = self._followed(_moved(self._shooting, here, value, ways))
+            self._last = self._followed(self._shooting.moved(here, value, ways))
         return self._last.residual
 
     def jacobian(self, value: FloatArray) -> FloatArray:
@@ -142,15 +142,4 @@ def _settled(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, l
         ways.append(-np.stack([np.zeros_like(steps[0]), *steps]))
         cross = np.einsum("wri,wrj->wij", js, rows.parameter)
         gains.append(np.linalg.solve(square, cross) * scale[:, None])
-    return _moved(shooting, point, point.value, ways), gains
-
-
-def _moved(shooting: Shooting, point: Point, value: FloatArray, ways: Sequence[FloatArray]) -> Point:
-    """Return the point at ``value``, (K + 1,), each window moved by its best step of (D, W, S)."""
-    C = shooting.problem.coordinates
-    each = [
-        shooting.best_starts(e, value, x + way[..., :C], v + way[..., C:])
-        for e, (x, v, way) in enumerate(zip(point.position, point.velocity, ways, strict=True))
-    ]
-    position, velocity = zip(*each, strict=True)
-    return Point(value, position, velocity)
+    return shooting.moved(point, point.value, ways), gains

@@ -129,6 +129,8 @@ class Shooting:
         self.prior_share = prior_share
         self.data: Sequence[WindowData] = problem.windows(length) if data is None else data
         self.length = length
+        # The last point whose predictions are known, and these: (W, H, M) an episode.
+        self._known: tuple[Point | None, list[FloatArray]] = (None, [])
         space = problem.space
         mean, std = space.prior
         own, around = 1 / std**2, 1 / (prior_share * space.width) ** 2
@@ -209,36 +211,38 @@ class Shooting:
         """
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.given else C
-        members = 1 + K + 1 + 2 * moved
+        members = K + 1 + 2 * moved
         values = np.repeat(point.value[None], members, axis=0)
         steps = np.concatenate([np.full(K, self._parameter_step), [DIFFERENCES.latency_s], self._state_step])
-        steps = stretch * steps[: members - 1]
+        steps = stretch * steps[:members]
         # A negative latency or friction is no model: there, differences are taken inwards.
         low, high = value_bounds(self.problem)
         outside = (point.value + steps[: K + 1] < low) | (point.value + steps[: K + 1] > high)
         steps[: K + 1] *= np.where(outside, -1.0, 1.0)
         before = point.value - steps[: K + 1]
         one_sided = np.concatenate([outside | (before < low) | (before > high), np.zeros(2 * moved, bool)])
-        values[1 : K + 2] += np.diag(steps[: K + 1])
+        values[: K + 1] += np.diag(steps[: K + 1])
         expected = point.value - self.prior_mean
         hessian, gradient = np.diag(self.prior_information), self.prior_information * expected
         cost, count = float(np.sum(self.prior_information * expected**2)), 0
         rows: list[WindowRows] = []
         back: list[tuple[FloatArray, FloatArray]] = []
         residuals: list[FloatArray] = []
+        base = self._observed(point)
         for e, data in enumerate(self.data):
             x = np.repeat(point.position[e][None], members, axis=0)
             v = np.repeat(point.velocity[e][None], members, axis=0)
             for c in range(moved):
-                x[K + 2 + c, :, c] += steps[K + 1 + c]
-                v[K + 2 + C + c, :, c] += steps[K + 1 + C + c]
+                x[K + 1 + c, :, c] += steps[K + 1 + c]
+                v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
             predicted = self._predict(values, data, x, v).observed
-            r = (predicted[0] - data.measured) / data.std
-            difference = predicted[1:] - predicted[:1]
+            r = (base[e] - data.measured) / data.std
+            difference = predicted - base[e]
             if central:
-                other = self._predict(2 * values[:1] - values, data, 2 * x[:1] - x, 2 * v[:1] - v).observed
+                here_x, here_v = point.position[e], point.velocity[e]
+                other = self._predict(2 * point.value - values, data, 2 * here_x - x, 2 * here_v - v).observed
                 two = ~one_sided
-                difference[two] = (predicted[1:] - other[1:])[two] / 2
+                difference[two] = (predicted - other)[two] / 2
             jac = np.moveaxis(difference / data.std, 0, -1) / steps
             if np.isfinite(r).all():
                 # A column that diverges beside a finite base gives no direction.
@@ -279,32 +283,33 @@ class Shooting:
         point uphill. One such window would stop all parameters. So each takes the best of four ways: stay,
         take its own step, follow the parameter step, or both.
         """
-        value, C = point.value + step, self.problem.coordinates
+        value = point.value + step
         if self.given:
             return Point(value, point.position, point.velocity)
-        chosen = []
-        for e, (gain, shift) in enumerate(normal.back):
+        ways = []
+        for gain, shift in normal.back:
             follow = gain @ step
-            ways = -np.stack([np.zeros_like(shift), shift, follow, shift + follow])
-            chosen.append(
-                self.best_starts(
-                    e, value, point.position[e] + ways[..., :C], point.velocity[e] + ways[..., C:]
-                )
-            )
-        position, velocity = zip(*chosen, strict=True)
-        return Point(value, position, velocity)
+            ways.append(-np.stack([np.zeros_like(shift), shift, follow, shift + follow]))
+        return self.moved(point, value, ways)
 
-    def best_starts(
-        self, e: int, value: FloatArray, x: FloatArray, v: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return each window's start state of least cost among D candidates, (D, W, C); (W, C) twice.
+    def moved(self, point: Point, value: FloatArray, ways: Sequence[FloatArray]) -> Point:
+        """Return the point at other parameters, each window's start state moved by its best step.
 
-        ``e`` is the number of the episode, ``value``, (K + 1,), parameters and latency.
+        ``value``, (K + 1,), holds parameters and latency, ``ways`` the steps to choose from, (D, W, 2 C) per
+        episode.
         """
-        costs = self._window_costs(e, np.repeat(value[None], len(x), axis=0), x, v)
-        best = np.argmin(costs, axis=0)
-        window = np.arange(x.shape[1])
-        return x[best, window], v[best, window]
+        C, position, velocity, observed = self.problem.coordinates, [], [], []
+        for e, way in enumerate(ways):
+            x, v = point.position[e] + way[..., :C], point.velocity[e] + way[..., C:]
+            predicted = self._predict(np.repeat(value[None], len(x), axis=0), self.data[e], x, v).observed
+            best = np.argmin(self._window_costs(e, predicted, x, v), axis=0)
+            window = np.arange(x.shape[1])
+            position.append(x[best, window])
+            velocity.append(v[best, window])
+            observed.append(predicted[best, window])
+        found = Point(value, tuple(position), tuple(velocity))
+        self._known = found, observed
+        return found
 
     def vector(self, point: Point) -> FloatArray:
         """Return all whitened residuals at a point, priors last, (M,)."""
@@ -345,13 +350,12 @@ class Shooting:
 
     def window_costs(self, point: Point) -> list[FloatArray]:
         """Return each window's cost at a point, (W,) per episode."""
-        starts = enumerate(zip(point.position, point.velocity, strict=True))
-        return [self._window_costs(e, point.value[None], x[None], v[None])[0] for e, (x, v) in starts]
+        starts = enumerate(zip(self._observed(point), point.position, point.velocity, strict=True))
+        return [self._window_costs(e, y[None], x[None], v[None])[0] for e, (y, x, v) in starts]
 
-    def _window_costs(self, e: int, values: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
+    def _window_costs(self, e: int, predicted: FloatArray, x: FloatArray, v: FloatArray) -> FloatArray:
         """Return the cost of each window of an episode, (N, W); infinite where a member diverged."""
         data = self.data[e]
-        predicted = self._predict(values, data, x, v).observed
         cost = np.sum(((predicted - data.measured) / data.std) ** 2, axis=(2, 3))
         if not self.given:
             start = np.concatenate([x, v], axis=2) - data.prior_mean
@@ -360,12 +364,16 @@ class Shooting:
 
     def residuals(self, point: Point) -> list[FloatArray]:
         """Return the whitened residuals at a point, (W, H, M) an episode."""
-        found = []
-        for e, data in enumerate(self.data):
-            x, v = point.position[e][None], point.velocity[e][None]
-            predicted = self._predict(point.value[None], data, x, v).observed[0]
-            found.append((predicted - data.measured) / data.std)
-        return found
+        predicted = self._observed(point)
+        return [(y - data.measured) / data.std for y, data in zip(predicted, self.data, strict=True)]
+
+    def _observed(self, point: Point) -> list[FloatArray]:
+        """Return the predictions at a point, (W, H, M) an episode; those of the last point are kept."""
+        if self._known[0] is not point:
+            starts = zip(self.data, point.position, point.velocity, strict=True)
+            found = [self._predict(point.value[None], d, x[None], v[None]).observed[0] for d, x, v in starts]
+            self._known = point, found
+        return self._known[1]
 
     def shaken(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
         """Return the point with, window by window, the best of ``count`` drawn start states.
@@ -374,18 +382,14 @@ class Shooting:
         feet stick where they should slip, which no derivative shows. Half of the draws are around the
         smoothed states instead of the point's; ``spread`` is in the smoothed states' standard deviations.
         """
-        C = self.problem.coordinates
-        std = spread * self.state_std
-        chosen = []
+        std, ways = spread * self.state_std, []
         for e, data in enumerate(self.data):
-            draw = std * rng.standard_normal((count, len(data.windows), 2 * C))
+            draw = std * rng.standard_normal((count, len(data.windows), len(std)))
             draw[0] = 0.0
-            x, v = point.position[e] + draw[..., :C], point.velocity[e] + draw[..., C:]
-            x[1::2] = data.start_position + draw[1::2, :, :C]
-            v[1::2] = data.start_velocity + draw[1::2, :, C:]
-            chosen.append(self.best_starts(e, point.value, x, v))
-        position, velocity = zip(*chosen, strict=True)
-        return Point(point.value, position, velocity)
+            smoothed = np.concatenate([data.start_position, data.start_velocity], axis=1)
+            draw[1::2] += smoothed - np.concatenate([point.position[e], point.velocity[e]], axis=1)
+            ways.append(draw)
+        return self.moved(point, point.value, ways)
 
     def _predict(
         self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray

@@ -120,7 +120,7 @@ def solve(
 
     Return the solution, the normal equations there, and the number of derivatives.
     """
-    bounds, used, before = value_bounds(shooting.problem), 0, np.inf
+    bounds, used, before = value_bounds(shooting.problem), 0, shooting.cost(point)
     normal: Normal | None = None
     # Beside a kink, steps shrink to nothing. A new trust region around the updated start states continues, or
     # shows that this is the end.
@@ -158,7 +158,6 @@ class _Following:
     def __init__(self, shooting: Shooting, point: Point, normal: Normal | None) -> None:
         self._shooting, self._here, self._normal = shooting, point, normal
         self._last = point
-        self._vector: tuple[Point, FloatArray] | None = None
 
     def at(self, value: FloatArray) -> Point:
         """Return the point at parameters and latency, (K + 1,)."""
@@ -171,11 +170,7 @@ class _Following:
 
     def residual(self, value: FloatArray) -> FloatArray:
         """See :class:`LeastSquares`."""
-        point = self.at(value)
-        # The start is evaluated twice, here and by the library.
-        if self._vector is None or self._vector[0] is not point:
-            self._vector = point, self._shooting.vector(point)
-        return self._vector[1]
+        return self._shooting.vector(self.at(value))
 
     def jacobian(self, value: FloatArray) -> FloatArray:
         """See :class:`LeastSquares`."""

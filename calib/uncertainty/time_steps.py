@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.refinement import Refined, refine
-from deal_hw.calib.fit.residual import Shooting, WindowRows
+from deal_hw.calib.fit.refinement import Refined, refine_windows
+from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
 from deal_hw.calib.uncertainty.cluster_robust import eliminated, without_starts
 from deal_hw.calib.uncertainty.intervals import Uncertainty, intervals, widened_to
 from deal_hw.calibration import Z90, Alarm, Progress, ProgressCallback, listed
@@ -94,8 +94,6 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
     tick = problem.episodes[0].step_s
     centre = round(refined.latency_s / tick)
     low, high = (round(v / tick) for v in problem.latency_range_s)
-    length_s = refined.shooting.length * problem.episodes[0].period_s
-    states = refined.shooting.states(refined.point)
     contacts = problem.robot.base is not None
     reach, iterations = SCAN.ticks, SCAN.iterations
     if contacts:
@@ -112,16 +110,8 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
     waiting = [t for t in range(centre - reach, centre + reach + 1) if low <= t <= high and t not in found]
     while waiting and len(found) < SCAN.most:
         t = waiting.pop(0)
-        found[t] = refine(
-            problem,
-            refined.theta,
-            t * tick,
-            (length_s,),
-            iterations=iterations,
-            fixed_latency=True,
-            shake=False,
-            states=states,
-        )
+        start = _at_latency(refined, t * tick)
+        found[t] = refine_windows(refined.shooting, start, iterations, fixed_latency=True)
         if progress is not None:
             progress(
                 Progress(
@@ -136,10 +126,22 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
     return LatencyScan(ticks, tuple(found[t] for t in ticks))
 
 
+def _information(refined: Refined) -> FloatArray:
+    """Return the information on parameters and latency, (K + 1, K + 1); the range tells what data do not."""
+    prior = np.append(1.0 / refined.shooting.problem.space.width**2, 0.0)
+    return np.asarray(refined.normal.hessian + np.diag(prior))
+
+
 def _latency_variance(refined: Refined) -> float:
     """Return the latency's variance under the sensors' noise, all parameters free [s^2]."""
-    prior = np.append(1.0 / refined.shooting.problem.space.width**2, 0.0)
-    return float(np.linalg.inv(refined.normal.hessian + np.diag(prior))[-1, -1])
+    return float(np.linalg.inv(_information(refined))[-1, -1])
+
+
+def _at_latency(refined: Refined, latency_s: float) -> Point:
+    """Return where a fit ends at another latency, were its predictions straight in everything."""
+    information, shift = _information(refined), latency_s - refined.latency_s
+    others = -np.linalg.solve(information[:-1, :-1], information[:-1, -1]) * shift
+    return refined.shooting.followed(refined.point, refined.normal, np.append(others, shift))
 
 
 def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:

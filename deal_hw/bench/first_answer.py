@@ -60,7 +60,7 @@ parameters:
   - {kind: dof_armature, elements: "*"}
   - {kind: servo_effort_limit, elements: gripper}
 """
-"""As in docs/results/example-so101.md."""
+"""As on page 'SO-101 arm' of the documentation."""
 
 GO2_PARAMETERS = """\
 parameters:
@@ -72,7 +72,7 @@ parameters:
   - {kind: tendon_frictionloss, elements: ["*_rod", "*_strap"], nominal: 5, ratio: 10}
   - {kind: dof_armature, elements: "*_joint"}
 """
-"""As in docs/results/example-go2-suspended.md."""
+"""As on page 'Go2 on a stand, public recording' of the documentation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +98,10 @@ class _Ask:
             ConfigurationError: There are none; the message says how to make them.
         """
         if self.real is None:
-            raise ConfigurationError(
-                f"there are no real recordings; give --real DIR with DIR/{name}, made as in {example}"
-            )
+            raise ConfigurationError(f"no real recordings: give --real DIR; {example} makes DIR/{name}")
         files = [self.real / name / f"{motion}.npz" for motion in motions]
         if missing := [str(f) for f in (*files, self.real / name / "columns.yaml") if not f.exists()]:
-            raise ConfigurationError(f"{', '.join(missing)} missing; make them as in {example}")
+            raise ConfigurationError(f"{', '.join(missing)} missing: {example} shows how to make them")
         return files
 
 
@@ -150,7 +148,7 @@ def _so101(ask: _Ask) -> CalibrateSettings:
 
     fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
     held_out = ("step_response", "slow_precision")
-    files = ask.recorded("so101", (*fitted, *held_out), "docs/results/example-so101.md")
+    files = ask.recorded("so101", (*fitted, *held_out), "page 'SO-101 arm' of the documentation")
     parameters = ask.folder / "so101.yaml"
     parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
     recordings = Recordings(
@@ -169,7 +167,7 @@ def _go2(ask: _Ask) -> CalibrateSettings:
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
     name = "go2_suspended"
-    files = ask.recorded(name, ("train",), "docs/results/example-go2-suspended.md")
+    files = ask.recorded(name, ("train",), "page 'Go2 on a stand, public recording' of the documentation")
     parameters = ask.folder / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
     recordings = Recordings(

@@ -51,9 +51,8 @@ def prepare(
     """
     if source.recordings.model is None and source.dataset is None:
         raise ConfigurationError(
-            "bench real needs --model robot.xml --data rec.csv ... (docs/tutorials/your-robot.md) or "
-            "--dataset DIR, and --holdout other.csv (of a dataset episodes) or a part of each recording "
-            "(--holdout-part)"
+            "bench real needs --model robot.xml --data rec.csv ... or --dataset DIR, and --holdout other.csv "
+            "(of a dataset episodes) or a part of each recording (--holdout-part)"
         )
     settings = dataclasses.replace(source, range_ratio=range_ratio)
     settings.check()

@@ -37,7 +37,7 @@ class Calibrate(CalibrateSettings):
     deal-hw calibrate runs/first/dataset
 
     Of any robot, from its MuJoCo model and recordings of joint positions and commands:
-    deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine    (docs/tutorials/your-robot.md)
+    deal-hw calibrate --model robot.xml --data rec.csv --out runs/mine
     """
 
     dataset: tyro.conf.Positional[Path | None] = None

@@ -64,7 +64,7 @@ class Repair:
 
 @dataclass(frozen=True, kw_only=True)
 class Import(ImportSettings):
-    """Make a dataset of recordings of any robot; refuses what is not plausible. See docs/how-to/import.md."""
+    """Make a dataset of recordings of any robot; refuses what is not plausible."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
 

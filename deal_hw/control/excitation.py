@@ -82,7 +82,7 @@ class RichConfig:
     """Parts of the run with other gains and limits; the first that fits counts. By default the second half
     runs with low effort limits and a high speed limit, for a limit that is never reached leaves no trace in
     the recording; and stiff and little damped, for a cart that creeps never asks for the effort that is
-    allowed. docs/how-to/excitation.md has what either brought."""
+    allowed. Page 'Choose a motion' of the documentation has the figures."""
 
     def __post_init__(self) -> None:
         low, high = self.hold_s

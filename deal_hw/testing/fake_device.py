@@ -1,4 +1,4 @@
-"""A device for a virtual wire that says what a test tells it to, whatever it is asked."""
+"""A device for a virtual wire that sends the bytes that a test chooses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class FakeDevice:
         outbox: Bytes that the next tick sends.
 
     Args:
-        answer: What a message provokes; nothing by default.
+        answer: The answer to each message; none by default.
     """
 
     def __init__(self, answer: bytes = b"") -> None:
@@ -26,7 +26,7 @@ class FakeDevice:
         self.outbox += self._answer
 
     def tick(self) -> bytes:
-        """Send what is waiting, once."""
+        """Send the waiting bytes once."""
         self.device_ns += 1_000_000
         out, self.outbox = self.outbox, b""
         return out

@@ -13,7 +13,7 @@ from deal_hw.transport import Message, Transport, TransportWrapper
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultRates:
-    """How often something happens to a frame, each a probability from 0 to 1.
+    """Probabilities of faults of a frame, each from 0 to 1.
 
     Attributes:
         corrupt: One byte becomes another.
@@ -40,7 +40,7 @@ class FrameFaults:
         duplicated: Frames repeated so far.
 
     Args:
-        rates: How often.
+        rates: Probabilities of the faults.
         rng: Source of randomness.
         delimiter: End of a frame; None: every call is one frame.
     """
@@ -54,7 +54,7 @@ class FrameFaults:
         self._delimiter = delimiter
 
     def apply(self, data: bytes) -> bytes:
-        """Return what arrives of ``data``, which holds whole frames."""
+        """Return the part of ``data`` (whole frames) that arrives."""
         if self._delimiter is None:
             return self._frame(data)
         frames = data.split(self._delimiter)
@@ -82,7 +82,7 @@ class FrameFaults:
 
 
 class OneBadFrame(FrameFaults):
-    """Changes one byte of the next message when told to, and no other.
+    """Changes one byte of the next message on request.
 
     Args:
         byte: Which one of the message's bytes; negative counts from the end.
@@ -94,7 +94,7 @@ class OneBadFrame(FrameFaults):
         self._armed = False
 
     def corrupt_next(self) -> None:
-        """Have the next message arrive corrupt."""
+        """Make the next message corrupt."""
         self._armed = True
 
     def apply(self, data: bytes) -> bytes:
@@ -112,7 +112,7 @@ class RecordFaults(FrameFaults):
     """Faults of frames of a fixed size. Their first bytes are spared: CAN controllers filter by identifiers.
 
     Args:
-        rates: How often.
+        rates: Probabilities of the faults.
         rng: Source of randomness.
         size: Bytes of a frame.
         header: Bytes at its beginning that stay.
@@ -133,12 +133,12 @@ class RecordFaults(FrameFaults):
 
 
 class FaultyTransport(TransportWrapper):
-    """A transport whose messages suffer on the way.
+    """A transport with faults.
 
     Args:
         inner: The transport that works.
-        received: What happens to messages from the device.
-        sent: What happens to messages to the device.
+        received: Faults of messages from the device.
+        sent: Faults of messages to the device.
         clock: Measures waiting across lost messages; without it each lost message starts the wait again.
     """
 
@@ -170,14 +170,14 @@ class FaultyTransport(TransportWrapper):
         self._inner.reopen()
 
     def send(self, message: Message) -> None:
-        """Send what is left of the message."""
+        """Send the message after its faults."""
         self._check()
         payload = message.payload if self._sent is None else self._sent.apply(message.payload)
         if payload:
             self._inner.send(Message(message.channel, payload, message.stamp_ns))
 
     def receive(self, timeout_s: float) -> Message:
-        """Receive what is left of a message; a lost one is as if it had never come."""
+        """Receive a message after its faults; a lost one never arrives."""
         start_ns = self._clock.now_ns() if self._clock else 0
         left_s = timeout_s
         while True:

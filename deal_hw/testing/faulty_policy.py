@@ -1,8 +1,8 @@
-"""Policies that go wrong when told to: for tests of what stands between policy and motors.
+"""Policies with a fault on request, for tests of the checks between policy and motors.
 
-They observe the wanted velocity alone. While it is zero they ask for the default pose. With a wanted velocity
-ahead the fault shows; a rare one shows at :data:`RARE_M_S` alone, which the trial of a policy does not meet:
-what only the safety filter can stop.
+They observe the commanded velocity alone. While it is zero they request the default pose. With a commanded
+velocity ahead the fault shows. A rare fault shows at :data:`RARE_M_S` alone, which the trial of a policy does
+not meet, so only the safety filter can stop it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from deal_hw.policy import AXES, ObservationTerm, PolicySpec
 Fault = Literal["nan", "late", "endless", "fails", "shape", "memory"]
 """Answers NaN; takes its time; loops for ever; fails; answers twice as many actions; wants 4 GB of memory."""
 RARE_M_S: Final = 0.3
-"""The wanted velocity ahead at which a rare fault shows; it is gone 1 mm/s away from it."""
+"""Commanded velocity ahead at which a rare fault shows [m/s]; 1 mm/s away from it there is none."""
 _RARE_WIDTH_M_S: Final = 1e-3
 _SIDE = 128
 _OPSET = 17
@@ -31,8 +31,8 @@ def faulty_policy(
     """Return such a policy as an ONNX model, and its spec.
 
     Args:
-        description: The robot that it shall fit.
-        fault: What goes wrong.
+        description: The robot of the policy.
+        fault: Name of the fault.
         rounds: For "late": products of 128 x 128 matrices a step at a wanted velocity of 1 m/s (of
             :data:`RARE_M_S` where it is rare); some 0.1 ms each.
         rare: Whether the fault shows at one wanted velocity alone.
@@ -158,7 +158,7 @@ def _fault_nodes(onnx: Any, fault: Fault) -> list[Any]:
 
 
 def _loop(onnx: Any, count: str) -> list[Any]:
-    """Return what multiplies matrices in vain, so many times."""
+    """Return nodes that multiply matrices without use, for the given number of times."""
     helper, side = onnx.helper, [_SIDE, _SIDE]
     body = helper.make_graph(
         [

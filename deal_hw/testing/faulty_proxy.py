@@ -1,4 +1,4 @@
-"""A TCP connection that can freeze, be reset and be refused: what a network does to a robot's link."""
+"""A TCP connection that can freeze, be reset and be refused, as a robot's link can."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _JOIN_S = 5.0
 
 
 class FaultyProxy:
-    """Forwards TCP connections from a port of its own to a target, until told otherwise; a context manager.
+    """Forwards TCP connections from a port of its own to a target; a context manager.
 
     Frozen, nothing passes in either direction and nothing is closed, as behind a switch that restarts: what
     was sent meanwhile waits in the kernel's buffers and arrives late. Refused, each connection ends with a
     reset and new ones are refused, as where the program at the other end restarts.
 
     Attributes:
-        port: Where it listens, on 127.0.0.1.
+        port: Its port on 127.0.0.1.
 
     Args:
         target: Host and port to forward to.
@@ -62,7 +62,7 @@ class FaultyProxy:
         self._thread.join(_JOIN_S)
 
     def set(self, state: State) -> None:
-        """Change what happens to connections; returns when it is so.
+        """Change the treatment of connections; returns when it is in force.
 
         Raises:
             TimeoutError: The thread does not answer.
@@ -130,7 +130,7 @@ class FaultyProxy:
                 self._watch(end)
 
     def _watch(self, end: socket.socket) -> None:
-        """Read where the other end takes more, write where something waits; neither while frozen."""
+        """Read if the other end takes more, write if data wait; neither while frozen."""
         events = 0
         if self._state != "frozen":
             events |= 0 if self._waiting[self._pairs[end]] else selectors.EVENT_READ

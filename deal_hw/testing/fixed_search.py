@@ -1,4 +1,4 @@
-"""A search whose answer a test chooses, to look at what comes after a search."""
+"""A search with a result that a test chooses, to test the steps after a search."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from deal_hw.types import FloatArray
 
 
 class FixedSearch(CalibrationMethod[Any]):
-    """Ends where it is told, or near it, with the whole range as its interval.
+    """Ends at a given point, or near it, with the whole range as its interval.
 
     Attributes:
-        budgets: What each run was given.
+        budgets: Budget of each run.
 
     Args:
-        theta: Where it ends, (K,).
+        theta: The result, (K,).
         latency_s: The latency that it finds [s].
-        spread: Standard deviation of the logarithm of what each parameter is off.
+        spread: Standard deviation of the logarithm of each parameter's error.
     """
 
     name = "fixed"
@@ -42,7 +42,7 @@ class FixedSearch(CalibrationMethod[Any]):
         progress: ProgressCallback | None = None,
         checkpoint: StateStore | None = None,
     ) -> CalibrationResult:
-        """Return that place."""
+        """Return the given point."""
         self.budgets.append(budget)
         return CalibrationResult(
             method=self.name,

@@ -1,4 +1,4 @@
-"""A policy without a network: state feedback, for tests of what runs policies."""
+"""A policy without a network: state feedback, for tests of code that runs policies."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class LinearPolicy:
     """Action = gains x observation, for one actuated joint.
 
     Args:
-        spec: What it observes.
+        spec: Its observations and action.
         gains: Target per observed quantity, (O,) [m or rad per unit].
-        disturb: Called with the number of the call, from 0, and the action; returns what to give instead.
+        disturb: Called with the number of the call, from 0, and the action; returns the action to use.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class LinearPolicy:
         self._disturb = disturb
 
     def reset(self) -> None:
-        """Count the calls anew."""
+        """Restart the count of calls."""
         self.calls = 0
 
     def act(self, observation: Observation) -> FloatArray:

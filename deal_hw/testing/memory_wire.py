@@ -1,4 +1,4 @@
-"""One end of a wire of topics whose other end is two lists: what a test lets arrive, and what was sent."""
+"""One end of a wire of topics; the other end is two lists, of messages to receive and of messages sent."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from deal_hw.transport import Message, TopicTransport
 
 
 class MemoryWire(TopicTransport):
-    """Hands out what a test put into it.
+    """Returns the messages that a test put into it.
 
     Attributes:
-        arriving: What is received next.
-        sent: What was sent.
+        arriving: Messages to receive.
+        sent: Messages sent.
         is_open: Whether it is open.
         broken: Whether sending fails.
     """
@@ -51,15 +51,15 @@ class MemoryWire(TopicTransport):
         self.sent.append(message)
 
     def receive(self, timeout_s: float) -> Message:
-        """Return what arrived first.
+        """Return the first message.
 
         Raises:
-            TransportTimeoutError: Nothing did.
+            TransportTimeoutError: There is none.
         """
         if not self.arriving:
             raise TransportTimeoutError("nothing")
         return self.arriving.popleft()
 
     def writers(self, topic: str) -> tuple[str, ...]:
-        """Return nobody."""
+        """Return no writer."""
         return ()

@@ -1,4 +1,4 @@
-"""What every calibration method must do."""
+"""Contract of every calibration method."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class MethodCase:
         make_problem: Makes a new problem; two parameters of a cart-pole are the usual one.
         truth: The parameters' true values, (K,).
         budget: Enough to recover them.
-        short_budget: As little as makes a generation.
+        short_budget: Enough for a generation.
         tolerance: Largest mean |ln(estimate / truth)| that counts as recovered; None for methods that do not
             read the data.
-        open_store: Opens a checkpoint file: path, identity of the run. None where there is no such file; then
+        open_store: Opens a checkpoint file: path, identity of the run. None if there is no such file; then
             states are kept in memory.
-        grows: Whether what the method keeps grows with its generations by design, as a surrogate's data do.
+        grows: Whether the method's state grows with its generations by design, as a surrogate's data do.
     """
 
     method: CalibrationMethod[Any]
@@ -82,7 +82,7 @@ class MemoryStore:
 
     def save(self, state: Mapping[str, Any]) -> None:
         """See :meth:`deal_hw.calibration.StateStore.save`."""
-        # What goes on changing after it was saved would not be what was saved.
+        # The method goes on changing its arrays after saving them.
         self.state = copy.deepcopy(state)
         self.sizes.append(_bytes_of(state))
 
@@ -102,7 +102,7 @@ def _bytes_of(value: Any) -> int:
 
 
 class _StopRunError(Exception):
-    """Raised by a callback that has seen enough."""
+    """Raised by a callback to stop a run."""
 
 
 class MethodSuite:
@@ -137,7 +137,7 @@ class MethodSuite:
         assert again.trace == short.trace
 
     def test_stays_in_bounds(self, case: MethodCase) -> None:
-        """No estimate, interval, member or latency leaves the range that was asked for, at any generation."""
+        """No estimate, interval, member or latency leaves its range, at any generation."""
         seen: list[FloatArray] = []
 
         def watch(progress: Progress) -> None:
@@ -162,7 +162,7 @@ class MethodSuite:
         assert len(result.trace) == len(calls) >= 1
 
     def test_a_callback_can_stop_the_run(self, case: MethodCase) -> None:
-        """What the callback raises comes out of the run unchanged."""
+        """The run raises the callback's exception unchanged."""
 
         def stop(_: Progress) -> None:
             raise _StopRunError
@@ -183,7 +183,7 @@ class MethodSuite:
     def test_resumed_run_gives_the_same_numbers(
         self, case: MethodCase, short: CalibrationResult, tmp_path: Path
     ) -> None:
-        """Stopped at each of its generations and resumed, a run ends bit for bit where it would have."""
+        """Stopped at each of its generations and resumed, a run gives the same result to the bit."""
         store = case.store(tmp_path / "checkpoint.npz")
         result, stops = None, 0
         while result is None:
@@ -225,7 +225,7 @@ class MethodSuite:
                 case.run(case.short_budget, checkpoint=case.open_store(path, "mine"))
 
     def test_state_does_not_grow(self, case: MethodCase) -> None:
-        """What is kept grows when a stage begins, not with each generation; the trace aside."""
+        """The saved state grows when a stage begins, not with each generation; the trace may grow."""
         if case.grows:
             pytest.skip("this method keeps what it has seen")
         store = MemoryStore()

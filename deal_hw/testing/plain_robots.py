@@ -1,7 +1,7 @@
-"""Robots in plain MuJoCo with hidden truths and deliberate faults: what a calibration is tried on.
+"""Robots in plain MuJoCo with hidden true parameters and deliberate faults, to test calibrations.
 
-Nothing of deal-hw simulates here: an MJCF text, ``mj_step``, a delay of the commands, sensor noise, a CSV.
-The model that is calibrated is the same text with other numbers, or lacks what the fault has.
+Only MuJoCo simulates here: an MJCF text, ``mj_step``, a delay of the commands, sensor noise, a CSV. The
+calibrated model is the same text with other numbers, or lacks the effect of the fault.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FAULTS: Mapping[Fault, str] = {
     "mass": "the last link weighs 50 % more than in the model",
     "sign": "the last servo turns the other way",
 }
-"""Faults by name, as they are described to people."""
+"""Faults by name, with their descriptions."""
 
 SHARED: Mapping[SharedFault, tuple[str, ...]] = {
     "mirrored": ("the last joint has the other sign", "the sign of {last}", "{last} hangs against gravity"),
@@ -44,7 +44,7 @@ SHARED: Mapping[SharedFault, tuple[str, ...]] = {
     "doubled": ("all positions are doubled", "{all} were multiplied by 2"),
     "doubled-joint": ("the last joint's positions are doubled", "positions of {last} were multiplied by 2"),
 }
-"""Faults of recordings that commands and measurements share: in words, and what names them to the user."""
+"""Faults of recordings that commands and measurements share: description, and the words of the message."""
 
 CAUSES: Mapping[Fault, tuple[str, ...]] = {
     "friction": ("friction",),
@@ -70,7 +70,7 @@ NOISE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class _Joint:
-    """A joint and what moves it; ``kp`` 0 for a joint without a motor."""
+    """A joint and its motor; ``kp`` 0 for a joint without a motor."""
 
     name: str
     damping: float
@@ -139,16 +139,16 @@ SPREAD = {"damping": 2.0, "frictionloss": 2.0, "armature": 2.0, "kp": 1.5}
 
 @dataclass(frozen=True, slots=True)
 class PlainRobot:
-    """A model and the robot that it stands for.
+    """A model and its robot.
 
     Attributes:
         kind: A name in `KINDS`.
-        model: MJCF of the model that is calibrated.
+        model: MJCF of the model to calibrate.
         robot: MJCF of the robot.
         truth: The robot's values by the names that ``deal-hw calibrate --model`` gives them.
         delay_s: Mean delay of the commands, a whole number of physics steps [s].
-        fault: What the model lacks, or what is wrong with its recordings, or None.
-        seed: Drew the truth; draws motions and noise.
+        fault: Effect that the model lacks, or fault of its recordings, or None.
+        seed: Of truth, motions and noise.
     """
 
     kind: str
@@ -216,12 +216,12 @@ def _mjcf(kind: str, made: _Kind, values: Mapping[str, Mapping[str, float]], hea
 
 
 def record(robot: PlainRobot, number: int, seconds: float) -> str:
-    """Return a recording as CSV text: time, positions, and what was commanded.
+    """Return a recording as CSV text: time, positions and commands.
 
     Args:
         robot: The robot.
-        number: Which motion; each number is another one.
-        seconds: How long [s].
+        number: Number of the motion.
+        seconds: Duration [s].
     """
     model = mujoco.MjModel.from_xml_string(robot.robot)
     data = mujoco.MjData(model)
@@ -270,7 +270,7 @@ def record(robot: PlainRobot, number: int, seconds: float) -> str:
 def _shared(
     fault: str | None, time: FloatArray, measured: FloatArray, commands: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a recording with what commands and measurements share; a free last joint has no command."""
+    """Return a recording with the robot's shared fault; a free last joint has no command."""
     time, measured, commands = time.copy(), measured.copy(), commands.copy()
     last = [measured[:, -1], *([commands[:, -1]] if commands.shape == measured.shape else [])]
     factors = {"mirrored": -1.0, "degrees": 180 / np.pi, "doubled-joint": 2.0}
@@ -284,7 +284,7 @@ def _shared(
 
 
 def has_shared(kind: str, fault: SharedFault) -> bool:
-    """Return whether a robot has joints enough, and of one sort, for a fault of its recordings."""
+    """Return whether a robot has enough joints of one type for a fault of its recordings."""
     joints = KINDS[kind].joints
     if fault == "swapped":
         return len(joints) > 1 and all(joint.kp for joint in joints[-2:])
@@ -292,7 +292,7 @@ def has_shared(kind: str, fault: SharedFault) -> bool:
 
 
 def shared_words(kind: str, fault: SharedFault) -> tuple[str, ...]:
-    """Return phrases one of which a calibration says where it names a fault of the recordings."""
+    """Return phrases; a message that names the fault of the recordings has one of them."""
     names = [joint.name for joint in KINDS[kind].joints]
     every = f"positions of {names[0]}" if len(names) == 1 else "all positions"
     before = names[max(len(names) - 2, 0)]
@@ -314,7 +314,7 @@ def write(robot: PlainRobot, folder: Path, *, seconds: float = 12.0) -> tuple[Pa
 
     Args:
         robot: The robot.
-        folder: Where.
+        folder: Folder to write to.
         seconds: Length of each recording [s].
 
     Returns:

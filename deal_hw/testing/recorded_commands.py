@@ -1,4 +1,4 @@
-"""A policy whose answers are known beforehand, for methods that run a recording's policy in simulators."""
+"""A policy with known answers, for methods that run a recording's policy in simulators."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from deal_hw.types import FloatArray
 
 @dataclass(eq=False)
 class RecordedCommands:
-    """Answers with given commands, whatever it sees.
+    """Answers with given commands for any observation.
 
     Attributes:
         commands: The command of each control period, (T, A).
-        history: Control periods that it says it looks back.
+        history: Number of past control periods that it claims to use.
     """
 
     commands: FloatArray
@@ -24,7 +24,7 @@ class RecordedCommands:
 
     @classmethod
     def of(cls, target: FloatArray, period: int) -> Self:
-        """Take those of a recording: targets of device periods, (S, A), so many in a control period."""
+        """Take a recording's commands: targets of device periods, (S, A), ``period`` in a control period."""
         return cls(target[period // 2 :: period])
 
     def restart(

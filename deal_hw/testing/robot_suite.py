@@ -1,4 +1,4 @@
-"""What every robot driver must do, whatever its wire."""
+"""Contract of every robot driver on any wire."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _PATIENCE_S = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotBench:
-    """A robot under test and robots that have something wrong, none of them connected.
+    """A robot under test and faulty robots, none of them connected.
 
     Attributes:
         robot: A driver in front of a device (or its emulator) that works.
         foreign: A driver in front of another kind of device.
-        newer: A driver in front of a device that speaks a newer version of the protocol.
-        silent: A driver in front of a device that says nothing.
+        newer: A driver in front of a device with a newer version of the protocol.
+        silent: A driver in front of a device that sends nothing.
         unplug: Pulls the cable of ``robot``.
         corrupt: Makes the next frame from ``robot``'s device arrive corrupt.
-        greets: Whether ``connect`` says something to the device; a robot that only has commands is listened
-            to.
+        greets: Whether ``connect`` sends a message to the device. For a robot without such a message it only
+            listens.
     """
 
     robot: Robot
@@ -99,7 +99,7 @@ class RobotSuite:
             bench.newer.connect()
 
     def test_silence_is_a_timeout(self, bench: RobotBench) -> None:
-        """A device that says nothing raises a TimeoutError from the transport's branch of the tree."""
+        """A silent device raises a TransportError that is a TimeoutError."""
         with pytest.raises(TransportError) as caught:
             bench.silent.connect()
         assert isinstance(caught.value, TimeoutError)
@@ -128,7 +128,7 @@ class RobotSuite:
         assert not state.status & (Status.WATCHDOG | Status.FAULT | Status.HOMING)
 
     def test_a_command_returns_what_was_sent(self, armed: Robot) -> None:
-        """The rounded command is close to the wish, and sending it again changes nothing."""
+        """The rounded command is close to the requested one, and sending it again changes nothing."""
         sent = armed.send_command(default_command(armed, target=0.012345678))
         again = armed.send_command(sent)
         np.testing.assert_allclose(sent.position_target, 0.012345678, atol=1e-3)
@@ -192,7 +192,7 @@ class RobotSuite:
             assert robot.take_wire() == []
 
     def test_commands_are_on_the_wire_once(self, armed: Robot) -> None:
-        """A command is kept as it was sent; sent again without being new, it is not."""
+        """A command is kept once; a repetition of it is not kept."""
         armed.take_wire()
         armed.send_command(default_command(armed))
         armed.repeat()

@@ -1,6 +1,6 @@
-"""A cart-pole's recording without a robot: balanced in simulation, as the device would act and report.
+"""A cart-pole's recording without a robot: balanced in simulation, with the device's behaviour.
 
-For tests of what reads recordings. There is no wire in it: for drivers and control there is the emulator.
+For tests of code that reads recordings. It has no wire; tests of drivers and control use the emulator.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def simulated_episode(
     sensor: bool = False,
     seed: int = 0,
 ) -> Trajectory:
-    """Return a recording of a cart-pole that balances while its cart is sent to changing places.
+    """Return a recording of a cart-pole that balances while its cart follows changing set-points.
 
     Args:
         description: The cart-pole.

@@ -1,6 +1,6 @@
 """A recording of a robot on legs without a robot: it stands in simulation and reports joints and body.
 
-For tests of what reads recordings. There is no wire in it: for drivers and control there is the emulator.
+For tests of code that reads recordings. It has no wire; tests of drivers and control use the emulator.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def standing_episode(
         space: The parameters.
         theta: The robot's true parameters, (K,).
         targets: One for each control period, (C, A) [rad].
-        height_m: Of the base, from where the robot drops onto its feet [m].
+        height_m: Initial height of the base; the robot drops onto its feet [m].
         latency_ticks: Device periods from a command's reception until it acts.
     """
     robot = load_model(description)
@@ -61,7 +61,7 @@ def standing_episode(
 
 
 def _report(description: RobotDescription, x: FloatArray, v: FloatArray, targets: FloatArray) -> Trajectory:
-    """Return states, (T, 6 + J) each, as the robot reports them: nothing of where the base is."""
+    """Return states, (T, 6 + J) each, as the robot reports them: without the base's position."""
     T, J = len(x), len(description.joint_names)
     device_s = np.arange(T) / description.state_rate_hz
     sent_s = np.arange(len(targets)) / description.control_rate_hz + RECEIVED_AFTER_S

@@ -1,4 +1,4 @@
-"""What every policy trainer must do."""
+"""Contract of every policy trainer."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class TrainerCase:
         layout: The layout that the environment trains for.
         distribution: What the environment draws physics from.
         config: Enough steps to learn the toy.
-        short_config: As few steps as make an update at all.
-        score: How well a policy does the toy; larger is better.
-        learned: A score that no lucky policy reaches and a trained one exceeds with margin.
+        short_config: Just enough steps for an update.
+        score: Score of a policy on the toy task; larger is better.
+        learned: A score that no random policy reaches and a trained one exceeds with margin.
         export: Writes a policy and reads it back.
     """
 
@@ -73,7 +73,7 @@ class TrainerSuite:
         return case.train(case.short_config)
 
     def test_learns_the_toy_under_the_step_budget(self, case: TrainerCase) -> None:
-        """Training does what it is there for, and a hardly trained policy does not pass the same bar."""
+        """A trained policy exceeds the score `learned`; a hardly trained one does not."""
         assert case.score(case.train(case.config)) >= case.learned
 
     def test_a_hardly_trained_policy_does_not_pass(self, case: TrainerCase, short: Policy) -> None:
@@ -81,7 +81,7 @@ class TrainerSuite:
         assert case.score(short) < case.learned
 
     def test_policy_carries_layout_and_digest(self, case: TrainerCase, short: Policy) -> None:
-        """The policy says what it observes, what its action means and under what it was trained."""
+        """The policy's spec has its observations, its action and the parameters of its training."""
         spec = short.spec
         assert spec.observation == case.layout.observation
         assert spec.action_scale == case.layout.action_scale
@@ -116,7 +116,7 @@ class TrainerSuite:
         assert not np.array_equal(other.act(observation), short.act(observation))
 
     def test_progress_counts_up_to_the_budget(self, case: TrainerCase) -> None:
-        """Progress rises and ends at the number of steps that were asked for."""
+        """Progress rises and ends at the requested number of steps."""
         calls: list[tuple[int, int]] = []
         case.train(case.short_config, progress=lambda status: calls.append((status.steps, status.total)))
         done = [d for d, _ in calls]
@@ -124,7 +124,7 @@ class TrainerSuite:
         assert calls[-1] == (case.short_config.steps, case.short_config.steps)
 
     def test_a_stopped_training_goes_on_where_it_was(self, case: TrainerCase, tmp_path: Path) -> None:
-        """Told to stop after its first report it leaves a checkpoint; resumed, it does what is left."""
+        """Stopped after its first report it leaves a checkpoint; resumed, it does the remaining steps."""
         file, reports = tmp_path / "checkpoint.safetensors", [0, 0]
 
         def count(status: TrainingStatus) -> None:
@@ -146,7 +146,7 @@ class TrainerSuite:
     def test_a_fine_tune_starts_from_the_networks_of_a_checkpoint(
         self, case: TrainerCase, tmp_path: Path
     ) -> None:
-        """Told to stop at once, it acts as the policy whose checkpoint it was given."""
+        """Stopped at once, it acts as the policy of its start checkpoint."""
         file = tmp_path / "checkpoint.safetensors"
         kept = case.train(case.short_config, files=TrainingFiles(checkpoint=file))
         started = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(start=file, stop=lambda: True))

@@ -1,4 +1,4 @@
-"""What every transport must do: of byte streams, and of messages with topics."""
+"""Contract of every transport: of byte streams, and of messages with topics."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class TransportSuite:
         raise NotImplementedError("a TransportSuite overrides the fixture `pair`")
 
     def test_bytes_arrive_unchanged_in_both_directions(self, pair: TransportPair) -> None:
-        """All 256 byte values pass, so no terminal setting and no escape character is in the way."""
+        """All 256 byte values pass, so no terminal setting or escape character changes them."""
         data = bytes(range(256))
         with pair.near as near:
             pair.send(data)
@@ -176,7 +176,7 @@ class TopicTransportSuite:
                 assert (arrived.channel, arrived.payload) == (pair.up, pair.payload(pair.up, number))
 
     def test_messages_keep_their_order(self, pair: TopicPair) -> None:
-        """A burst that nobody reads may lose messages, but never turns them round or brings one twice."""
+        """A burst that nobody reads may lose messages, but never reorders or repeats them."""
         with _met(pair):
             for number in range(1, 21):
                 pair.far.send(Message(pair.up, pair.payload(pair.up, number), 0))
@@ -226,7 +226,7 @@ class TopicTransportSuite:
             pair.near.close()
 
     def test_own_messages_do_not_come_back(self, pair: TopicPair) -> None:
-        """Whoever writes and reads a topic hears the others only."""
+        """A writer does not receive its own messages."""
         for end in (pair.near, pair.far):
             end.declare(publish=[pair.down], subscribe=[pair.down])
         with _met(pair):
@@ -249,7 +249,7 @@ class TopicTransportSuite:
             assert next_message(pair, pair.far).channel == pair.down
 
     def test_nobody_listening_is_no_error(self, pair: TopicPair) -> None:
-        """Commands to an absent robot go nowhere, without a wait and without an error."""
+        """Commands to an absent robot are dropped, without a wait and without an error."""
         pair.near.declare(publish=[pair.down], subscribe=[pair.up])
         with pair.near as near:
             for number in range(50):
@@ -272,7 +272,7 @@ class TopicTransportSuite:
             meet(pair)
 
     def test_oneself_is_not_among_the_writers(self, pair: TopicPair) -> None:
-        """Who writes and reads a topic alone sees no other writer."""
+        """The only writer of a topic sees no other writer."""
         pair.near.declare(publish=[pair.down], subscribe=[pair.down])
         with pair.near as near:
             assert near.writers(pair.down) == ()

@@ -1,4 +1,4 @@
-"""The one door to rerun: its absence becomes the error that names the extra."""
+"""The only import of rerun: if rerun is missing, the error names the extra."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How an inspected episode opens: verdict, robot and details at the left, plots at the right.
+"""Layout of an inspected episode: verdict, robot and details at the left, plots at the right.
 
-A plot's left edge is where its y labels end, and rerun has no setting for it. So time axes are in line where
-labels are equally wide, which plots of one quantity nearly are.
+Rerun starts a plot where its y labels end and has no setting for it. So time axes are aligned only where
+labels are equally wide, as in most plots of one quantity.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Plot:
 
     Attributes:
         name: Title, with the unit.
-        origin: Entity that the contents start from.
+        origin: Entity at the root of the contents.
         contents: Entities in it.
         curves: What is drawn.
-        within: The y axis reaches no farther than this.
+        within: Largest range of the y axis.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Plot:
         """Return the view; all of them share one time axis.
 
         Args:
-            rows: So many plots are below each other.
+            rows: Number of plots below each other.
             limits: The y axis; by default that of the curves.
         """
         limits = limits or visible_range(self.curves, self.within, rows)
@@ -74,7 +74,7 @@ def inspect_blueprint(
         description: The robot.
         overlay: Predictions to show beside it.
         cycles: The control cycles.
-        bodies: Where the robot's bodies are at the beginning, to look at, (B, 3) [m]; None: at the origin.
+        bodies: Positions of the robot's bodies at the start, for the camera, (B, 3) [m]; None: the origin.
         alarms: Whether there are alarms.
     """
     tabs = [
@@ -111,7 +111,7 @@ def joint_groups(names: Sequence[str], most: int) -> dict[str, list[int]]:
 
     Args:
         names: The joints.
-        most: So many at most.
+        most: Joints of a tab at most.
     """
     if len(names) <= most:
         return {"": list(range(len(names)))}
@@ -125,7 +125,7 @@ def joint_groups(names: Sequence[str], most: int) -> dict[str, list[int]]:
 
 
 def _grids(name: str, plots: Sequence[Sequence[Plot]], trajectory: Trajectory, joints: Sequence[str]) -> Any:
-    """Return the plots of each joint, on tabs where there are many."""
+    """Return the plots of each joint, on tabs if there are many."""
     columns = time_columns(trajectory.duration_s)
     # Wide plots are two below each other; more were too low for labels.
     most = max(columns * (1 + columns) // len(plots[0]), 1) if plots else 1
@@ -143,7 +143,7 @@ def _joints(
     description: RobotDescription,
     overlay: Overlay | None,
 ) -> Any:
-    """Return a quantity of each joint; after it, where there are predictions, how far they are off."""
+    """Return a quantity of each joint, followed by the errors of predictions."""
     error, per_second = ("error", "") if quantity == "position" else ("velocity_error", "/s")
     rows: list[list[Plot]] = []
     for j, (joint, unit) in enumerate(zip(trajectory.joint_names, description.position_units, strict=True)):
@@ -222,7 +222,7 @@ def _loop_timing(trajectory: Trajectory, cycles: CycleTable | None) -> Any:
 
 
 def _body(trajectory: Trajectory, body: BodyTrajectory) -> Any:
-    """Return what was sensed of the body; an imported recording has of all this the IMU alone."""
+    """Return the plots of the body's sensors; an imported recording has the IMU alone."""
     tabs: dict[str, list[Plot]] = {}
 
     def add(tab: str, name: str, group: str, values: FloatArray, *names: str) -> None:
@@ -259,7 +259,7 @@ def _span(values: FloatArray) -> tuple[float, float]:
 
 
 def _robot(description: RobotDescription, bodies: FloatArray | None) -> Any:
-    """Return the 3D view, looking along +y from far enough to see the robot and what sliding joints cover."""
+    """Return the 3D view along +y, from far enough to see the robot and the range of sliding joints."""
     slides = [
         high
         for (_, high), unit in zip(description.limits.trip_position, description.position_units, strict=True)

@@ -1,4 +1,4 @@
-"""What a robot with legs senses of its body, as traces: IMU, feet, motors' temperatures, battery."""
+"""Traces of the body of a robot with legs: IMU, feet, motors' temperatures, battery."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def log_body(log: Log, trajectory: Trajectory, body: BodyTrajectory, description
     def traces(
         group: str, names: tuple[str, ...], values: FloatArray, colors: tuple[tuple[int, int, int], ...]
     ) -> None:
-        # An imported recording has of all this the IMU alone.
+        # An imported recording has the IMU alone.
         for i, name in enumerate(names[: values.shape[1]]):
             if not np.isfinite(values[:, i]).any():
                 continue

@@ -12,7 +12,7 @@ from deal_hw.types import FloatArray, Trajectory
 from deal_hw.viz.backend import rr
 
 DEVICE_TIMELINE = "device_time"
-"""Time on the robot's own clock since the first sample: what motion and simulation follow."""
+"""Time on the robot's own clock since the first sample: the clock of motion and simulation."""
 HOST_TIMELINE = "host_time"
 """Time on the host's clock since the first sample: of a sample its reception, of a command its sending."""
 
@@ -72,7 +72,7 @@ class Log:
         width: float = 1.5,
         step: bool = False,
     ) -> None:
-        """Say how the scalars of an entity are drawn; ``step`` holds each value until the next."""
+        """Set the style of an entity's scalars; ``step`` holds each value until the next."""
         mode = rr.components.InterpolationMode.StepAfter if step else rr.components.InterpolationMode.Linear
         style = rr.SeriesLines(colors=[color], widths=[width], names=[name], interpolation_mode=mode)
         self.stream.log(path, style, static=True)
@@ -91,7 +91,7 @@ class Log:
         quaternion: FloatArray,
     ) -> None:
         """Write T poses, (T, 3) and w x y z (T, 4); those that are not finite are left out."""
-        # Rerun draws what has a NaN pose at the origin.
+        # Rerun draws a shape with a NaN pose at the origin.
         known = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
         xyzw = np.roll(quaternion[known], -1, axis=1)
         columns = rr.Transform3D.columns(translation=position[known], quaternion=xyzw)

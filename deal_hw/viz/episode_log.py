@@ -68,7 +68,7 @@ def write_episode(
         cycles: The control cycles, for loop timing and safety states.
         overlay: Predictions to show beside it.
         result: The calibration whose parameters are listed.
-        verdict: Whether that can be used, in markdown.
+        verdict: Whether it can be used, in markdown.
         name: Name of the recording in the viewer.
         note: One more sentence for the verdict, such as why there are no predictions.
     """
@@ -103,7 +103,7 @@ def write_episode(
 
 
 def log_samples(log: Log, trajectory: Trajectory, description: RobotDescription) -> None:
-    """Write what the robot reported."""
+    """Write the states of the robot."""
     clocks = trajectory.device_s, trajectory.receive_s
     for j, joint in enumerate(trajectory.joint_names):
         for quantity, values in (("position", trajectory.position), ("velocity", trajectory.velocity)):
@@ -120,7 +120,7 @@ def log_samples(log: Log, trajectory: Trajectory, description: RobotDescription)
 
 
 def log_commands(log: Log, trajectory: Trajectory) -> None:
-    """Write what was asked and sent, and how regularly."""
+    """Write the commands requested and sent, and their timing."""
     device_s, sent_s = command_device_times(trajectory), trajectory.sent_s
     for a, joint in enumerate(trajectory.actuated):
         for what, values, color, width in (
@@ -134,7 +134,7 @@ def log_commands(log: Log, trajectory: Trajectory) -> None:
 
 
 def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
-    """Write how punctual the control loop was, and what its safety filter thought."""
+    """Write the timing of the control loop and the states of its safety filter."""
     host_s = cycles.start_s
     device_s = host_to_device(trajectory, host_s)
     for name, label, values, color in (
@@ -163,7 +163,7 @@ def log_cycles(log: Log, trajectory: Trajectory, cycles: CycleTable) -> None:
 
 
 def log_status(log: Log, trajectory: Trajectory) -> None:
-    """Write each status bit that tells something, at the samples where it changes."""
+    """Write each status bit that changes or is set, at the samples where it changes."""
     for bit in Status:
         values = (trajectory.status & int(bit)) != 0
         usual = bit in Status.ARMED | Status.HOMED
@@ -228,7 +228,7 @@ def _broken_times(window_s: FloatArray, recording_s: FloatArray) -> FloatArray:
 
 
 def _first_known(positions: FloatArray) -> FloatArray | None:
-    """Return where the bodies but the world, (B - 1, 3), are at the first sample that says so."""
+    """Return the positions of the bodies without the world, (B - 1, 3), at the first sample that has them."""
     known = np.flatnonzero(np.isfinite(positions).all(axis=(1, 2)))
     return positions[known[0], 1:] if known.size else None
 
@@ -241,7 +241,7 @@ def log_scene(
     poses: tuple[FloatArray, FloatArray],
     overlay: Overlay | None,
 ) -> None:
-    """Write the robot in 3D: the real one, and a ghost for each parameter set.
+    """Write the robot in 3D: the real one, and a transparent one for each parameter set.
 
     Args:
         log: Where to.
@@ -270,8 +270,8 @@ def log_scene(
 def _beside(predicted: FloatArray, real: FloatArray) -> FloatArray:
     """Return predicted base poses, (W, H + 1, 7), beside the real ones as they are drawn, (W, H + 1, 7).
 
-    Each window starts at the real height. Nobody measures how far the real robot moves along the floor, and
-    it is drawn in one place: so is its ghost, or every step ahead would look like an error.
+    Each window starts at the real height. The real robot's motion along the floor is not measured, so it is
+    drawn in one place. The prediction is, too, or every step ahead would look like an error.
     """
     moved = predicted.copy()
     moved[..., :2] = real[..., :2]

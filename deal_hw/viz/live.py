@@ -13,7 +13,7 @@ _START_S = 20.0
 
 @contextlib.contextmanager
 def live_viewer() -> Iterator[tuple[str, str]]:
-    """Run a viewer until the block ends: a window where there is a desktop, a server for a browser elsewhere.
+    """Run a viewer until the block ends: a window if there is a desktop, else a server for a browser.
 
     Yields:
         Where to send data, and the address to open in a browser ("" for a window).

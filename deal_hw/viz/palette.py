@@ -1,4 +1,4 @@
-"""The one set of colours, of Okabe and Ito (2008): told apart with any colour vision, on white and black."""
+"""The colours, from Okabe and Ito (2008): distinct for any colour vision, on white and black."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 Color = tuple[int, int, int]
 
 REAL: Color = (0, 114, 178)
-"""Blue: what the robot reported."""
+"""Blue: measured."""
 NOMINAL: Color = (230, 159, 0)
-"""Orange: what the user's model predicts."""
+"""Orange: predictions of the user's model."""
 CALIBRATED: Color = (0, 158, 115)
-"""Green: what the calibrated model predicts."""
+"""Green: predictions of the calibrated model."""
 REQUESTED: Color = (140, 140, 140)
 SENT: Color = (204, 121, 167)
 ALARM: Color = (213, 94, 0)

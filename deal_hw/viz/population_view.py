@@ -9,7 +9,7 @@ Entities, over the timeline ``generation`` (refinement and latency scan count on
     /log                                       its own words
     /motion/<joint>/{real,population}          a joint's curves in a lane of its own, 2D
 
-What is shown is lossy: the search hands a copy over and goes on, whatever the viewer does.
+The view may skip generations: the search hands over a copy and never waits for the viewer.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class PopulationView:
     """Shows the progress of a search from a thread of its own.
 
     Args:
-        space: What is searched.
+        space: The searched parameters.
         stream: The rerun recording, already connected.
         predict: Predicts the recording for the overlay; None for no overlay.
     """
@@ -76,11 +76,11 @@ class PopulationView:
             self.left_out += 1
 
     def close(self) -> None:
-        """Show what waits, for a few seconds at most."""
+        """Show the waiting generations, for a few seconds at most."""
         with contextlib.suppress(queue.Full):
             self._waiting.put(None, timeout=CLOSE_S)
         self._thread.join(CLOSE_S)
-        # A viewer that was closed by hand is no reason to lose a calibration.
+        # A viewer that the user closed must not end the calibration.
         with contextlib.suppress(Exception):
             self._stream.flush(timeout_sec=CLOSE_S)
 
@@ -90,7 +90,7 @@ class PopulationView:
             while (progress := self._waiting.get()) is not None:
                 self._log(progress)
         except Exception as err:
-            # Whatever breaks the view, the search goes on; the recording says why it ends here.
+            # An error of the view must not end the search; the recording holds the reason.
             with contextlib.suppress(Exception):
                 self._stream.log("/log", rr.TextLog(f"the live view stopped: {err}", level="ERROR"))
 
@@ -126,7 +126,7 @@ class PopulationView:
         self._overlay(population, progress.latency_s)
 
     def _overlay(self, population: FloatArray, latency_s: float | None) -> None:
-        # A prediction takes a part of a second of one processor: now and then is enough.
+        # A prediction takes a part of a second of one processor, so only some generations get one.
         if self._predict is None or time.monotonic() < self._next_overlay:
             return
         mean = self._space.from_scale(self._space.to_scale(population).mean(axis=0))
@@ -135,7 +135,7 @@ class PopulationView:
         self._next_overlay = time.monotonic() + OVERLAY_EVERY_S
 
     def _lanes(self, overlay: Overlay) -> None:
-        # Plots over a timeline keep all they were sent; curves in a picture are replaced by the next ones.
+        # Plots over a timeline keep all data; curves in a picture are replaced by the next ones.
         t = overlay.device_s - overlay.device_s.min()
         x = LANE_WIDTH * t / max(float(t.max()), 1e-9)
         for j, joint in enumerate(overlay.joint_names):
@@ -161,8 +161,8 @@ def population_view(
     """Show a search until the block ends.
 
     Args:
-        space: What is searched.
-        address: Where a viewer waits for data; "" for none.
+        space: The searched parameters.
+        address: Address of a viewer that waits for data; "" for none.
         save: File to write as well or instead.
         predict: Predicts the recording for the overlay; None for no overlay.
     """

@@ -1,4 +1,4 @@
-"""The robot in 3D: the real one solid, predictions as ghosts."""
+"""The robot in 3D: the real one solid, predictions transparent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WORLD = "/world"
 
 
 def log_surroundings(log: Log, scene: Scene) -> None:
-    """Write what is fixed to the world, in its own colours."""
+    """Write the shapes that are fixed to the world, in their own colours."""
     log.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in scene.shapes:
         if shape.body == 0:
@@ -43,10 +43,10 @@ def log_robot(
         log: Where to.
         scene: Its shapes.
         name: ``"real"`` or the name of a parameter set.
-        color: Of all its shapes; two robots in the same place are told apart by nothing else.
+        color: Of all its shapes; only the colour distinguishes two robots in the same place.
         poses: Positions (T, B, 3) and quaternions w x y z (T, B, 4) of the bodies.
         time_s: Device and host times, (T,) each.
-        ghost: Whether to draw it see-through.
+        ghost: Whether to draw it transparent.
     """
     for body, body_name in enumerate(scene.bodies):
         shapes = [shape for shape in scene.shapes if shape.body == body]

@@ -1,4 +1,4 @@
-"""What part of the y axis a plot opens with, and in which corner its legend covers least.
+"""The initial y range of a plot, and the corner in which its legend covers least.
 
 Rerun labels an axis at multiples of a power of ten only. So a range of its own choice often has one label, or
 none; ours has three at least.
@@ -21,14 +21,14 @@ Curve = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleSettings:
-    """Settings of what a plot opens with.
+    """Settings of the initial view of a plot.
 
     Attributes:
         margin: Room above and below the values, in shares of their span.
         least_share: The least span, in shares of the largest value: a signal that hardly moves is drawn as
             one that hardly moves.
         least_span: The least span of values near zero, in their unit: rounding is not a signal.
-        ticks: So many labels at least.
+        ticks: Least number of labels.
         label_px: Rerun leaves out labels that are closer together [px].
         window_px: Height that plots share in a window of 1280 x 800 [px].
         frame_px: Height of a plot's title and time labels [px].
@@ -63,7 +63,7 @@ def visible_range(
     Args:
         curves: What is drawn; values that are not finite are left out.
         within: Values beyond these ends are cut off.
-        rows: So many plots share the window's height.
+        rows: Number of plots that share the window's height.
         settings: Margins and numbers of labels.
     """
     known = [values[np.isfinite(values)] for _, values in curves]

@@ -98,7 +98,7 @@ def _choose_light_theme(client: Any, port: int) -> None:
     calls: tuple[dict[str, Any], ...] = (
         {"method": "initialize", "params": _CONTROL},
         {"method": "tools/call", "params": {"name": "click", "arguments": _LIGHT_BUTTON}},
-        # The pointer is drawn; up there it is cut off with the menu.
+        # The pointer is drawn; at the top it is cut off with the menu.
         {"method": "tools/call", "params": {"name": "hover", "arguments": {"pos": {"x": 600, "y": 2}}}},
     )
     command = [str(program()), "viewer-mcp", "--endpoint", f"http://{LOOPBACK}:{port}"]
@@ -122,7 +122,7 @@ def _choose_light_theme(client: Any, port: int) -> None:
 
 
 def _settled(client: Any) -> bytes:
-    """Return a screenshot that is the same as the one before it: all is loaded and drawn."""
+    """Return a screenshot that equals the one before it, so that all is loaded and drawn."""
     last = b""
     for _ in range(10):
         time.sleep(_SETTLE_S)

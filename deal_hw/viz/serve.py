@@ -29,7 +29,7 @@ def serve_web(rrd: Path, *, port: int = DEFAULT_WEB_PORT) -> Iterator[tuple[str,
 
     Args:
         rrd: The recording.
-        port: Where the browser connects; 0 for any free one. The data come over another free port.
+        port: Port for the browser; 0 for any free one. The data come over another free port.
 
     Yields:
         The address to open, and the server.

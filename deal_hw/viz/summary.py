@@ -1,4 +1,4 @@
-"""What stands beside the traces in words: the recording, the errors of each parameter set, the parameters."""
+"""Texts beside the traces: the recording, the errors of each parameter set, the parameters."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _WIDE = 3
 def verdict_markdown(
     overlay: Overlay | None, verdict: str, alarms: Sequence[Alarm] = (), note: str = ""
 ) -> str:
-    """Return what stands at the top, as markdown: is the calibration of use, and what speaks against it.
+    """Return the text at the top, as markdown: the verdict on the calibration, and its alarms.
 
     Args:
         overlay: Predictions, if there are any.
         verdict: Whether the calibration can be used; empty where none is shown.
-        alarms: Its alarms; what was seen is a line each.
+        alarms: Its alarms; a line each.
         note: One more sentence, such as why there is no overlay.
     """
     parts = [
@@ -41,7 +41,7 @@ def summary_markdown(
     overlay: Overlay | None,
     result: CalibrationResult | None,
 ) -> str:
-    """Return the details as markdown: errors of each joint, parameters, and what the alarms mean.
+    """Return the details as markdown: errors of each joint, parameters, and the alarms in full.
 
     Args:
         trajectory: The recording.
@@ -132,7 +132,7 @@ def _parameters(result: CalibrationResult) -> str:
     for k, p in enumerate(result.space):
         verdict = result.verdicts[k] if result.verdicts else ""
         low, high = result.interval[k]
-        # What the data cannot tell has no value, whatever number the search ended at.
+        # A parameter that the data do not determine gets no value; the search's number has no meaning.
         estimate = "no value" if verdict == "not identifiable" else f"{result.estimate[k]:.4g}"
         lines.append(
             f"| {p.name} [{p.unit}] | {p.nominal:.3g} | {estimate} | {low:.3g} to {high:.3g} | "
@@ -147,5 +147,5 @@ def _verdict(result: CalibrationResult) -> str:
         for number, alarm in enumerate(result.alarms, start=1)
     ]
     lines = ["**Alarms.**", "", *lines, ""] if lines else []
-    lines += [f"- the data cannot see: {direction}" for direction in result.null_directions]
+    lines += [f"- not determined by the data: {direction}" for direction in result.null_directions]
     return "\n".join(lines)

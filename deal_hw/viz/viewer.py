@@ -1,4 +1,4 @@
-"""Rerun's own program as a child: on loopback, without its usage statistics, gone when we are done."""
+"""Rerun's own program as a child process: on loopback, without usage statistics, ended with its block."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Viewer:
 
     @property
     def output(self) -> str:
-        """What it printed so far."""
+        """Its output so far."""
         return self.log.read_text(encoding="utf-8", errors="replace")
 
     def check(self) -> None:
@@ -79,10 +79,10 @@ def free_port() -> int:
 
 
 def check_port(port: int) -> None:
-    """Check that a TCP port can be had on the loopback interface.
+    """Check that a TCP port is free on the loopback interface.
 
     Raises:
-        ConfigurationError: Somebody has it.
+        ConfigurationError: It is in use.
     """
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -90,7 +90,7 @@ def check_port(port: int) -> None:
             probe.bind((LOOPBACK, port))
         except OSError as err:
             raise ConfigurationError(
-                f"port {port} of {LOOPBACK} cannot be had ({err.strerror}); choose another"
+                f"port {port} of {LOOPBACK} cannot be opened ({err.strerror}); choose another with --web-port"
             ) from err
 
 
@@ -100,8 +100,8 @@ def run_viewer(
 ) -> Iterator[Viewer]:
     """Run rerun's program until the block ends.
 
-    It gets a settings folder of its own, so that it reports no usage whatever the user's settings say, and
-    looks the same on every machine; the user's own settings are not touched.
+    It gets a settings folder of its own. So it reports no usage and looks the same on every machine, and the
+    user's own settings stay unchanged.
 
     Args:
         arguments: Its arguments.
@@ -146,11 +146,11 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def web_address(port: int, data: str) -> str:
-    """Return what to open in a browser, in the light theme.
+    """Return the address to open in a browser, in the light theme.
 
     Args:
-        port: Where rerun serves its web viewer.
-        data: Where the data come from.
+        port: Port of rerun's web viewer.
+        data: Address of the data.
     """
     return f"http://{LOOPBACK}:{port}?url={urllib.parse.quote(data, safe='')}&theme=light"
 

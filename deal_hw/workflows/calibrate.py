@@ -195,7 +195,7 @@ def calibrate(
     Args:
         model: The robot's MJCF (path), ``mujoco.MjSpec`` or last compiled ``mujoco.MjModel``.
         data: Recordings to fit: files (CSV, NPZ, MCAP, LeRobot folders), mappings of names to arrays, or data
-            frames. Positions [rad or m] (T, J), commands (T, A), time [s] (T,); see docs/how-to/import.md.
+            frames. Positions [rad or m] (T, J), commands (T, A), time [s] (T,).
         dataset: Instead of both, a dataset that ``deal-hw collect`` recorded, or ``data import`` made.
         holdout: What only judges the result: recordings, or episodes of the dataset.
         episodes: Episodes of the dataset to fit; all but the held-out ones by default.

@@ -54,7 +54,7 @@ class TrainSettings(Checked):
 
     env: str = ""
     """A Gymnasium environment of your own, module:ENV_ID, for a robot that is a robot.yaml or a dataset that
-    carries one (docs/how-to/training.md). Parameters are drawn into its MuJoCo model at every reset."""
+    carries one. Parameters are drawn into its MuJoCo model at every reset."""
 
     distribution: File | ParameterDistribution | Calibrated | None = None
     """distribution.json of a calibration: parameters, their uncertainty, latency. From Python also a

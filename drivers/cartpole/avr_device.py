@@ -26,7 +26,7 @@ _INSTALL = "apt-get install gcc libc6-dev gcc-avr avr-libc libsimavr-dev libelf-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rig:
-    """How the emulated cart-pole is built; as in firmware/rig.h, docs/how-to/firmware.md.
+    """How the emulated cart-pole is built; as in firmware/rig.h.
 
     Attributes:
         m_per_count: Travel of the cart for one count of its encoder [m].

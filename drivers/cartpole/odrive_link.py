@@ -1,7 +1,7 @@
 """A cart-pole of parts: an ODrive on the belt (its public CANSimple frames) and a pole encoder node.
 
 The host side of the wire. The messages of the cart-pole become CANSimple frames and back, so the robot in
-front of it is the same as on other wires. docs/how-to/cartpole-odrive.md says how the parts are set up.
+front of it is the same as on other wires. Page 'ODrive' of the documentation shows how to set up the parts.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ _REFUSALS = {
 
 
 class CartpoleRobot(Robot):
-    """A cart-pole that speaks the protocol of docs/reference/protocol-cartpole-serial.md, on any frames.
+    """A cart-pole that speaks protocol version 1, on any frames.
 
     ``connect`` says hello to the device, which switches its motor off; on an inherited port a child process
     connects again, with a transport that adopted the descriptor, and so starts from the passive state. Over a

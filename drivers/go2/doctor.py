@@ -148,7 +148,7 @@ class Go2Doctor:
         for peer in seen.peers:
             yield Finding("dds", Level.OK, str(peer))
         for complaint in seen.complaints:
-            yield Finding("dds", Level.FAIL, complaint, "see docs/how-to/go2-dds.md")
+            yield Finding("dds", Level.FAIL, complaint, "see page 'DDS' of the documentation")
         typed: dict[str, set[str]] = {}
         for end in seen.endpoints:
             if end.topic in topics.TYPES:

@@ -48,7 +48,7 @@ class Support(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SupportConfig:
-    """Where the lines are drawn. Figures of the emulator: docs/how-to/go2.md; no real robot was measured."""
+    """Limits between floor and stand. They come from the emulator; no real robot was measured."""
 
     window_s: float = 0.3
     """States of this time are judged by their median [s]."""

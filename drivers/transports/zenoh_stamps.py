@@ -3,7 +3,7 @@
 The robot's side stamps what it sends with its own clock. A client returns the newest stamp that it has heard
 with each message of its own, and numbers them. The robot's side then knows, by its own clock alone, how old
 the state was that the client acted on, the way there and back included: wall clocks play no part. TCP's
-timestamps work alike (RFC 7323). docs/reference/protocol-go2.md has the bytes for clients in other languages.
+timestamps work alike (RFC 7323). Page 'Go2 messages' of the documentation has the bytes for other languages.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def read_echo(attachment: bytes) -> Echo:
             return Echo(stream, sequence, Stamp(session, time_ns))
     raise FrameError(
         f"an attachment of {len(attachment)} bytes that begins {attachment[:4].hex(' ')!r} is no "
-        f"echo of version {VERSION} ({_ECHO_BYTES.size} bytes, docs/reference/protocol-go2.md): neither "
-        "sequence nor age is known"
+        f"echo of version {VERSION} ({_ECHO_BYTES.size} bytes, page 'Go2 messages' of the documentation): "
+        "neither sequence nor age is known"
     )
 
 

@@ -81,13 +81,13 @@ def test_help_teaches_the_jobs_first(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_no_arguments_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    """A bare `deal-hw` says what it can do."""
+    """`deal-hw` alone prints the help."""
     assert cli.main([]) == 0
     assert capsys.readouterr().out == cli.help_text() + "\n"
 
 
 def test_unknown_verb_lists_the_verbs_and_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    """A mistyped verb gives one line with what exists and what was probably meant."""
+    """A mistyped verb gives one line with the known verbs and the nearest one."""
     assert cli.main(["calibrat"]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -166,7 +166,7 @@ def test_bad_option_exits_with_two(add_verb: Callable[..., None], capsys: pytest
 def test_expected_error_is_one_line(
     add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str], error: Exception, line: str
 ) -> None:
-    """What deal-hw raises on purpose, and what the system refuses, ends in one line and exit code 2."""
+    """Errors of deal-hw and refusals of the system end in one line and exit code 2."""
 
     def fail(settings: Settings) -> None:
         raise error
@@ -192,7 +192,7 @@ def test_traceback_on_request(
 
 
 def test_bug_is_not_hidden(add_verb: Callable[..., None]) -> None:
-    """An error that nobody raised on purpose keeps its traceback."""
+    """An unexpected error keeps its traceback."""
 
     def fail(settings: Settings) -> None:
         raise ZeroDivisionError
@@ -258,7 +258,7 @@ def test_an_error_output_that_nobody_reads_changes_nothing(
 
 
 def test_no_file_gets_the_number_of_a_closed_output() -> None:
-    """What is opened later must not be written to by whoever prints an error."""
+    """A file that is opened later must not get the text of an error."""
     code = (
         "import os, sys; from deal_hw.cli.main import main; main(['--version']);"
         "sys.exit(os.open(os.devnull, os.O_RDONLY))"
@@ -271,7 +271,7 @@ def test_no_file_gets_the_number_of_a_closed_output() -> None:
 def test_an_error_is_one_bounded_line(
     add_verb: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whatever a file had in it: no control characters, no second line, an end."""
+    """A message with text from a file has no control characters, one line, and a limited length."""
 
     def fail(settings: Settings) -> None:
         raise ConfigurationError("a\nb \x1b[31m" + "x" * 10**6)
@@ -320,7 +320,7 @@ def test_missing_package_names_the_extra(add_verb: Callable[..., None]) -> None:
 
 
 def test_missing_module_of_ours_is_a_bug(add_verb: Callable[..., None]) -> None:
-    """No extra brings a module of deal_hw: its absence is not dressed up as one."""
+    """A missing module of deal_hw itself is not reported as a missing extra."""
 
     def load(settings: Settings) -> None:
         raise ModuleNotFoundError("No module named 'deal_hw.nothing'", name="deal_hw.nothing")
@@ -354,7 +354,7 @@ def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize("name", ["collect", "deploy", "doctor", "emulate", "replay"])
 def test_help_of_a_verb_loads_no_wire_and_no_simulator(name: str) -> None:
-    """What a robot's options are is known without the packages that reach or simulate it."""
+    """The help shows a robot's options without loading the packages that reach or simulate it."""
     code = (
         "import contextlib, sys, json\nfrom deal_hw.cli.main import main\n"
         f"with contextlib.suppress(SystemExit): main([{name!r}, '--help'])\n"
@@ -391,6 +391,6 @@ def commands_in_docs() -> list[str]:
 
 @pytest.mark.parametrize("command", commands_in_docs())
 def test_command_in_docs_parses(command: str) -> None:
-    """What the README and the docs tell a reader to type is accepted."""
+    """Each command of the README and the docs is accepted."""
     _, name, *arguments = shlex.split(command)
     cli.parse(name, arguments)

@@ -17,7 +17,7 @@ PAGE = (MEASURED / "README.md").read_text(encoding="utf-8")
 
 
 def lacks(document: Any) -> set[str]:
-    """Return what the head of a file of rows does not say; of several calls each must say it."""
+    """Return the facts that the head of a file of rows lacks; each of several calls must have them."""
     if not isinstance(document, dict):
         return {"command", "commit", "machine", "versions"}
     if "calls" in document:
@@ -35,15 +35,15 @@ def lacks(document: Any) -> set[str]:
 
 
 def told() -> dict[str, set[str]]:
-    """Return what the page says that files lack."""
-    table = PAGE.partition("| older file | does not say |")[2].partition("\n\n")[0]
+    """Return the facts that files lack, by the page."""
+    table = PAGE.partition("| older file | lacks |")[2].partition("\n\n")[0]
     rows = [line.split("|") for line in table.splitlines()[2:]]
     return {row[1].strip(" `"): {word.strip() for word in row[2].split(",")} for row in rows}
 
 
 @pytest.mark.parametrize("path", sorted(MEASURED.glob("*.json")), ids=lambda path: str(path.name))
 def test_a_file_of_rows_says_where_it_comes_from(path: Path) -> None:
-    """What an older file does not say is listed; a new one says everything."""
+    """The page lists the missing facts of older files; a new file has all."""
     assert lacks(json.loads(path.read_text(encoding="utf-8"))) == told().get(path.name, set())
 
 
@@ -65,7 +65,7 @@ def test_what_is_measured_now_says_everything() -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "tools").glob("*.py")), ids=lambda path: str(path.name))
 def test_a_tool_that_writes_rows_writes_their_head(path: Path) -> None:
-    """Whoever writes a file of figures as JSON calls what describes the call."""
+    """Each tool that writes figures as JSON also writes the description of its call."""
     text = path.read_text(encoding="utf-8")
     if path.name.startswith(("measure_", "dds_peer_")) and re.search(r'"--out"|out: Path', text):
         assert re.search(r"\b(?:describe_call|write_rows)\(", text) or "fault_table" in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from deal_hw.cli.main import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
+FOLDERS = ("deal_hw", "calib", "drivers", "policies")
 
 
 def test_documents_link_to_files_that_exist() -> None:
@@ -78,6 +80,19 @@ def test_each_alarm_is_on_its_page() -> None:
 def test_values_of_run_time_are_shortened() -> None:
     """Braces inside an expression do not end it."""
     assert docs_pages.shortened("a {', '.join({x})} b {y}") == "a … b …"
+
+
+def test_messages_name_pages_of_the_site() -> None:
+    """Texts in the product name a page as the navigation does; an installed wheel has no docs/ folder."""
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    pages = set(re.findall(r"- ([^:\n]+): \S+\.md$", navigation, flags=re.M))
+    named = []
+    for path in (file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert not re.search(r"\bdocs/[\w-]+/", node.value), f"{path.relative_to(ROOT)}: {node.value}"
+                named += re.findall(r"page '([^']+)'", node.value, flags=re.I)
+    assert named and set(named) <= pages
 
 
 def test_readme_is_short() -> None:
@@ -146,3 +161,12 @@ def test_names_in_docstrings_are_names() -> None:
         "of :class:<code>~deal_hw.robot.Robot</code> and :meth:<code>x</code>", None, None, None
     )
     assert shown == "of <code>deal_hw.robot.Robot</code> and <code>x</code>"
+
+
+def test_options_stay_whole_in_wrapped_commands() -> None:
+    """A command's options are marked, and text outside of code is not."""
+    shown = docs_pages.on_page_content(
+        "<p>a --b</p><pre><code>c --out-dir d\n--e</code></pre>", None, None, None
+    )
+    whole = '<span class="option">{}</span>'.format
+    assert shown == f"<p>a --b</p><pre><code>c {whole('--out-dir')} d\n{whole('--e')}</code></pre>"

@@ -95,7 +95,7 @@ def names_in_docs() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("document", "name"), names_in_docs())
 def test_name_in_docs_exists(document: str, name: str) -> None:
-    """What a document names is somewhere in the sources."""
+    """Each name in a document is in the sources."""
     if name.endswith(".py"):
         assert (ROOT / name).is_file()
         return

@@ -1,4 +1,4 @@
-"""The fuzzer notices what it is there for, and every kind of input survives a few."""
+"""The fuzzer finds each kind of failure, and every reader survives a few inputs."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def talk(data: bytes) -> None:
 def test_failures_are_counted(
     read: Callable[[bytes], None], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each failure costs one input, has its name, and the run goes on behind it."""
+    """Each failure ends one input and has its name, and the run goes on."""
     monkeypatch.syspath_prepend(str(TOOL.parent))
     from fuzz.kind import WireKind
     from fuzz.mutations import damage_bytes

@@ -1,4 +1,4 @@
-"""What a hint tells to install comes from where deal-hw was installed from."""
+"""An install hint names the source from which deal-hw was installed."""
 
 from __future__ import annotations
 

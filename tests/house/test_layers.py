@@ -1,4 +1,4 @@
-"""The import order, read from the sources: who may know whom, and who may load what."""
+"""The import order, read from the sources: allowed imports between parts, and of large packages."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def part_of(module: str) -> str:
 
 
 def imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and name of all that is imported, at the top or inside functions, also by name as text."""
+    """Yield line and name of every import, at the top or inside functions, also by name as text."""
     for found in imports(tree):
         # `from deal_hw import drivers` imports a part and `from deal_hw.calib import fit` a room, not names.
         whole = [name for name in found.names if f"{found.source}.{name}" in WHOLE]
@@ -271,7 +271,7 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
     ],
 )
 def test_allowed_imports_pass(path: str, source: str) -> None:
-    """What the order allows is not complained of."""
+    """Allowed imports give no complaint."""
     assert violations({path: source}) == []
 
 

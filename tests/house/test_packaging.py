@@ -1,4 +1,4 @@
-"""What is shipped: the wheel holds the package and nothing else, and its base loads without the extras."""
+"""The wheel holds the package and nothing else, and its base loads without the extras."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def found() -> list[refusals.Refusal]:
 
 
 def test_the_table_is_that_of_the_sources(found: list[refusals.Refusal]) -> None:
-    """A refusal that is new, gone or worded otherwise shows as a line of a diff."""
+    """A new, removed or changed refusal shows as a line of a diff."""
     kept = (ROOT / refusals.TABLE).read_text(encoding="utf-8")
     diff = difflib.unified_diff(
         kept.splitlines(),

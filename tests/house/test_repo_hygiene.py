@@ -1,4 +1,4 @@
-"""What the repository must not hold, and what it must."""
+"""Contents that the repository must not have, and those that it must have."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_repository_names_no_machine(pattern: re.Pattern[str]) -> None:
     ids=["home", "checkout", "registry", "mirror", "password"],
 )
 def test_seeded_slip_is_caught(pattern: re.Pattern[str], text: str) -> None:
-    """The patterns find what they are for."""
+    """Each pattern finds its target."""
     assert pattern.search(text) is None
     assert pattern.search(text.replace("~", ""))
 

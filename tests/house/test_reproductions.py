@@ -60,7 +60,7 @@ from deal_hw.workflows.running.supervised import run_episodes
 
 S = 1_000_000_000
 PATIENCE_S = 60.0
-"""How long something is waited for that comes within seconds, and on commit d5a5f8c never."""
+"""Time limit for events that come within seconds, and on commit d5a5f8c never."""
 
 
 # A Go2 that stays stiff.
@@ -90,7 +90,7 @@ def test_a_link_that_drops_as_the_run_ends_leaves_no_stiff_go2() -> None:
 
 
 class Go2:
-    """An emulated Go2 in a process of its own, which tells at its end what it heard."""
+    """An emulated Go2 in a process of its own, which reports its commands at its end."""
 
     def __init__(self, folder: Path, *options: str) -> None:
         self._truth = folder / "truth.json"
@@ -105,7 +105,7 @@ class Go2:
         return {"plan": RunPlan(**values), "port": self.process.port}
 
     def commands(self) -> dict[str, Any]:
-        """End the emulator and return what commands it heard."""
+        """End the emulator and return the commands that it received."""
         self.process.stop()
         told: dict[str, Any] = json.loads(self._truth.read_text())["commands"]
         return told
@@ -209,7 +209,7 @@ def test_ctrl_z_stops_the_program_with_a_damped_go2(
 def test_a_supervisor_that_stands_still_leaves_a_damped_go2(
     go2: Callable[..., Go2], supervisor: Callable[[Go2, int], tuple[subprocess.Popen[str], int]]
 ) -> None:
-    """SIGSTOP: the control process went on, and nobody watched it."""
+    """SIGSTOP: the control process went on without a watch."""
     robot = go2("--sport", "off")
     process, control = supervisor(robot, signal.SIGSTOP)
     ended = os.pidfd_open(control)

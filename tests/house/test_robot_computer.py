@@ -135,7 +135,7 @@ def run_bare(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str
 
 
 def test_extras_are_really_refused(tmp_path: Path) -> None:
-    """A verb that needs an extra says so here, in one line: the refusal works, and so does its message."""
+    """A verb that needs a missing extra is refused in one line."""
     done = run_bare(tmp_path, "emulate", "cartpole")
     assert done.returncode == 2
     assert install_line("sim") in done.stderr

@@ -1,4 +1,4 @@
-"""Words that are gone: one name for one thing, and that is the field's (CONTRIBUTING.md, "Words")."""
+"""Words that are no longer used: one thing has one name, that of the field (CONTRIBUTING.md)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ GONE = {
     r"asked_position|/command/asked": "requested",
     r"\bheed(ed|s)?\b": "use, wait for",
 }
-"""Pattern of what is gone -> what there is instead."""
+"""Pattern of an old word -> its replacement."""
 
 KEPT = (
     # Old names that files of old versions have, mapped to the new ones.
@@ -56,7 +56,7 @@ KEPT = (
     ("docs/results/index.md", r"weki"),
     ("tests/house/test_words.py", r".*"),
 )
-"""Beginning of a path, and what may stand there all the same."""
+"""Beginning of a path, and the old words that are allowed there."""
 
 
 def sources() -> list[str]:
@@ -69,7 +69,7 @@ def sources() -> list[str]:
 
 @pytest.mark.parametrize(("pattern", "instead"), GONE.items())
 def test_a_word_that_is_gone_stays_gone(pattern: str, instead: str) -> None:
-    """Neither in names nor in sentences nor in file names."""
+    """No old word is in names, sentences or file names."""
     files = sources()
     if not files:
         pytest.skip("the files are listed by git, and this is no checkout")

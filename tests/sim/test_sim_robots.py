@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from deal_hw.clock import VirtualClock
@@ -112,8 +112,24 @@ def robots(draw: st.DrawFn) -> RobotFile:
     )
 
 
+def named_feet(*feet: str) -> RobotFile:
+    """Return a robot whose feet have these names."""
+    joint = JointEntry(name="a", unit="rad", default_position=0.0, actuator=ActuatorEntry(stiffness=1.0))
+    return RobotFile(
+        version=1,
+        name="r",
+        mjcf="r.xml",
+        actuation="position",
+        control_rate_hz=50.0,
+        state_rate_hz=500.0,
+        joints=(joint,),
+        feet=feet,
+    )
+
+
 @settings(max_examples=60, deadline=None)
 @given(robots())
+@example(named_feet("\x85", "\u2028", "a\nb\nc", "ü"))
 def test_what_is_written_is_read_again(robot: RobotFile) -> None:
     """Whatever a name looks like to YAML, and however small a number is."""
     import tempfile

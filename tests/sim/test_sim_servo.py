@@ -43,12 +43,12 @@ def test_delaying_the_target_delays_the_setpoint(seed: int, steps: int) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 60))
-def test_slew_is_the_step_by_step_law(seed: int, steps: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.booleans())
+def test_slew_is_the_step_by_step_law(seed: int, steps: int, limited: bool) -> None:
     """The closed form between changes equals moving by at most the rate at each step."""
     rng = np.random.default_rng(seed)
     target = rng.uniform(-1, 1, (3, steps, 2)).round(1)
-    rate = rng.choice([0.02, 0.1, 0.5], (3, steps, 2))
+    rate = rng.choice([0.02, 0.1, 0.5] if limited else [3.0, np.inf], (3, steps, 2))
     start = rng.uniform(-1, 1, (3, 2))
     now, want = start, []
     for k in range(steps):

@@ -202,7 +202,7 @@ def test_summary_lists_errors_and_parameters(rrd: Rrd, shown: Any) -> None:
     assert "latency 8.0 ms (7.0 to 9.0)" in text and "pole.length 0.3 m" in text
     assert (
         "1. backlash of 2 mm play in the gear **mend it**" in text
-        and "the data cannot see: all masses together" in text
+        and "not determined by the data: all masses together" in text
     )
 
 

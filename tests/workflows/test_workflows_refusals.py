@@ -59,7 +59,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
         {**COLLECT, "simulation": deal_hw.SimulationOptions(truth_seed=3)},
         "--truth-seed would have no effect: only with --simulated",
     ),
-    ("collect", {"robot": "r.yaml", "out": "out"}, "a robot of your own has no driver here"),
+    ("collect", {"robot": "r.yaml", "out": "out"}, "deal-hw has no driver for this robot"),
     ("new_robot", {"model": "m.xml"}, "model m.xml does not exist"),
     ("new_robot", {"model": "m.xml", "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 0.001 to"),
     ("check_robot", {"robot": "r.yaml"}, "r.yaml cannot be read: there is no such file"),

@@ -147,7 +147,7 @@ REFUSED: list[tuple[str, str]] = [
     ),
     (
         "collect {made}/robot.yaml --out r",
-        "a robot of your own has no driver here (docs/how-to/add.md); record its",
+        "deal-hw has no driver for this robot; record its",
     ),
     (
         "collect {made}/robot.yaml --simulated --out r --excite chirp",
@@ -163,9 +163,12 @@ REFUSED: list[tuple[str, str]] = [
         "--truth-seed would have no effect: only with --simulated",
     ),
     ("collect cartpole --out r", "say where the robot is: --port"),
-    ("replay {made}/run/dataset/episodes/000000.mcap --port p", "a robot of your own has no driver here"),
+    ("replay {made}/run/dataset/episodes/000000.mcap --port p", "deal-hw has no driver for this robot"),
     ("replay {made}/run/dataset/episodes/000000.mcap --simulated --no-record", "--no-record: a rehearsal is"),
-    ("deploy {made}/robot.yaml --port p", "a robot of your own has no driver here; docs/how-to/add.md"),
+    (
+        "deploy {made}/robot.yaml --port p",
+        "deal-hw has no driver for this robot; page 'Add a robot or a method'",
+    ),
     ("design-excitation {made}/none --out e.json", "unknown robot"),
 ]
 

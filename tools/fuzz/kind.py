@@ -1,4 +1,4 @@
-"""What the fuzzer needs to know of one kind of input."""
+"""Description of one kind of input for the fuzzer."""
 
 from __future__ import annotations
 

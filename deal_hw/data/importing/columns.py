@@ -198,7 +198,8 @@ def read_column_map(path: Path) -> ColumnMap:
     Raises:
         ConfigurationError: It cannot be read or says something that a column map does not.
     """
-    with reading(path, "a column map", "docs/how-to/import.md describes it", error=ConfigurationError):
+    described = "page 'Use your recordings' of the documentation describes it"
+    with reading(path, "a column map", described, error=ConfigurationError):
         return parse_column_map(read_yaml(Path(path)), (f"column map {Path(path).name}",))
 
 

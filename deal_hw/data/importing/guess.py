@@ -332,6 +332,6 @@ def unguessed(channels: Channels, what: str) -> DatasetError:
     ]
     shown = ", ".join(names[:24]) + (", ..." if len(names) > 24 else "")
     return DatasetError(
-        f"{channels.path}: cannot tell {what}; say it in a column map (docs/how-to/import.md). Channels: "
-        f"{shown or 'none'}"
+        f"{channels.path}: cannot tell {what}; write it into a column map (page 'Use your recordings' of the "
+        f"documentation). Channels: {shown or 'none'}"
     )

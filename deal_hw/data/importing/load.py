@@ -89,7 +89,8 @@ def load_tables(
     Raises:
         DatasetError: It cannot be read or understood.
     """
-    with reading(path, "a recording of a robot", "docs/how-to/import.md says what one holds"):
+    described = "page 'Use your recordings' of the documentation describes one"
+    with reading(path, "a recording of a robot", described):
         tables = tables_of(read_channels(path), columns, joints, say)
     if not tables:
         raise DatasetError(f"{path} holds no recording")

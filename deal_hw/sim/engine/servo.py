@@ -28,6 +28,8 @@ def slew(start: FloatArray, target: FloatArray, rate: FloatArray) -> FloatArray:
     count, steps = start.shape[0], target.shape[-2]
     targets = target if target.ndim == 3 else target[None]
     rates = rate if rate.ndim == 3 else rate[:, None]
+    if steps and _never_binds(start, targets, rates):
+        return np.broadcast_to(targets, (count, steps, start.shape[1]))
     out = np.empty((count, steps, start.shape[1]))
     now = start
     # Between changes of target and rate the set-point moves on a straight line until it arrives.
@@ -37,6 +39,13 @@ def slew(start: FloatArray, target: FloatArray, rate: FloatArray) -> FloatArray:
         out[:, begin:end] = now[:, None] + np.clip(gap, -reach, reach)
         now = out[:, end - 1]
     return out
+
+
+def _never_binds(start: FloatArray, targets: FloatArray, rates: FloatArray) -> bool:
+    """Return whether each target can be reached within the step in which it changes."""
+    first = np.abs(targets[:, 0] - start) <= rates[:, 0]
+    later = np.abs(np.diff(targets, axis=1)) <= (rates if rates.shape[1] == 1 else rates[:, 1:])
+    return bool(first.all() and later.all())
 
 
 def play(start: FloatArray, setpoint: FloatArray, width: FloatArray) -> FloatArray:

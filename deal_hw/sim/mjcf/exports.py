@@ -69,7 +69,7 @@ def write_exports(folder: Path, robot: RobotModel, result: CalibrationResult) ->
         VALUES: plain_values(result),
     }
     for name, values in tables.items():
-        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, width=110)
+        text = yaml.safe_dump(values, sort_keys=False, width=110)
         (folder / name).write_text(text, encoding="utf-8")
     return list(tables)
 

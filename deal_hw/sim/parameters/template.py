@@ -14,7 +14,7 @@ from deal_hw.sim.parameters.kind import Kind, joint_of
 
 _HEAD = """\
 # Parameters of {title} for `deal-hw calibrate --parameters`. Remove what you know or do not want to search.
-# Every key is explained in docs/reference/parameters.md. Nominal values are the model's.
+# Every key is explained on page 'Parameters' of the documentation. Nominal values are the model's.
 # A value of 0 has no ratio, so its line is commented out: give it a `nominal` or a `range`, remove the #.
 # Measure what you can: `weighed: 0.35` fixes a mass, `prior: {{mean: 0.35, std: 0.02}}` says what you expect.
 parameters:

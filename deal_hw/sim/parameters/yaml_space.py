@@ -1,7 +1,7 @@
 """A user's params.yaml: the searched parameters of an MJCF, their ranges, and known values.
 
-The format is described in docs/reference/parameters.md. Nominal values come from the MJCF, so the file holds
-only the user's changes.
+Page 'Parameters' of the documentation describes the format. Nominal values come from the MJCF, so the file
+holds only the user's changes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def read_space(path: Path, model: Any) -> ParameterSpace:
         ConfigurationError: The file cannot be used; the message names the entry and what to write instead.
         UnknownNameError: A kind or an element is not known; the message lists the names.
     """
-    with reading(path, "parameters", "docs/reference/parameters.md describes them", error=ConfigurationError):
+    described = "page 'Parameters' of the documentation describes them"
+    with reading(path, "parameters", described, error=ConfigurationError):
         return parse_space(read_bytes(path, YAML_BYTES).decode("utf-8"), model, source=str(path))
 
 

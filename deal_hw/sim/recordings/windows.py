@@ -97,10 +97,12 @@ def setpoints(batch: ServoBatch, episode: SampledEpisode, latency_s: FloatArray)
         # Efforts are not slewed; before the first one the motors are off.
         efforts = np.repeat(episode.target[None], batch.count, axis=0)
         return delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
-    factor = batch.servo_factor("servo_speed_limit")
-    rate = factor[:, None] * episode.speed_limit[None] * episode.step_s
+    # Members with the same limit have the same set-point; most spaces have one limit for all.
+    factors, member = np.unique(batch.servo_factor("servo_speed_limit"), axis=0, return_inverse=True)
+    rate = factors[:, None] * episode.speed_limit[None] * episode.step_s
+    path = slew(np.repeat(episode.start_setpoint[None], len(factors), axis=0), episode.target, rate)
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
-    path = delay(slew(start, episode.target, rate), batch.lag_s(latency_s) / episode.step_s, start)
+    path = delay(path[member.ravel()], batch.lag_s(latency_s) / episode.step_s, start)
     return path if batch.play is None else play(start, path, batch.play)
 
 

@@ -219,9 +219,8 @@ def _line(name: str, value: Any, comment: str, indent: int = 0) -> str:
 def _dumped(value: Any) -> str:
     # The dumper quotes ambiguous text, and writes 1.0e-05, which stays a number.
     def dump(style: str | None) -> str:
-        return yaml.safe_dump(
-            [value], default_style=style, default_flow_style=True, allow_unicode=True, width=math.inf
-        )
+        # ASCII only: with allow_unicode PyYAML writes a next-line character as it is and reads it as a space.
+        return yaml.safe_dump([value], default_style=style, default_flow_style=True, width=math.inf)
 
     text = dump(None)
     # Only double quotes keep text with line breaks on one line.

@@ -45,7 +45,7 @@ DEFAULT = "default"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recordings(Checked):
-    """Any robot: its MuJoCo model and its recordings. Step by step in docs/tutorials/your-robot.md."""
+    """Any robot: its MuJoCo model and its recordings (page 'Your own robot' of the documentation)."""
 
     model: Path | None = None
     """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
@@ -54,12 +54,12 @@ class Recordings(Checked):
     """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
 
     columns: Path | None = None
-    """Column map (YAML, docs/how-to/import.md); without it the channels' meaning is guessed from their
-    names."""
+    """Column map (YAML; page 'Use your recordings' of the documentation). Without one, the meaning of the
+    channels is guessed from their names."""
 
     parameters: Path | None = None
-    """What to search (YAML, docs/reference/parameters.md); by default friction, damping and armature of every
-    joint and gain of every actuator of the model."""
+    """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
+    of every joint and gain of every actuator of the model."""
 
     write_parameters: Path | None = None
     """Write such a file for --model, to edit, and do nothing else."""

@@ -73,8 +73,8 @@ class CalibrateSettings(Checked):
     simulator; by default the copy that the dataset keeps."""
 
     space: str = ""
-    """Which parameters of a robot of ours, such as k9 or k11; the first by default. See
-    docs/reference/parameters.md."""
+    """Named parameter set of a robot with a driver, such as k9 or k11; by default the first. Page
+    'Parameters' of the documentation lists them."""
 
     free: tuple[str, ...] = ()
     """Search exactly these parameters instead; the others keep their nominal values."""
@@ -87,8 +87,8 @@ class CalibrateSettings(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Search each parameter within a factor RANGE-RATIO to either side of its nominal value. By default as
-    its parameter set says, mostly 5; with --model 20 for dry friction (docs/reference/parameters.md), and
-    with --parameters the ranges of that file."""
+    its parameter set says, mostly 5; with --model 20 for dry friction; with --parameters the ranges of that
+    file."""
 
     latency: Annotated[float | None, Range(0, LONGEST_LATENCY_S, "s")] = None
     """Total latency [s] if it is known; by default it is searched."""
@@ -98,8 +98,7 @@ class CalibrateSettings(Checked):
 
     spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
     """Leave out up to three samples in a row that jump away and come back, so many times farther than the
-    joint's fastest motion would take it (docs/explanation/calibration.md). A larger number leaves out
-    less."""
+    joint's fastest motion would take it. A larger number leaves out less."""
 
     residual_std: float | Mapping[str, float] | tuple[str, ...] | None = ()
     """What a prediction may be off [rad, m]: sensor noise and what no model has. One number, or NAME VALUE

@@ -21,8 +21,7 @@ GAIT_SMOOTHING_S = 0.04
 """Feet that land change joint velocities within some 10 ms: longer smoothing bends states there [s]."""
 WALK_TELLS = (
     "a walk tells the gains of the joints and the floor's friction; it hardly tells their dry friction, not "
-    "their armature, and masses only where the motors' efforts weigh the robot "
-    "(docs/explanation/calibration.md)"
+    "their armature, and masses only where the motors' efforts weigh the robot"
 )
 WEIGHING_S = 0.35
 """A robot that is about to walk has stood still for so long [s]."""

@@ -209,7 +209,7 @@ class EmulateSettings:
 
     firmware: Annotated[Literal["python", "host", "avr"], CARTPOLE] = "python"
     """Cart-pole: the firmware in Python, its C core compiled for this host, or the image for the ATmega328P
-    under simavr (docs/how-to/firmware.md)."""
+    under simavr."""
 
     link: Annotated[File | None, CARTPOLE] = None
     """Make a symbolic link to the port here."""

@@ -20,7 +20,7 @@ HELDOUT: Final = (
     (4.0, (0.3, 0.0, 0.3)),
     (6.0, (0.0, -0.2, 0.0)),
 )
-"""What only judges the calibration; gentle, or every second robot falls (docs/how-to/training.md)."""
+"""Velocities that only judge the calibration. They are gentle: with faster ones every second robot falls."""
 HELDOUT_S: Final = 8.0
 
 

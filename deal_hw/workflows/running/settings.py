@@ -53,8 +53,8 @@ class LinkOptions(Checked):
     checksum by another rule; a state that was corrupted on the way is then taken for a true one."""
 
     simulator: Annotated[Literal["none", "unitree_mujoco"], GO2] = "none"
-    """What stands in the place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and battery
-    (docs/how-to/unitree-mujoco.md). A real robot is then refused."""
+    """The simulator that runs in place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and
+    battery. A real robot is then refused."""
 
     record_wire: bool = True
     """Record the raw bytes, too."""
@@ -117,7 +117,8 @@ def plan_options(robot: str, link: LinkOptions, legs: LegOptions, *, walks: bool
     """
     if is_user_robot(robot):
         raise ConfigurationError(
-            f"{robot}: a robot of your own has no driver here; docs/how-to/add.md says how to write one"
+            f"{robot}: deal-hw has no driver for this robot; page 'Add a robot or a method' of the "
+            "documentation shows how to write one"
         )
     description = driver_description(robot)
     stands = _stands(description) if legs.stand is None else legs.stand

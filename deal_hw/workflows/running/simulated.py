@@ -86,8 +86,8 @@ def require_driver(robot: str, port: str) -> None:
     """
     if is_user_robot(robot):
         raise ConfigurationError(
-            f"{robot}: a robot of your own has no driver here (docs/how-to/add.md); record its simulation "
-            "with --simulated, or import recordings of it: deal-hw data import"
+            f"{robot}: deal-hw has no driver for this robot; record its simulation with --simulated, or "
+            "import recordings of it: deal-hw data import"
         )
     if not port:
         raise ConfigurationError("say where the robot is: --port, such as /dev/ttyUSB0")

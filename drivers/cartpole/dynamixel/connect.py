@@ -41,7 +41,7 @@ def parse_port(port: str) -> tuple[str, DynamixelSettings]:
             Path(file),
             dict[str, Any],
             "settings of the servos",
-            "docs/how-to/dynamixel.md shows one",
+            "page 'Dynamixel servos' of the documentation shows one",
             error=ConfigurationError,
         )
     values |= {name: _value(text) for name, text in given.items()}

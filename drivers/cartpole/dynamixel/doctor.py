@@ -159,7 +159,8 @@ def _latency_timer(path: str, sysfs: Path) -> Iterator[Finding]:
         Level.NOTE if slow else Level.OK,
         f"the adapter's latency timer is {timer_ms} ms",
         f"deal-hw sets it to 1 ms while it runs; for other programs: echo 1 > /sys/class/tty/"
-        f"{Path(path).resolve().name}/device/latency_timer, or the udev rule in docs/how-to/dynamixel.md"
+        f"{Path(path).resolve().name}/device/latency_timer, or the udev rule "
+        "on page 'Dynamixel servos' of the documentation"
         if slow
         else "",
     )

@@ -45,7 +45,7 @@ _TRIES = 5
 """Times that a question is put while answers are corrupt: with 5 % of them corrupt all fail once in 10**6."""
 _LISTEN_S = 0.05
 _ALL_STATUS = 2
-_WIZARD = "with Dynamixel Wizard 2.0 (docs/how-to/dynamixel.md)"
+_WIZARD = "with Dynamixel Wizard 2.0 (page 'Dynamixel servos' of the documentation)"
 
 
 @dataclass(frozen=True, slots=True)

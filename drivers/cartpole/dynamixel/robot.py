@@ -61,7 +61,7 @@ class _Sent(NamedTuple):
 
 
 class DynamixelCartpole(Robot):
-    """A cart-pole on two X-series servos (docs/how-to/dynamixel.md).
+    """A cart-pole on two X-series servos.
 
     Servos say nothing unless asked, so :meth:`read_state` asks them, ``state_rate_hz`` times a second, the
     last time so that the answer is there when the caller's time is over: question, answer and command do not

@@ -14,8 +14,8 @@ Simulator = Literal["none", "unitree_mujoco"]
 """What stands in the place of a robot."""
 UNITREE_MUJOCO: Final = (
     "no head, no battery: this is how the simulator unitree_mujoco fills them; if it is what runs there, add "
-    "`--simulator unitree_mujoco`, which says what replaces the checks that its states do not allow "
-    "(docs/how-to/unitree-mujoco.md). A real Go2 never sends them: then do not command it"
+    "`--simulator unitree_mujoco`, which says what replaces the checks that its states do not allow. "
+    "A real Go2 never sends them: then do not command it"
 )
 _HEADLESS: Final = slice(4, 6)
 _BATTERY: Final = slice(1040, 1084)

@@ -1,0 +1,63 @@
+"""Multiple shooting: predictions that are kept, and fits that start from a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.refinement import refine, refine_windows
+from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.uncertainty.time_steps import scan_latency
+
+
+def stepped(shooting: Shooting, problem: Problem) -> tuple[Point, Point]:
+    """Return a point at the nominal values and where start states follow a step to."""
+    here = shooting.start(problem.space.nominal, 0.004)
+    step = np.append(0.02 * np.cos(np.arange(len(problem.space))), 1e-4)
+    return here, shooting.followed(here, shooting.normal(here), step)
+
+
+@pytest.mark.parametrize("central", [False, True])
+def test_kept_predictions_are_those_of_the_point(
+    small_problem: Callable[..., Problem], central: bool
+) -> None:
+    """A fit that has just predicted at a point gives the same numbers as one that has not."""
+    problem = small_problem()
+    kept, fresh = Shooting(problem, 20), Shooting(problem, 20)
+    _, point = stepped(kept, problem)
+    before = problem.steps
+    cost, residuals = kept.cost(point), kept.residuals(point)
+    assert problem.steps == before
+    assert cost == fresh.cost(point)
+    for a, b in zip(residuals, Shooting(problem, 20).residuals(point), strict=True):
+        np.testing.assert_array_equal(a, b)
+    a, b = (s.normal(point, central=central) for s in (kept, Shooting(problem, 20)))
+    np.testing.assert_array_equal(a.hessian, b.hessian)
+    np.testing.assert_array_equal(a.gradient, b.gradient)
+
+
+def test_kept_predictions_are_not_used_at_another_point(small_problem: Callable[..., Problem]) -> None:
+    """Points in turn: each time the numbers are that point's own."""
+    problem = small_problem()
+    shooting = Shooting(problem, 20)
+    here, there = stepped(shooting, problem)
+    costs = [shooting.cost(p) for p in (here, there, here)]
+    assert costs[0] == costs[2] == Shooting(problem, 20).cost(here) != costs[1]
+
+
+def test_a_scan_of_the_latency_ends_where_each_tick_fitted_alone_ends(
+    small_problem: Callable[..., Problem],
+) -> None:
+    """The start that the free latency's fit foretells leads to the same least cost."""
+    problem = small_problem(latency_ticks=3, fixed_latency_s=None)
+    free = refine(problem, problem.space.nominal, 0.004, (0.2,))
+    scan = scan_latency(problem, free, None)
+    tick_s = problem.episodes[0].step_s
+    for tick, found in zip(scan.ticks, scan.refined, strict=True):
+        start = free.shooting.start(free.theta, tick * tick_s)
+        alone = refine_windows(free.shooting, start, 10, fixed_latency=True)
+        assert found.normal.cost == pytest.approx(alone.normal.cost, rel=2e-3)
+    assert scan.ticks[scan.best] == 3
